@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
+from r2flow.data.loader import RunLoader
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count, NonNegative
@@ -144,10 +145,10 @@ def describe_gradients(module: torch.nn.Module) -> str:
 
 def describe_batch(trainer: L.Trainer) -> str:
     """The images of the step being taken, on all devices and in all accumulated batches, and their scans."""
-    sampler = getattr(trainer.train_dataloader, "run_sampler", None)
-    if sampler is None:
+    loader = trainer.train_dataloader
+    if not isinstance(loader, RunLoader):
         return "images unknown to the loader"
-    whole = copy.copy(sampler)
+    whole: Any = copy.copy(loader.batch_sampler)
     whole.rank, whole.ranks = 0, 1
     whole.first_batch = trainer.global_step * trainer.accumulate_grad_batches
     batches = iter(whole)

@@ -196,7 +196,8 @@ class ScanDataModule(L.LightningDataModule):
         order, batches = self._order(self.training_source), self.trainer.max_steps * accumulated
         sampler = RunSampler(order, self.batch_size // accumulated, batches, rank, ranks)
         sampler.first_batch = self.trainer.global_step * accumulated
-        return RunLoader(self._dataset(self.training_source, "training"), sampler, **self._loader_options())
+        dataset = self._dataset(self.training_source, "training")
+        return RunLoader(dataset, batch_sampler=sampler, **self._loader_options())
 
     def _ready(self) -> None:
         """Open what is there by now: pairs are made after `setup`."""

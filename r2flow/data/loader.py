@@ -90,7 +90,8 @@ class Permutations:
 class RunSampler(Sampler[list[tuple[int, int]]]):
     """The batches of one rank over a whole run, (k, scan) each, from batch `first_batch` on.
 
-    Global batch m holds images [m B, (m + 1) B); rank r of R takes every R-th of them, from r on.
+    Global batch m holds images [m B, (m + 1) B); rank r of R takes every R-th of them, from r on. The length is that of
+    the run even if a resumed iterator starts late: Lightning adds the batches of a resumed run to what it fetches.
     """
 
     def __init__(self, order: Order, batch_size: int, batches: int, rank: int = 0, ranks: int = 1) -> None:
@@ -108,18 +109,7 @@ class RunSampler(Sampler[list[tuple[int, int]]]):
 
 
 class RunLoader(DataLoader[Item]):
-    """A loader whose one epoch is the whole run.
-
-    Its length stays that of the run although a resumed iterator starts late: Lightning adds the batches
-    of a resumed run to what it fetches, and a shortened length would shift everything after it.
-    """
-
-    def __init__(self, dataset: Dataset[Item], sampler: RunSampler, **options: Any) -> None:
-        super().__init__(dataset, batch_sampler=sampler, **options)
-        self.run_sampler = sampler
-
-    def __len__(self) -> int:
-        return self.run_sampler.batches
+    """A loader whose one epoch is the whole run, by a `RunSampler`."""
 
     # Lightning takes a loader with these two for one that resumes. The position itself comes from the
     # trainer's step (ScanDataModule.train_dataloader), which also holds when the number of ranks changed.

@@ -21,7 +21,7 @@ from r2flow.generators import Generated, Generator, as_flow
 from r2flow.generators.base import Precision, autocast
 from r2flow.models import name_of
 from r2flow.samplers import build_sampler
-from r2flow.store import Store
+from r2flow.store import Damaged, Store
 
 ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
 
@@ -61,8 +61,11 @@ class PairStore(Store):
 
     def has(self, item: int) -> bool:
         """Whether a shard is there and as long as the first `num` pairs need."""
-        pairs = len(self.batches_of(item)) * self.recipe.batch_size
-        return super().has(item) and len(self.head(item)["usable"]) >= pairs
+        try:
+            usable = self.head(item)["usable"]
+        except (FileNotFoundError, Damaged):
+            return False
+        return len(usable) >= len(self.batches_of(item)) * self.recipe.batch_size
 
     def missing_pairs(self) -> int:
         """How many pairs are in the shards that have yet to be made."""

@@ -52,13 +52,10 @@ class ScanSet:
         if identity is not None:  # a part of a part is told apart from the same numbers of the whole
             chosen = str(identity.get("part", "")).encode() + np.asarray(numbers, dtype=np.int64).tobytes()
             identity = {**identity, "part": hashlib.sha256(chosen).hexdigest()[:16]}
-        about = {**self.about, "part": name}
-        return ScanSet(self.label, self.source.subset(numbers), self.sensor, about, identity, self._drives_of(numbers))
-
-    def _drives_of(self, numbers: Sequence[int]) -> dict[str, list[int]]:
         place = {number: i for i, number in enumerate(numbers)}
         found = {drive: [place[n] for n in held if n in place] for drive, held in self.drives.items()}
-        return {drive: kept for drive, kept in found.items() if kept}
+        drives, about = {drive: kept for drive, kept in found.items() if kept}, {**self.about, "part": name}
+        return ScanSet(self.label, self.source.subset(numbers), self.sensor, about, identity, drives)
 
     def limited(self, most: int | None) -> "ScanSet":
         """At most `most` scans, by `fixed_choice`."""
@@ -70,8 +67,7 @@ class ScanSet:
         """At most `most` scans, evenly spread over all."""
         if most >= len(self):
             return self
-        numbers = spread(len(self), most)
-        return ScanSet(self.label, self.source.subset(numbers), self.sensor, drives=self._drives_of(numbers))
+        return self.part(spread(len(self), most), f"{most} of {len(self)}, evenly spread")
 
     def batches(self, numbers: Sequence[int], batch_size: int, workers: int = 0) -> Iterator[Tensor]:
         """The scans of these numbers in order, each batch (B, 2 or 1, H, W), read by `workers` further processes."""

@@ -105,12 +105,6 @@ class Sensor:
         return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # a row is no longer one laser
 
 
-def evenly_spaced(top: float, bottom: float, rows: int) -> tuple[float, ...]:
-    """Middles in degrees of `rows` equal bins of the field of view [bottom, top]."""
-    step = (top - bottom) / rows
-    return tuple(top - step * (row + 0.5) for row in range(rows))
-
-
 def _beams(top: float, step: float, count: int) -> tuple[float, ...]:
     return tuple(top - step * beam for beam in range(count))
 
@@ -163,7 +157,7 @@ PANDAR64_CHANNELS = (
 # packets list its lasers by number, and every unit has its own calibration of their elevations.
 SENSORS: Registry[Sensor] = Registry(
     "sensor",
-    hdl64e=Sensor("hdl64e", evenly_spaced(3.0, -25.0, 64)),
+    hdl64e=Sensor("hdl64e", _beams(3 - 7 / 32, 7 / 16, 64)),
     hdl64e_rings=Sensor("hdl64e_rings", HDL64E_RINGS),
     hdl32e=Sensor(
         "hdl32e",

@@ -63,7 +63,7 @@ def test_an_item_depends_on_its_number_alone():
 def test_workers_change_nothing():
     def batches(workers):
         dataset = FlowDataset(Scans(), Encoding(SENSOR), 0, "training")
-        return list(RunLoader(dataset, RunSampler(Permutations(10, 3), 4, 5), num_workers=workers))
+        return list(RunLoader(dataset, batch_sampler=RunSampler(Permutations(10, 3), 4, 5), num_workers=workers))
 
     for a, b in zip(batches(0), batches(2), strict=True):
         assert all(torch.equal(a[name], b[name]) for name in a)

@@ -8,7 +8,7 @@ import yaml
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_points
-from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor, evenly_spaced
+from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "sensor"
 
@@ -46,7 +46,7 @@ def test_resizing_keeps_the_field_of_view(sensor):
         gap = abs(np.diff(edges)).max()
         assert abs(edges[[0, -1]] - sensor.row_edges[[0, -1]]).max() < gap / 2
     # Evenly spaced beams stay so: the edges are exact.
-    even = Sensor("even", evenly_spaced(10, -30, 40)).resized(10)
+    even = Sensor("even", tuple(9.5 - beam for beam in range(40))).resized(10)
     np.testing.assert_allclose(even.row_edges, np.linspace(10, -30, 11), atol=1e-12)
 
 
