@@ -364,6 +364,15 @@ def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path
     assert "1 scans completed" in said
 
 
+def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
+    sensor = SENSORS["vlp16"].resized(columns=64)
+    image = np.stack([np.full(sensor.shape, 9.0), np.full(sensor.shape, 0.5)]).astype(np.float32)
+    write_points(tmp_path / "points" / "0.ply", *image_to_points(image, sensor.rays()))
+    ((scan,), (said,)) = open_partial([str(tmp_path / "points")], Reading(sensor.resized(64, 64)))
+    assert "16 of the 64 rows of vlp16 are measured" in said
+    assert (scan.read().state != Ray.UNKNOWN).any(1).sum() == 16
+
+
 @pytest.mark.parametrize(("rows", "columns", "named"), [(4, 64, True), (8, 32, True), (4, 32, True), (8, 32, False)])
 def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(
     tmp_path: Path, rows: int, columns: int, named: bool

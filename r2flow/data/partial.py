@@ -20,7 +20,7 @@ from r2flow.data.sources import LOOKED_AT, spread
 from r2flow.errors import InputError, naming
 from r2flow.lidar.beams import full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending
-from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.transfer import (
     Partial,
     image_of_same,
@@ -107,13 +107,15 @@ def _files(
     if points := [path for path in paths if path not in images]:
         some = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
         doubt = None if source else other_sensor(some, target)
+        if not source and not doubt and target.name in SENSORS and SENSORS[target.name].shape[0] < target.shape[0]:
+            source = SENSORS[target.name]  # its beams are fewer than the rows of the answers
         same = _same_view(source, target) if source else doubt is None
         try:
             fired = sensor_of(some, source or (target if same else None))
         except InputError as error:
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
         if same and fired.columns >= FEWER * target.columns:
-            full = scale or (1.0 if noted else usual_scale(spec, source or target))
+            full = scale or (1.0 if noted else max(usual_scale(spec, source or target), full_reflectance(some) or 0))
             by_points = partial(_read_points, reading=reading, fired=None, scale=full, strict=True)
         else:
             full = scale or (1.0 if noted else source and source.reflectance_scale) or full_reflectance(some) or 1.0
