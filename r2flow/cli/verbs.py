@@ -90,7 +90,7 @@ def _usage(message: str) -> str:
     said = one_line(message).rstrip(".") or "no verb is given"
     wrong = re.fullmatch(r"Invalid value for ('.*'): Input should be (.*?)(, unable to .*)?", said)
     if not wrong:
-        return f"{said}."
+        return said + "." * (not said.endswith("?"))
     names = re.findall(r"--?[\w-]+", wrong[1])
     words = [word.partition("=") for word in sys.argv[1:]]
     after = [*sys.argv[2:], ""]

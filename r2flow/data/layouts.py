@@ -89,7 +89,7 @@ class Layout(SourceKind):
         self.chosen([], split, None)  # a split that is not known is refused before anything is looked for
         if not root.is_dir():
             raise InputError(
-                f"{root} is not a folder. Give the folder of {name} scans (data.root=FOLDER; in a verb {name}:FOLDER)."
+                f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb {name}:FOLDER)."
             )
         held = [drive for drive in self.find(root) if drive.scans]
         if not held:

@@ -73,9 +73,14 @@ def _rows_of(result: MetricResult) -> list[dict[str, Any]]:
 
 
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
-    """Print one table, its protocol before it and the remarks after it."""
+    """Print one table, its protocol before it, the remarks after it. Sets in columns have numbers: names are long."""
     columns, lines = _table(comparisons)
     print(_protocol(comparisons))
+    if not columns[0]:
+        numbers = list(map(str, range(1, len(columns))))
+        print_table(list(zip(numbers, columns[1:], strict=True)), ("", "its scans : real"))
+        columns = ["", *numbers]
+        print()
     print_table(lines, columns)
     for remark in _remarks(comparisons):
         print(f"  {remark}")

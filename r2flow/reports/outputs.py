@@ -217,7 +217,7 @@ def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
     elif experiment:
         then = f"train experiment={experiment} {as_override('stage.init', run)}"
     else:
-        then = f"evaluate REAL {shlex.quote(str(run))}"
+        then = f"evaluate REAL {shlex.quote(str(run))}{plugins}"
     return f"""
 next
   r2flow sample {run} --num 16{plugins} --seed 1 --out {out.parent / "more"}

@@ -1,6 +1,5 @@
 """Scans and range images, ready to be drawn."""
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -16,8 +15,6 @@ from r2flow.data.sources import ScanFiles, SimulatedScans, spread, warn_of_other
 from r2flow.errors import InputError
 from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import read_range_image
-
-log = logging.getLogger(__name__)
 
 
 class View(NamedTuple):
@@ -62,7 +59,7 @@ def scans_of(path: Path) -> list[Path]:
 
 def _say_how_many(what: str | Path, count: int, most: int) -> None:
     if count > most:
-        log.warning("%s: %d of its %s scans are taken, evenly spread; --num takes more", what, most, f"{count:,}")
+        print(f"{what}: {most} of its {count:,} scans, evenly spread (--num)")
 
 
 def views_of(spec: str, reading: Reading, most: int) -> list[View]:
