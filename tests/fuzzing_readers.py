@@ -59,7 +59,7 @@ def prepared(path: Path) -> bytes:
 
 def pairs(path: Path) -> bytes:
     folder = in_folder("pairs")(path)
-    store = PairStore(folder, PairRecipe("0" * 16, (2, 8, 64), 0, 0, "euler", 1, 1e-5, 2, 2), 4)
+    store = PairStore(folder, PairRecipe("0" * 16, (2, 8, 64), 0, 0, {"name": "euler", "steps": 1}, 2, 2), 4)
     try:
         return store.read(0)[0]["x_1"].tobytes()
     except Damaged as error:

@@ -80,7 +80,7 @@ def write_stores(folder: Path, beside: Path) -> None:
         write_points(scans / f"{number}.bin", XYZ * [1, 1, 0.1], REFLECTANCE)
     prepare_folder(scans, beside / "prepared", SENSOR)
     keep(folder, "prepared", *(beside / "prepared").iterdir())
-    recipe = PairRecipe("0" * 16, (2, 8, 64), 0, 0, "euler", 1, 1e-5, 2, 2)
+    recipe = PairRecipe("0" * 16, (2, 8, 64), 0, 0, {"name": "euler", "steps": 1}, 2, 2)
     store = PairStore(beside / "pairs", recipe, 4)
     store.begin()
     x_1 = DRAW.standard_normal((4, 2, 8, 64)).astype(np.float16)

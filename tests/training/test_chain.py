@@ -180,7 +180,7 @@ def test_a_killed_chain_ends_as_the_one_left_alone(
         ),
         (["experiment=reflow", "stage.init=RF1", "sensor=vlp16"], "the sensor is the parent's"),
         (["experiment=reflow", "stage.init=RF1", "data.augment.flip=true"], "data.augment changes scans"),
-        (["experiment=reflow", "stage.init=RF1", "data.pairs.num=0"], "num and batch_size"),
+        (["experiment=reflow", "stage.init=RF1", "data.pairs.num=0"], "data.pairs: num"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.sampler.name=dopri"], "Did you mean 'dopri5'"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.sampler.name=jump"], "holds other pairs"),
         (["experiment=reflow", "stage.init=RF1"], "holds other pairs"),
