@@ -29,6 +29,7 @@ Positive = Annotated[float, Bound("above 0", lambda x: x > 0)]
 NonNegative = Annotated[float, Bound("of at least 0", lambda x: x >= 0)]
 Seed = Annotated[int, Bound("of at least 0 and below 2^63", lambda n: 0 <= n < 2**63)]
 Portion = Annotated[float, Bound("in [0, 1)", lambda x: 0 <= x < 1)]
+Share = Annotated[float, Bound("in [0, 1]", lambda x: 0 <= x <= 1)]
 
 
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:

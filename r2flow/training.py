@@ -54,7 +54,6 @@ EXPECTED_WARNINGS = (
     "Checkpoint directory .* exists and is not empty.*",
     ".*isinstance.treespec, LeafSpec.*",
     "You passed in a .val_dataloader. but have no .validation_step.*",
-    "Using ModelCheckpoint with manual optimization and every_n_train_steps.*",
     "The dirpath has changed from.*",
     "Using ModelCheckpoint with manual optimization.*",
 )

@@ -151,7 +151,7 @@ def complete(
             "--checkpoint",
             "-c",
             help="A checkpoint file, a run folder or a model; if left out densify, and street for what lies in sectors "
-            "without any ray or with --sampler.",
+            "without any ray or with a --sampler of flows from noise.",
         ),
     ] = None,
     precision: PrecisionOption = "32-true",
@@ -160,7 +160,7 @@ def complete(
         typer.Option("--from", help="Sensor of the scans, by name or YAML; found in the scans if left out."),
     ] = None,
     to: Annotated[
-        str | None, typer.Option(help="Sensor of the answers, by name or YAML, of a model for any; the model's own.")
+        str | None, typer.Option(help="Sensor of the answers, by name or YAML; the model's own if left out.")
     ] = None,
     size: SizeOption = None,
     mask: Annotated[
@@ -176,7 +176,8 @@ def complete(
     num: Annotated[int, typer.Option(min=1, help="Answers to each scan.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="An answer depends on seed, scan and its number alone.")] = 0,
     scans: Annotated[
-        int | None, typer.Option("--scans", min=1, help="The most scans of each folder, evenly spread; all.")
+        int | None,
+        typer.Option("--scans", min=1, help="Most scans of each folder, evenly spread; all if left out."),
     ] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 1,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture and a page in 3-D.")] = 8,
@@ -209,9 +210,10 @@ def complete(
         reading = replace(reading_for([], loaded), columns=named_columns(columns))
         return loaded, *open_partial(what, reading, sensor, reflectance_scale, scans)
 
-    name = str(checkpoint or (DEFAULT if how.sampler else DENSIFY))
+    by_densify = how.given.get("name", "jump") in ("jump", "transport")
+    name = str(checkpoint or (DENSIFY if by_densify else DEFAULT))
     loaded, partial, said = opened(name)
-    if name == DENSIFY and not (checkpoint or to or size) and lack_sectors(partial, job):
+    if name == DENSIFY and not (checkpoint or to or size or how.sampler) and lack_sectors(partial, job):
         name = DEFAULT
         loaded, partial, said = opened(name)
     if said and isinstance(loaded.generator, TransferFlow):  # of another sensor, which fills other rows

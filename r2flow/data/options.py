@@ -90,7 +90,7 @@ class PairOptions:
     seed: Seed = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
     first: Seed | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
     precision: Precision = "32-true"  # of the network
-    knots: int | None = None  # inner states of each path to keep with its pair, for stage=flow_map
+    knots: Natural | None = None  # inner states of each path to keep with its pair, for stage=flow_map
     of: str | None = None  # the flow that draws them; None: that of stage.init
     parent: str | None = None  # hash of the flow; the run fills it in
 

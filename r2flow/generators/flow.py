@@ -16,7 +16,7 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.samplers import MMPS, FixedSteps, ODESampler, Progress, Sampler
 
-USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # of a new flow: docs/results.md
+USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # of a new flow
 
 
 class Flow(Generator):

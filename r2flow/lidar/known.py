@@ -1,6 +1,7 @@
 """What is known of a scan: a state of each ray, and masks that say which rays are measured.
 
-state = ray_states(images, parse_mask("rows:4")(images.shape[-2:], rng))
+measured = parse_mask("rows:4")(images.shape[-2:], numpy.random.default_rng(0))
+state = ray_states(images, torch.from_numpy(measured))
 """
 
 import hashlib
@@ -9,7 +10,6 @@ import math
 from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.region import region
 from r2flow.lidar.scan_files import read_numbers
-from r2flow.registry import Bound, Count, Natural, Registry, check_options
+from r2flow.registry import Count, Natural, Registry, Share, check_options
 
 
 class Ray(IntEnum):
@@ -62,9 +62,6 @@ def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
 
 
 Mask = Callable[[tuple[int, int], np.random.Generator], np.ndarray]  # (H, W) and draws to measured rays, (H, W) bool
-
-
-Share = Annotated[float, Bound("in [0, 1]", lambda x: 0 <= x <= 1)]
 
 
 def every_row(step: Count, first: Natural = 0) -> Mask:

@@ -76,7 +76,7 @@ class Checkpoint:
         """Scans 0 to num - 1 of a seed: range in metres and reflectance, (num, 2 or 1, H, W), 0 without a return.
 
         Args:
-            how: Options of `r2flow.model.sampling.sample`: steps, method, batch_size, region, ...
+            how: Options of `r2flow.model.sampling.sample`: name, steps, batch_size, region, ...
         """
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
@@ -86,7 +86,7 @@ class Checkpoint:
         Args:
             images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W).
             state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`.
-            how: Options of `r2flow.model.completion.complete`: keep, steps, batch_size, ...
+            how: Options of `r2flow.model.completion.complete`: name, steps, batch_size, ...
         """
         return torch.stack([found.images for found in complete(self, images, state, num, seed, **how)])
 

@@ -123,10 +123,8 @@ def draw(
     x_1 = made.x.cpu()  # which also waits for a GPU
     seconds = time.perf_counter() - start
     images = generator.space.decode(x_1, channels)
-    if seen is not None:
-        images = seen.place(images)
     if region is not None and seen is not None:
-        images = region.place(region.crop(images))
+        images = region.place(region.crop(seen.place(images)))
     return Samples(images, numbers[0], made.evaluations.cpu(), made.converged.cpu(), seconds)
 
 

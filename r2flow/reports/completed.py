@@ -18,6 +18,7 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
+from r2flow.lidar.scan_files import WRITTEN
 from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import common_mae
 from r2flow.model.checkpoint import Checkpoint
@@ -29,7 +30,6 @@ from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
 from r2flow.store import Store, read_manifest
 
-WRITTEN = (".bin", ".pcd", ".ply", ".npy")  # formats that answers are written in; others become .ply
 SHOWN = 4  # answers on a page
 
 

@@ -2,8 +2,7 @@
 
 A sampler takes the states x_t of a flow from noise at t = 0 to x_1 at t = 1, where the values of a mask are known. With
 u = v(t, x_t), x_1hat = x_t + (1 - t) u is the mean E[x_1 | x_t]. With a flow map, `Replace` and `Repaint` jump to the
-next time; `MMPS` needs that mean and takes the map's velocity u(x, t, t). docs/completion.md has how far each is from
-the posterior where that is known.
+next time; `MMPS` needs that mean and takes the map's velocity u(x, t, t).
 """
 
 from abc import abstractmethod
@@ -21,8 +20,8 @@ from r2flow.registry import Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid, Steps
 from r2flow.samplers.stochastic import back, sde
 
-GROWN = 10.0  # of |y - A x_1hat|^2: docs/completion.md
-EARLIEST = 0.1  # time before which `MMPS` takes the flow's Jacobian of this time: at t = 0 it is divided by 0
+GROWN = 10.0  # times |y - A x_1hat|^2: a larger residual has diverged
+EARLIEST = 0.1  # earlier times take the Jacobian of this one: the formula divides by t
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def sde_step(t: float, s: float, c: float, t_b: float | None = None) -> Step:
     return Step((1 - s) / (1 - t) * kept, now, before, (1 - s) * math.sqrt(1 - kept**2))
 
 
-def sde(estimate: Estimate, x: Tensor, times: Tensor, c: float, noise: Noise) -> Iterator[Tensor]:
+def sde(estimate: Estimate, x: Tensor, times: Tensor, c: float, noise: Noise | None) -> Iterator[Tensor]:
     """The states after each step, (B, ...); the last one is x_1. One estimate a step.
 
     Where x_1hat is linear in x the law of x_1 is of order 2 in the steps. `times` rise from 0 to 1, (N + 1,) float64.
@@ -81,7 +81,7 @@ def sde(estimate: Estimate, x: Tensor, times: Tensor, c: float, noise: Noise) ->
         x = step.keep * x + step.now * x_1
         if former is not None and step.before:
             x = x + step.before * former[1]
-        if step.fresh:
+        if step.fresh and noise is not None:  # the ODE, c = 0, takes none
             x = x + step.fresh * noise(j)
         former = t, x_1
         yield x
@@ -113,7 +113,6 @@ class SDE(OnGrid):
         return self.churn > 0
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        assert draws is not None
         field, x, alive, times = generator.field(condition), noise, finite(noise), self.times()
         if self.finish and self.steps > 1:
             times = torch.cat([self.times(0.0, 1 - self.finish, fewer=1), times[-1:]])

@@ -43,12 +43,11 @@ class LearnFlowMap(Reflow):
         objective: str = "consistency",
         jumps: Mapping[str, Any] | None = None,
         rho: Positive = 0.01,
-        loss: str = "pseudo_huber",
         **options: Any,
     ) -> None:
         if options.pop("time", None) is not None:
             raise InputError("a flow map learns jumps from time to time: give stage.jumps and leave stage.time out.")
-        super().__init__(generator, loss, {"name": "uniform"}, **options)
+        super().__init__(generator, time={"name": "uniform"}, **options)
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))

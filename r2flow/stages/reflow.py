@@ -24,7 +24,7 @@ class Reflow(Rectify):
         self, generator: Generator, loss: str = "pseudo_huber", time: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
         super().__init__(generator, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
-        generator.run_by(ode_sampler(self.generator), generator.few)  # fresh noise would part the pairs
+        generator.run_by(ode_sampler(self.generator), generator.few)  # with fresh noise x_0 does not end at x_1
 
 
 class Distill(Reflow):
@@ -39,7 +39,6 @@ class Distill(Reflow):
         self,
         generator: Generator,
         steps: Count = 1,
-        loss: str = "pseudo_huber",
         grid: str = "uniform",
         **options: Any,
     ) -> None:
@@ -47,5 +46,5 @@ class Distill(Reflow):
             raise InputError(
                 f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."
             )
-        super().__init__(generator, loss, {"name": "discrete", "k": steps, "grid": grid}, **options)
+        super().__init__(generator, time={"name": "discrete", "k": steps, "grid": grid}, **options)
         generator.run_by(FixedSteps(steps, grid), fixed=True)

@@ -112,10 +112,7 @@ def method_of(name: str) -> Method:
 
 
 def usual_grid(name: str) -> str:
-    """The default grid of a method: denser towards t = 1 for predictor-correctors, else equal steps.
-
-    P = 1.75 is the best or nearly the best of the flows in docs/results.md.
-    """
+    """The default grid of a method: denser towards t = 1 for predictor-correctors, else equal steps."""
     return "power:1.75" if getattr(SOLVERS[name], "corrects", False) else "uniform"
 
 

@@ -4,8 +4,7 @@ How neighbouring returns differ along rows and columns, where rays are lost, how
 statistic is a mean over the rays of half of the rows, so that turning the scan does not change it. Six of them are
 taken in sectors of azimuth as well, which do change: a scan that is turned or mirrored is another one.
 
-Which statistics, how many bands and sectors, and the scale were chosen by benchmarks/ranking.py on half of its kinds of
-damage; docs/metrics.md has what it found on the other half.
+Statistics, bands, sectors and scale were chosen on half of the kinds of damage in docs/metrics.md.
 """
 
 from collections.abc import Iterator

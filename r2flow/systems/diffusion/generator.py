@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -12,14 +12,12 @@ from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.space import ModelSpace
-from r2flow.registry import Bound, Positive
+from r2flow.registry import Positive, Share
 from r2flow.samplers import MMPS, Repaint
 from r2flow.samplers.base import Call, Condition, Fresh, Generated, Given, Noise, OnGrid, Steps, last_of
 from r2flow.systems.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
 from r2flow.systems.diffusion.objectives import PREDICTIONS
 from r2flow.systems.diffusion.sampling import repaint, walk
-
-Share = Annotated[float, Bound("in [0, 1]", lambda eta: 0 <= eta <= 1)]
 
 
 class Diffusion(NetworkFlow):
