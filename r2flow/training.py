@@ -25,9 +25,10 @@ from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_fig
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import SOURCES, Layout, Prepared, reflectance_levels, resolve, resolve_reflectance
+from r2flow.data.opening import SOURCES, Layout, Prepared
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, SourceOptions
 from r2flow.data.reading import AUTO
+from r2flow.data.resolving import reflectance_levels, resolve, resolve_reflectance
 from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
 from r2flow.model.checkpoint import checkpoints_of, step_of

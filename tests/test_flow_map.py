@@ -8,9 +8,9 @@ import yaml
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import FlowDataset
-from r2flow.data.opening import resolve
 from r2flow.data.options import DataOptions, PairOptions
 from r2flow.data.pairs import PairDataset, PairSource, PairStore, make_pairs
+from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.path import interpolate

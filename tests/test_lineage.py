@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.data.opening import resolve
+from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint, weights_hash

@@ -16,10 +16,11 @@ from r2flow import simulator
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.mixture import MixedOrder, Mixture
-from r2flow.data.opening import open_source, resolve
+from r2flow.data.opening import open_source
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
 from r2flow.data.pairs import PairDataset, PairSource, PairStore
 from r2flow.data.reading import Reading
+from r2flow.data.resolving import resolve
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
 from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.encoding import Encoding
@@ -56,7 +57,7 @@ class ScanDataModule(L.LightningDataModule):
         augment = self.options.augment or {}
         check_options("data.augment", Augmentation, augment)
         self.augment = Augmentation(**augment)
-        self.validation = self.options.held
+        self.validation = self.options.validation_options
         self.further: Further | None = None
         self.names: list[str] = []
         self.training_source: ScanSource | PairSource | None = None

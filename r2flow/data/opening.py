@@ -19,7 +19,7 @@ from torch import Tensor
 
 from r2flow.data import layouts
 from r2flow.data.layouts import Drive, Layout, SourceKind, spans_of
-from r2flow.data.options import FOLDER, MIXED, PAIRS, PREPARED, SIMULATED, Data, DataOptions, SourceOptions
+from r2flow.data.options import FOLDER, PREPARED, SIMULATED, SourceOptions
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
@@ -28,7 +28,7 @@ from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensor_files import ENDINGS, read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
-from r2flow.registry import Registry, check_options, did_you_mean
+from r2flow.registry import Registry, did_you_mean
 from r2flow.store import MANIFEST, read_manifest
 
 log = logging.getLogger(__name__)
@@ -323,99 +323,3 @@ def open_prepared(
     if not len(scans):
         raise InputError(f"{folder} holds no usable scan of split={split!r}, drives={drives}.")
     return scans
-
-
-# The sets of scans that a run's `data` names
-
-
-def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping[str, Any] | None = None) -> Data:
-    """A run's `data` in which each set of scans says everything: parts and held-out scans take from the run what they
-    leave out, but for split and drives, and every `reading` has all fields of `ReadingOptions`.
-
-    Args:
-        scale: The value that means full reflectance in files of the sensor.
-        parent: The reading of the run that this run starts from, or of the flow that draws its pairs.
-    """
-    check_options("data", DataOptions, data)
-    run = DataOptions(**data)
-    inherited = () if run.name == SIMULATED else parent or () if run.name == PAIRS else ("projection", "convention")
-    reading = {**{key: parent[key] for key in inherited if parent and parent.get(key) is not None}, **run.chosen}
-
-    def whole(options: Mapping[str, Any], usual: Mapping[str, Any]) -> Data:
-        return {**options, "reading": _whole_reading(SourceOptions(**options), usual, scale)}
-
-    data = {**data, "reading": _whole_reading(run, reading, scale)}
-    if run.name == MIXED:
-        data["parts"] = [whole(part, reading) for part in _checked_parts(run)]
-    if run.scans is not None:
-        _check_set("data.scans", run.scans)
-        data["scans"] = whole(run.scans, {})
-    other = run.held.data
-    if other is not None and run.name != PAIRS:
-        held = {"name": run.name, "root": run.root, "scenes": run.scenes, **other}
-        _check_set("data.validation.data", held, split=False)
-        if held["name"] != run.name:  # other files, with columns and a scale of their own
-            reading = {key: value for key, value in reading.items() if key not in ("columns", "reflectance_scale")}
-            held["root"] = other.get("root")
-        data["validation"] = {**data["validation"], "data": whole(held, reading)}
-    return data
-
-
-def _whole_reading(options: SourceOptions, usual: Mapping[str, Any], scale: float | None) -> Data:
-    """Every field of `ReadingOptions`: what a set of scans says, else `usual`, else what its kind usually has."""
-    name, of_kind = options.name, 1.0
-    if name == FOLDER:
-        of_kind = scale or 1.0
-    elif name in SOURCES:
-        of_kind = SOURCES[name].reflectance_scale
-    reading: Data = {"projection": "spherical", "convention": "centre", "columns": None, "on_bad_scan": "error"}
-    reading |= {"reflectance_scale": of_kind, **usual, **options.chosen}
-    written = name == FOLDER and options.root is not None and made_here(str(options.root))
-    return {**reading, "reflectance_scale": 1.0} if written else reading
-
-
-def _checked_parts(run: DataOptions) -> list[Data]:
-    """The parts of a mixture."""
-    if not run.parts:
-        example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
-        raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
-    for number, part in enumerate(run.parts):
-        _check_set(f"data.parts[{number}]", part)
-    if len({part.get("weight") is None for part in run.parts}) > 1:
-        raise InputError("data.parts: give every part a weight, or none, for shares by size.")
-    if sum(part["name"] == SIMULATED for part in run.parts) > 1:
-        raise InputError("data.parts: simulated scenes are numbered; give one simulated part, with all its scenes.")
-    return [{"scenes": run.scenes, **part} for part in run.parts]
-
-
-def _check_set(what: str, options: Mapping[str, Any], split: bool = True) -> None:
-    """Refuse what names no single set of scans, or, with `split`, does not say whether test drives are meant too."""
-    check_options(what, SourceOptions, options)
-    name = options.get("name")
-    if name in (None, MIXED, PAIRS):
-        raise InputError(f"{what} needs the name of a data set, found {name!r}.")
-    known = ", ".join(SOURCES[name].splits)
-    if split and known and "split" not in options:
-        raise InputError(f"{what}: {name} has a standard split: give split, one of {known}, or null for all.")
-
-
-def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
-    """`encoding.reflectance` for a config's `data`: `auto` is true where each of its sets of scans has reflectance."""
-    if isinstance(wanted, bool):
-        return wanted
-    if wanted != AUTO:
-        raise InputError(f"encoding.reflectance must be true, false or auto, found {wanted!r}.")
-    named = DataOptions(**resolve(data))
-    for options in (*named.sets, *([named.held_out] if named.held_out else [])):
-        lacking = SOURCES[options.name].lacks_reflectance(options, options.on_bad_scan)
-        if lacking:
-            log.info("encoding.reflectance=auto is false here, a flow of range alone: %s", lacking)
-            return False
-    log.info("encoding.reflectance=auto is true here: the scans have it")
-    return True
-
-
-def reflectance_levels(data: Mapping[str, Any]) -> int | None:
-    """The levels of reflectance that all sets of a config's `data` share; None if they differ or are not known."""
-    levels = {SOURCES[options.name].levels_of(options) for options in DataOptions(**resolve(data)).sets}
-    return levels.pop() if len(levels) == 1 else None

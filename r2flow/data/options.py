@@ -133,12 +133,12 @@ class DataOptions(SourceOptions):
             )
 
     @property
-    def held(self) -> ValidationOptions:
+    def validation_options(self) -> ValidationOptions:
         """`validation`, checked."""
         check_options("data.validation", ValidationOptions, self.validation or {})
         return ValidationOptions(**(self.validation or {}))
 
-    # What follows needs the `data` of `r2flow.data.opening.resolve`.
+    # What follows needs the `data` of `r2flow.data.resolving.resolve`.
 
     @property
     def sets(self) -> list[SourceOptions]:
@@ -151,7 +151,8 @@ class DataOptions(SourceOptions):
     @property
     def held_out(self) -> SourceOptions | None:
         """The set of `validation.data`."""
-        return None if self.held.data is None or self.name == PAIRS else SourceOptions(**self.held.data)
+        other = self.validation_options.data
+        return None if other is None or self.name == PAIRS else SourceOptions(**other)
 
     @property
     def next_to_pairs(self) -> SourceOptions | None:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.config import groups_of, key_of, rule
-from r2flow.data.opening import resolve
 from r2flow.data.options import MIXED, PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
+from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.generators import GENERATORS
 from r2flow.model.checkpoint import Checkpoint, as_parent, load_checkpoint, weights_hash

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import reflectance_levels, resolve_reflectance
 from r2flow.data.prepared import PreparedScans
+from r2flow.data.resolving import reflectance_levels, resolve_reflectance
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding

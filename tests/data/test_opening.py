@@ -15,11 +15,11 @@ from r2flow.data.opening import (
     open_scans,
     own_reading,
     reading_for,
-    resolve_reflectance,
 )
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairSource, PairStore, make_pairs, pair_noise
 from r2flow.data.reading import Reading
+from r2flow.data.resolving import resolve_reflectance
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
