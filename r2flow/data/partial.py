@@ -167,6 +167,8 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
     few = turns and source.columns < FEWER * target.columns
     turn = f", in the columns that its {source.columns} rays a turn meet" if few else ""
     beyond = f", {int((rows < 0).sum())} beams look past its view" if (rows < 0).any() else ""
+    if beyond and source.name in SENSORS:
+        beyond += f" (--to {source.name} --size {4 * len(e)}x{source.columns} keeps all)"
     return f"{spec}: {beams}; {measured}{turn}{beyond}"
 
 
