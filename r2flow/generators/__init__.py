@@ -1,4 +1,4 @@
-"""What turns noise, and perhaps a condition, into a scan; by name."""
+"""Registry of generators: models that turn noise, and optionally a condition, into a scan."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -35,13 +35,12 @@ GENERATORS: Registry[type[Generator]] = Registry(
 
 
 def build_generator(config: Mapping[str, Any]) -> Generator:
-    """The generator of a config with the keys `sensor`, `encoding`, `backbone` and, where it is no rectified flow,
-    `generator`.
+    """Build the generator of a config: keys `sensor`, `encoding`, `backbone` and `generator` (default: rectified flow).
 
     Raises:
-        InputError: a key is missing, a name is unknown, an option is, or the sizes do not fit together.
+        InputError: a missing key, an unknown name or option, or incompatible sizes.
     """
-    with torch.device("cpu"):  # geometry needs its numbers, also where the weights are made on the meta device
+    with torch.device("cpu"):  # geometry needs real values, even if the weights are on the meta device
         space = build_space(config)
     if "backbone" not in config:
         raise InputError("the config has no 'backbone'.")

@@ -1,4 +1,4 @@
-"""What is known of scans, as generators take it."""
+"""Conditions: partial scans as input of a generator."""
 
 import numpy as np
 import torch
@@ -12,34 +12,34 @@ from r2flow.lidar.space import ModelSpace
 
 
 def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
-    """What is known of scans, as generators take it: `image` and `known`, each (B, C, H, W) in model space.
+    """Condition of partial scans: `image` and `known`, each (B, C, H, W) in model space.
 
-    `known` is 1 where a value was measured; elsewhere `image` has a guess (`r2flow.lidar.interpolation.interpolated`),
-    and 0 where nothing at all was measured.
+    `known` is 1 for measured values. Elsewhere `image` is interpolated (`r2flow.lidar.interpolation.interpolated`), or
+    0 if the scan has no measured ray.
 
     Args:
-        images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W); 0 without a return. Of a scan without
-            reflectance, that of its returns is not known; that of an empty ray is.
+        images: Range in metres and optionally reflectance, (B, 2 or 1, H, W); 0 without a return. Without the
+            reflectance channel, the reflectance of returns is unknown, that of empty rays is known.
         state: `r2flow.lidar.known.Ray` of each ray, (B, H, W).
 
     Raises:
-        InputError: images or states of another shape, or a ray that contradicts its state.
+        InputError: images or states of the wrong shape, or a ray that contradicts its state.
     """
     _, h, w = space.shape
     if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != (h, w):
         raise InputError(f"the images to complete must be (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}.")
     if state.shape != images[:, 0].shape:
         raise InputError(f"the states of the rays must be {tuple(images[:, 0].shape)}, found {tuple(state.shape)}.")
-    returned, seen = images[:, 0] > 0, state != Ray.UNKNOWN
-    if bool((seen & (state != torch.where(returned, int(Ray.RETURN), int(Ray.EMPTY)))).any()):
-        raise InputError("the state of a measured ray is Ray.RETURN where its range is above 0 and Ray.EMPTY where it "
-                         "is 0, and of another ray Ray.UNKNOWN.")  # fmt: skip
+    returned, measured = images[:, 0] > 0, state != Ray.UNKNOWN
+    if bool((measured & (state != torch.where(returned, int(Ray.RETURN), int(Ray.EMPTY)))).any()):
+        raise InputError("a ray's state must be Ray.RETURN for a range above 0, Ray.EMPTY for a measured range of 0, "
+                         "and Ray.UNKNOWN for a ray that was not measured.")  # fmt: skip
     encoding = space.encoding
-    silent = encoding.reflectance and images.shape[1] == 1
-    guesses = np.stack([interpolated(x, m) for x, m in zip(images.cpu().numpy(), seen.cpu().numpy(), strict=True)])
-    filled = torch.where(seen[:, None], images, torch.from_numpy(guesses).to(images))
-    image = encoding.encode(torch.cat([filled, torch.zeros_like(filled)], 1) if silent else filled)
-    known = seen[:, None].expand_as(image).to(image)
-    if silent:
+    without_reflectance = encoding.reflectance and images.shape[1] == 1
+    guesses = np.stack([interpolated(x, m) for x, m in zip(images.cpu().numpy(), measured.cpu().numpy(), strict=True)])
+    filled = torch.where(measured[:, None], images, torch.from_numpy(guesses).to(images))
+    image = encoding.encode(torch.cat([filled, torch.zeros_like(filled)], 1) if without_reflectance else filled)
+    known = measured[:, None].expand_as(image).to(image)
+    if without_reflectance:
         known[:, -1] *= ~returned
-    return {IMAGE: image * seen.flatten(1).any(1)[:, None, None, None], KNOWN: known}
+    return {IMAGE: image * measured.flatten(1).any(1)[:, None, None, None], KNOWN: known}

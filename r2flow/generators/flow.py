@@ -1,4 +1,4 @@
-"""Generators that follow a velocity: dx/dt = v(t, x) from noise at t = 0 to data at t = 1."""
+"""Flows: generators by the ODE dx/dt = v(t, x), from noise at t = 0 to data at t = 1."""
 
 from collections.abc import Mapping
 from copy import copy
@@ -16,14 +16,14 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.samplers import MMPS, FixedSteps, ODESampler, Progress, Sampler
 
-USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # of a new flow
+USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # default of a new flow
 
 
 class Flow(Generator):
-    """A generator by an ODE. A subclass gives its velocity.
+    """A generator by an ODE. A subclass defines `velocity`.
 
     Attributes:
-        completers: Samplers that complete scans, with the settings they have by default; the first one is the default.
+        completers: Samplers that complete scans, with their default settings; the first one is the default.
     """
 
     plain = "euler"
@@ -34,11 +34,11 @@ class Flow(Generator):
         raise NotImplementedError
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
-        """u(t, x, s), the mean velocity from t to s: v(t, x), but for a flow map."""
+        """u(t, x, s), the mean velocity from t to s; v(t, x) unless the flow is a flow map."""
         return self.velocity(t, x, condition)
 
     def field(self, condition: Condition | None = None) -> Velocity:
-        """v(t, x) under a condition, as solvers take it."""
+        """v(t, x) under a condition, as passed to solvers."""
         return self.velocity if condition is None else Conditioned(self, condition)
 
     @torch.no_grad()
@@ -53,10 +53,10 @@ class Flow(Generator):
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
-        """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options.
+        """Solve the ODE from x at t_0, (B, ...), to t_1; see `r2flow.flow.solvers.solve` for the options.
 
         Raises:
-            InputError: the sampler does not follow the flow's paths.
+            InputError: the sampler is not an ODE solver.
         """
         how = sampler or self.sampler
         how.check(self)
@@ -64,21 +64,21 @@ class Flow(Generator):
 
 
 class NetworkFlow(Flow):
-    """A flow whose velocity follows from a backbone. A subclass says how.
+    """A flow whose velocity is computed from a backbone's output, by the subclass.
 
     Args:
-        space: The images it makes.
+        space: Model space of the images.
         backbone: Name and options, as in conf/backbone.
 
     Attributes:
-        answer: What its network tells.
-        region: The part of the image that it makes; None for all of it.
+        answer: The quantity that the network predicts.
+        region: Region of the image that is generated; None: all of it.
     """
 
     answer: str = "v(t, x)"
     region: Region | None = None
-    condition_channels: int = 0  # further input channels of the backbone, for a subclass with a condition
-    second_time: ClassVar[bool] = False  # whether the backbone takes a second time, for a subclass that is a flow map
+    condition_channels: int = 0  # additional input channels of the backbone, for a condition
+    second_time: ClassVar[bool] = False  # whether the backbone takes a second time, for flow maps
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space)
@@ -88,39 +88,38 @@ class NetworkFlow(Flow):
         )
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
-        """The noise of step j, for the part of the image that is made."""
+        """Noise of step j, cropped to the region."""
         noise = draws.step(self.noise_shape, j)
         return noise if self.region is None else self.region.crop(noise)
 
     def start_from(self, parent: Generator) -> None:
-        """Take over a flow's weights; what a second time adds changes nothing at first.
+        """Copy a flow's weights; layers for a second time are kept and start as a no-op.
 
-        Of a flow map all but its velocity u(x, t, t) is forgotten. A flow that looks elsewhere, as through another
-        sensor, keeps its own rays.
+        Only the velocity u(x, t, t) of a flow map is copied. Ray coordinates are not copied if the rays differ.
         """
-        theirs_tell = getattr(parent, "answer", self.answer)
-        if theirs_tell != self.answer:
-            raise InputError(f"the network to start from tells {theirs_tell}, and this one learns {self.answer}.")
-        own = self.state_dict()
-        apart = parent.backbone.second_time_names() if isinstance(parent, NetworkFlow) else frozenset[str]()
-        theirs = {
+        parent_answer = getattr(parent, "answer", self.answer)
+        if parent_answer != self.answer:
+            raise InputError(f"the parent's network tells {parent_answer}, and this one learns {self.answer}.")
+        state = self.state_dict()
+        added = parent.backbone.second_time_names() if isinstance(parent, NetworkFlow) else frozenset[str]()
+        inherited = {
             name: value
             for name, value in parent.state_dict().items()
-            if name in own or (name.startswith("backbone.") and name.removeprefix("backbone.") not in apart)
+            if name in state or (name.startswith("backbone.") and name.removeprefix("backbone.") not in added)
         }
-        new = {name: value for name, value in own.items() if not name.startswith("backbone.")}
-        new |= {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
+        new = {name: value for name, value in state.items() if not name.startswith("backbone.")}
+        new |= {name: state[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
         if not torch.equal(self.space.rays, parent.space.rays):
-            theirs |= {name: value for name, value in own.items() if name.endswith(".coords")}  # of an inner one too
-            sized = [name for name, value in theirs.items() if name in own and value.shape != own[name].shape]
+            inherited |= {name: value for name, value in state.items() if name.endswith(".coords")}  # inner ones too
+            sized = [name for name, value in inherited.items() if name in state and value.shape != state[name].shape]
             if sized:
-                here, there = ("x".join(map(str, one.space.shape)) for one in (self, parent))
+                size, parent_size = ("x".join(map(str, flow.space.shape)) for flow in (self, parent))
                 raise InputError(
-                    f"the network to start from has weights for images of {there} ('{sized[0]}'), found {here}: leave "
+                    f"the parent has weights for images of {parent_size} ('{sized[0]}'), found {size}: leave "
                     f"sensor out, give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}, "
-                    "or first grow it to a multiple of its size (examples/street/growing.py)."
+                    "or first grow the parent to a multiple of its size (examples/street/growing.py)."
                 )
-        self._take(parent, {**new, **theirs})
+        self._take(parent, {**new, **inherited})
 
     @property
     def unit(self) -> tuple[int, int]:
@@ -131,7 +130,7 @@ class NetworkFlow(Flow):
         return self.backbone.learns_directions
 
     def part(self, region: Region) -> Self:
-        """The flow on a region alone: its network does not see the rest of the image."""
+        """The flow on a region; the network does not see the rest of the image."""
         if region.share == 1:
             return self
         part = copy(self)
@@ -141,7 +140,7 @@ class NetworkFlow(Flow):
 
 
 class RectifiedFlow(NetworkFlow):
-    """v(t, x) by a backbone: 1-RF, k-RF and k-TD alike, which differ in how they are learned and in their sampler."""
+    """v(t, x) by a backbone. 1-RF, k-RF and k-TD differ only in training and sampler."""
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)
@@ -154,7 +153,7 @@ class RectifiedFlow(NetworkFlow):
 
 
 class Conditioned:
-    """v(t, x) or u(t, x, s) of a flow under a condition, which follows the scans that are still asked for."""
+    """v(t, x) or u(t, x, s) of a flow under a condition; `select` takes the condition of some scenes."""
 
     def __init__(self, flow: Flow, condition: Condition) -> None:
         self.flow, self.condition = flow, condition
@@ -170,12 +169,12 @@ class Conditioned:
 
 
 def ode_sampler(flow: Flow) -> Sampler:
-    """A flow's own sampler if it follows the flow's paths, else the usual one."""
+    """The flow's default sampler if it is an ODE sampler, else `USUAL`."""
     return flow.sampler if isinstance(flow.sampler, ODESampler) else USUAL
 
 
 def as_flow(generator: Generator, what: str) -> Flow:
-    """The generator as a flow."""
+    """The generator, if it is a flow."""
     if not isinstance(generator, Flow):
-        raise InputError(f"{what} needs the velocity of a flow, which a {type(generator).__name__} does not have.")
+        raise InputError(f"{what} needs the velocity of a flow; a {type(generator).__name__} does not have one.")
     return generator

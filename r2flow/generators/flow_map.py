@@ -1,4 +1,4 @@
-"""A flow map: one network that jumps from any time to any other."""
+"""Flow map: a network that jumps from any time t to any time s."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -15,12 +15,11 @@ from r2flow.samplers import Jump
 class FlowMap(RectifiedFlow):
     """X_{t->s}(x) = x + (s - t) u(x, t, s) with u by a backbone of two times.
 
-    It is run by `r2flow.samplers.maps`, and by a flow's samplers with v(t, x) = u(x, t, t). Its backbone takes a second
-    time.
+    Samplers: those of `r2flow.samplers.maps`, and a flow's samplers with v(t, x) = u(x, t, t).
     """
 
     second_time: ClassVar[bool] = True
-    goes_on_as = "rectified_flow"  # where velocities alone are learned, the jumps would be those of another flow
+    goes_on_as = "rectified_flow"  # a velocity loss would leave the jumps to those of the old flow
     plain = "jump"
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:

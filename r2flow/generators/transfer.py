@@ -1,4 +1,4 @@
-"""A rectified flow from a repaired scan to the scan: x_0 is no noise, but what the known rays say of the others."""
+"""Rectified flow from an interpolated partial scan (plus noise), instead of pure noise, to the full scan."""
 
 import math
 from collections.abc import Mapping
@@ -21,25 +21,25 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.registry import NonNegative
 from r2flow.samplers import Jump
 
-LAST = 1e-5  # of the time: where the velocity stops to grow
-CANDIDATES = 7  # six of `Surroundings` and the network's own
+LAST = 1e-5  # smallest 1 - t that the velocity is divided by
+CANDIDATES = 7  # six of `Surroundings` and one predicted freely by the network
 BISECTIONS = 28
-FINEST = 1e-3  # of a range: no return is known better
-FREE, SHIFT = 0.3, 0.02  # how far the answer nought moves a free range, and one of a neighbour, on log r
-NEVER = -1e4  # logit of what there is not
-WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0}  # of the three parts of the loss
+FINEST = 1e-3  # smallest Laplace scale on log r
+FREE, SHIFT = 0.3, 0.02  # log r per unit of network output: of the free candidate, of a neighbour
+NEVER = -1e4  # logit of a missing candidate
+WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0}  # loss weights
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What the network says of every ray: p(x_1 | x_t, what is known).
+    """The network's prediction for every ray: p(x_1 | x_t, condition), a mixture over candidates.
 
     Attributes:
-        logits: Log probability of each candidate, given that the ray returns, (B, 7, H, W).
-        ranges: Its log r, (B, 7, H, W); the last candidate is the network's own.
-        scales: b of its Laplace density on log r, (B, 7, H, W).
+        logits: Log probability of each candidate, given a return, (B, 7, H, W).
+        ranges: log r of each candidate, (B, 7, H, W); the last one is predicted freely by the network.
+        scales: Scale b of each candidate's Laplace density on log r, (B, 7, H, W).
         returns: Logit of a return, (B, 1, H, W).
-        strengths: Reflectance with each candidate, (B, 7, H, W).
+        strengths: Reflectance of each candidate, (B, 7, H, W).
     """
 
     logits: Tensor
@@ -54,51 +54,51 @@ class Answers:
         return each.logsumexp(1, keepdim=True)
 
     def quantile(self, u: Tensor) -> Tensor:
-        """The log r below which a return lies with probability u of (0, 1), (B, 1, H, W), by bisection."""
+        """Quantile of log r given a return, at u in (0, 1), (B, 1, H, W), by bisection."""
         p = self.logits.exp()
         low, high = (self.ranges - 20 * self.scales).amin(1, True), (self.ranges + 20 * self.scales).amax(1, True)
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
-            off = (middle - self.ranges) / self.scales
-            below = (p * torch.where(off < 0, off.exp() / 2, 1 - (-off).exp() / 2)).sum(1, keepdim=True) < u
+            z = (middle - self.ranges) / self.scales
+            below = (p * torch.where(z < 0, z.exp() / 2, 1 - (-z).exp() / 2)).sum(1, keepdim=True) < u
             low, high = torch.where(below, middle, low), torch.where(below, high, middle)
         return (low + high) / 2
 
     def likeliest(self, log_r: Tensor) -> Tensor:
-        """The candidate that log r is most likely of, (B, 1, H, W)."""
+        """Index of the candidate most likely to have produced log r, (B, 1, H, W)."""
         each = self.logits - self.scales.log() - (log_r - self.ranges).abs() / self.scales
         return each.argmax(1, keepdim=True)
 
     def least_error(self) -> Tensor:
-        """The candidate whose expected |log r - m_k| is least, (B, 1, H, W).
+        """Index k of the candidate with the smallest expected |log r - m_k|, (B, 1, H, W).
 
-        E|m - X| = |m - m_j| + b_j exp(-|m - m_j| / b_j) for X of the Laplace density of candidate j.
+        E|m - X| = |m - m_j| + b_j exp(-|m - m_j| / b_j) for X from the Laplace density of candidate j.
         """
         p, errors = self.logits.exp(), []
         for k in range(CANDIDATES):
-            off = (self.ranges[:, k : k + 1] - self.ranges).abs()
-            errors.append((p * (off + self.scales * (-off / self.scales).exp())).sum(1))
+            distance = (self.ranges[:, k : k + 1] - self.ranges).abs()
+            errors.append((p * (distance + self.scales * (-distance / self.scales).exp())).sum(1))
         missing = self.logits <= NEVER / 2
         return torch.stack(errors, 1).masked_fill(missing, torch.inf).argmin(1, keepdim=True)
 
 
 class TransferFlow(Flow):
-    """A rectified flow whose lines begin at a scan: x_t = (1 - t) x_0 + t x_1 with x_0 = s(x_1) + sigma e.
+    """Rectified flow that starts at a partial scan: x_t = (1 - t) x_0 + t x_1 with x_0 = s(x_1) + sigma e.
 
-    s keeps the known rays and fills the others from the known returns next to them. The network learns the density of
-    x_1 given x_t and what is known, ray by ray: a mixture over candidates, these neighbours among them, so that an edge
-    stays an edge (variational flow matching, Eijkelboom et al. 2024). The velocity is that of its mean,
+    s keeps the known rays and interpolates the others from the nearest known returns. The network learns the density
+    of x_1 given x_t and the condition, ray by ray: a mixture over candidates, among them these neighbours, which keeps
+    edges sharp (variational flow matching, Eijkelboom et al. 2024). The velocity is that of the mixture's mean,
 
-        v = (E[x_1 | x_t] - x_t) / (1 - t),
+        v = (E[x_1 | x_t] - x_t) / (1 - t).
 
-    and a step that ends at t = 1 takes the candidate of least expected error instead, or no return where that is more
-    likely. So one evaluation gives the median of each ray; the sampler `transport` draws answers that differ as far as
-    the scan leaves it open. Known rays come back to the bit. It takes images of any size and sensor (`at`).
+    A step that ends at t = 1 takes the candidate of least expected error instead, or no return if that is more likely:
+    one evaluation gives the median of each ray. The sampler `transport` draws diverse completions. Known rays are
+    returned bit for bit. Images can have any size and sensor (`at`).
 
     Args:
-        space: The images it makes.
-        backbone: Name and options of one that takes any size, as conf/backbone/local.yaml.
-        sigma: Noise of x_0 in model space.
+        space: Model space of the images.
+        backbone: Name and options of a backbone for any size, as in conf/backbone/local.yaml.
+        sigma: Standard deviation of the noise in x_0, in model space.
     """
 
     told, draws = True, False
@@ -118,10 +118,10 @@ class TransferFlow(Flow):
         self.run_by(Jump(steps=1))
 
     def at(self, space: ModelSpace, numbered: bool = True) -> Self:
-        """The same flow through another sensor, its weights shared.
+        """This flow for another sensor; it shares the weights.
 
         Args:
-            numbered: Whether what was learned of single rows holds: rows that the trained sensor does not fill.
+            numbered: Whether to use the vectors learned per row (`RowFeatures`).
         """
         part = copy(self)
         part.space, part.noise_shape, part.elevations = space, space.shape, space.rays[0, :, 0]
@@ -129,21 +129,22 @@ class TransferFlow(Flow):
         return part
 
     def answers(self, t: Tensor, x: Tensor, about: Surroundings, rows: Tensor) -> Answers:
-        """p(x_1 | x_t, what is known).
+        """p(x_1 | x_t, condition).
 
         Args:
             t: (B,) or ().
             x: x_t, (B, C, H, W).
-            rows: Of `RowFeatures`.
+            about: Candidates and features of the condition.
+            rows: Output of `RowFeatures`.
         """
         shape = len(x), -1, *x.shape[2:]
-        seen = torch.cat([x - about.start, about.features, rows.expand(*shape)], 1)
-        said = self.backbone(t, seen).float()
-        logits, shifts, scales = said[:, :-2].chunk(3, 1)
-        returns, strength = said[:, -2:].split(1, 1)
-        usual = said.new_tensor([0, 0, 0, 0, 2, 1, 0])[:, None, None]
-        there = torch.cat([about.there, torch.ones_like(about.there[:, :1])], 1)
-        logits = (logits + usual).masked_fill(~there, NEVER).log_softmax(1)
+        inputs = torch.cat([x - about.start, about.features, rows.expand(*shape)], 1)
+        output = self.backbone(t, inputs).float()
+        logits, shifts, scales = output[:, :-2].chunk(3, 1)
+        returns, strength = output[:, -2:].split(1, 1)
+        bias = output.new_tensor([0, 0, 0, 0, 2, 1, 0])[:, None, None]
+        present = torch.cat([about.there, torch.ones_like(about.there[:, :1])], 1)
+        logits = (logits + bias).masked_fill(~present, NEVER).log_softmax(1)
         ranges = torch.cat([about.ranges + SHIFT * shifts[:, :6], about.guess + FREE * shifts[:, 6:]], 1)
         scales = (scales - 4).clamp(max=2).exp() + FINEST
         nearest = about.strengths.gather(1, about.there.int().argmax(1, keepdim=True))
@@ -155,7 +156,7 @@ class TransferFlow(Flow):
         return self._toward(t, x, condition, last=False)
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
-        """The velocity, and to s = 1 that of the straight line to the answer."""
+        """The velocity; for s = 1, that of the straight line to the point estimate of x_1."""
         return self._toward(t, x, condition, last=bool((torch.as_tensor(s) >= 1).all()))
 
     def map(self, condition: Condition | None = None) -> MeanVelocity:
@@ -170,10 +171,9 @@ class TransferFlow(Flow):
         return ((x_1 - x) / (1 - expand_time(t, x)).clamp(min=LAST)).to(x)
 
     def transported(self, x_0: Tensor, condition: Condition) -> Tensor:
-        """x_1 by the monotone map of each ray's noise e to its density, in one evaluation: log r = F^-1(Phi(e)).
+        """x_1 in one evaluation, by the monotone map of each ray's noise e to its density: log r = F^-1(Phi(e)).
 
-        That is the optimal transport between the two, ray by ray: of many x_0 as many returns, and ranges, as the
-        network expects. Rays do not know of one another.
+        This is the optimal transport between the two in one dimension. Rays are independent of each other.
         """
         answers = self._answered(torch.zeros((), device=x_0.device), x_0, condition)
         u = torch.special.ndtr((x_0 - condition["start"])[:, :1].float() / max(self.sigma, 1e-6))
@@ -206,7 +206,7 @@ class TransferFlow(Flow):
     @torch.no_grad()
     def forward(self, noise: Tensor, condition: Condition | None = None, **how: Any) -> Generated:
         if condition is None:
-            raise InputError("a transfer flow begins at a scan: give it one, by r2flow complete.")
+            raise InputError("a transfer flow begins at a scan: give a condition, or use r2flow complete.")
         weight = next(self.parameters())
         condition = {name: value.to(weight) for name, value in condition.items()}
         image, known = parts_of(condition, noise.to(weight))
@@ -223,39 +223,39 @@ class TransferFlow(Flow):
     def loss(
         self, x_1: Tensor, condition: Condition, t: Tensor, noise: Tensor, steps: Tensor, rows: Tensor
     ) -> Mapping[str, Tensor]:
-        """The negative log-likelihood of the hidden rays of scans, by part: log r, return, and |reflectance|.
+        """Losses over the hidden rays: negative log-likelihood of log r and of a return, mean |error| of reflectance.
 
         Args:
-            x_1: The scans, or parts of them whose columns are no full turn, (B, C, H, W).
-            condition: Their `image` and `known`.
+            x_1: Crops of scans that do not span a full turn, (B, C, H, W).
+            condition: `image` and `known` of the crops.
             t: Times, (B,).
             noise: (B, C, H, W).
             steps: As in `Surroundings.of`.
-            rows: Of `RowFeatures`.
+            rows: Output of `RowFeatures`.
         """
         about = Surroundings.of(self.space, condition, ring=False, steps=steps)
         known = condition[KNOWN]
         x_0 = about.start + self.sigma * (known < 1) * noise
-        at = expand_time(t, x_1)
-        answers = self.answers(t, torch.where(known > 0, x_1, (1 - at) * x_0 + at * x_1), about, rows)
+        times = expand_time(t, x_1)
+        answers = self.answers(t, torch.where(known > 0, x_1, (1 - times) * x_0 + times * x_1), about, rows)
         metres = self.space.decode(x_1)
         returned, hidden = metres[:, :1] > 0, condition[KNOWN][:, :1] < 1
         log_r = torch.where(returned, metres[:, :1], 1.0).log()
-        both = (returned & hidden).float()
-        parts = {
-            "range": -_mean_over(answers.log_density(log_r), both),
+        mask = (returned & hidden).float()
+        losses = {
+            "range": -_mean_over(answers.log_density(log_r), mask),
             "return": _mean_over(
                 F.binary_cross_entropy_with_logits(answers.returns, returned.float(), reduction="none"), hidden.float()
             ),
         }
         if self.space.encoding.reflectance:
-            off = (answers.strengths - metres[:, 1:2]).abs()
-            parts["reflectance"] = _mean_over((answers.logits.detach().exp() * off).sum(1, keepdim=True), both)
-        return parts
+            errors = (answers.strengths - metres[:, 1:2]).abs()
+            losses["reflectance"] = _mean_over((answers.logits.detach().exp() * errors).sum(1, keepdim=True), mask)
+        return losses
 
 
 def _within_reach(known: Tensor) -> Tensor:
-    """Rows between the measured ones and, beyond these, as far as they are apart, (B, 1, H, 1), of (B, 1, H, W)."""
+    """Rows, (B, 1, H, 1), between measured rows or within their largest gap beyond them; `known` is (B, 1, H, W)."""
     reach = []
     for rows in known[:, 0].any(2):
         measured = rows.nonzero()[:, 0]
@@ -263,8 +263,8 @@ def _within_reach(known: Tensor) -> Tensor:
         if len(measured) == 0:
             reach.append(rows)
             continue
-        apart = measured.diff().max() if len(measured) > 1 else len(rows)
-        reach.append((number > measured[0] - apart) & (number < measured[-1] + apart))
+        gap = measured.diff().max() if len(measured) > 1 else len(rows)
+        reach.append((number > measured[0] - gap) & (number < measured[-1] + gap))
     return torch.stack(reach)[:, None, :, None]
 
 
