@@ -176,5 +176,5 @@ def ode_sampler(flow: Flow) -> Sampler:
 def as_flow(generator: Generator, what: str) -> Flow:
     """The generator, if it is a flow."""
     if not isinstance(generator, Flow):
-        raise InputError(f"{what} needs the velocity of a flow; a {type(generator).__name__} does not have one.")
+        raise InputError(f"{what} needs the velocity of a flow, which a {type(generator).__name__} does not have.")
     return generator

@@ -1,9 +1,10 @@
-"""How a generator is run: a frozen dataclass a way, by name.
+"""Registry of samplers. A sampler is a frozen dataclass that runs a generator.
 
     build_sampler({"name": "adams3", "steps": 16})
     build_sampler("chord", steps=2)
 
-A new one is a dataclass of `Sampler` with `SAMPLERS.add(name, cls)`; a solver in `r2flow.flow.solvers.SOLVERS` is one.
+To add a sampler, derive a dataclass from `Sampler` and call `SAMPLERS.add(name, cls)`. Every solver in
+`r2flow.flow.solvers.SOLVERS` is also a sampler.
 """
 
 import re
@@ -30,7 +31,7 @@ __all__ = [
 
 
 class _Samplers(Registry[Any]):
-    """The solvers by their names, and everything else."""
+    """The registered samplers and, by their names, all solvers."""
 
     def __getitem__(self, name: str) -> Any:
         if name not in SOLVERS or name in self._entries:
@@ -46,9 +47,9 @@ class _Samplers(Registry[Any]):
         return iter([*SOLVERS, *self._entries])
 
     def name_of(self, kind: type[Sampler]) -> str:
-        """The name that a class has here."""
-        unread = lazy(f"{kind.__module__}:{kind.__qualname__}")
-        return next(name for name, entry in self._entries.items() if entry is kind or entry == unread)
+        """Name of a registered class."""
+        reference = lazy(f"{kind.__module__}:{kind.__qualname__}")
+        return next(name for name, entry in self._entries.items() if entry is kind or entry == reference)
 
 
 SAMPLERS = _Samplers(
@@ -71,10 +72,10 @@ SAMPLERS = _Samplers(
 
 
 def parse_sampler(text: str) -> dict[str, Any]:
-    """Name and fields of `NAME[:FIELD=VALUE]...`, as `sde:steps=16:grid=power:2`."""
-    name, *given = re.split(r":(?=\w+=)", text)
-    words = (word.partition("=") for word in given)
-    return {"name": name, **{key: _plain(value) for key, _, value in words}}
+    """Parse `NAME[:FIELD=VALUE]...`, as `sde:steps=16:grid=power:2`, into name and fields."""
+    name, *fields = re.split(r":(?=\w+=)", text)
+    pairs = (word.partition("=") for word in fields)
+    return {"name": name, **{key: _plain(value) for key, _, value in pairs}}
 
 
 def _plain(text: str) -> Any:
@@ -85,10 +86,10 @@ def _plain(text: str) -> Any:
 
 
 def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
-    """A sampler by its name and fields; a text is that of `parse_sampler`. Given times decide the number of steps.
+    """Build a sampler from name and fields, or from a text (`parse_sampler`). `steps` follows from a grid of times.
 
     Raises:
-        InputError: an unknown name, an unknown field, or a value that a field cannot have.
+        InputError: an unknown name or field, or an invalid value.
     """
     options = parse_sampler(options) if isinstance(options, str) else options
     if not isinstance(options, Mapping) or not isinstance(options.get("name"), str):

@@ -1,4 +1,4 @@
-"""What every sampler has in common: noise in, scans out, and its fields as plain values."""
+"""Base class of samplers, and their result."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
@@ -18,7 +18,7 @@ Condition = Mapping[str, Tensor]
 
 Call = Callable[[], None]
 Progress = Call | None
-Noise = Callable[[int], Tensor]  # N(0, 1) of the j-th draw, j = 1, 2, ..., in the noise's shape
+Noise = Callable[[int], Tensor]  # the j-th draw from N(0, 1), j = 1, 2, ..., in the noise's shape
 Given = Condition | None
 Fresh = Noise | None
 Steps = Annotated[int, Bound("from 1 to 1,000,000", lambda n: 1 <= n <= 10**6)]
@@ -32,7 +32,7 @@ class Generated:
     Attributes:
         x: x_1, (B, C, H, W), on the generator's device, float32 or float64.
         evaluations: Network evaluations of each scan, (B,) int64.
-        converged: Whether each is finite and, for an adaptive method, solved, (B,) bool.
+        converged: Whether each scan is finite and, for an adaptive method, solved, (B,) bool.
     """
 
     x: Tensor
@@ -41,10 +41,10 @@ class Generated:
 
     @classmethod
     def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:
-        """Scans after the same number of evaluations.
+        """Scans that took the same number of evaluations.
 
         Args:
-            converged: Whether each was finite all the way, (B,) bool; None: where x is finite.
+            converged: Whether each scan was finite at every step, (B,) bool; None: whether x is finite.
         """
         counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
         x = wide(x)
@@ -52,7 +52,7 @@ class Generated:
 
 
 def last_of(states: Iterable[Tensor], progress: Call) -> Tensor:
-    """The last of a sampler's states; calls `progress` after each."""
+    """Iterate over a sampler's states, calling `progress` after each; return the last one."""
     for state in states:
         progress()
         last = state
@@ -60,14 +60,14 @@ def last_of(states: Iterable[Tensor], progress: Call) -> Tensor:
 
 
 class Sampler(ABC):
-    """How a generator is run. A subclass is a frozen dataclass in `SAMPLERS`; name and fields are what a config, a
-    checkpoint and a command line hold.
+    """How a generator is run. A subclass is a frozen dataclass in `SAMPLERS`; configs, checkpoints and the command line
+    store its name and fields.
 
     Attributes:
-        draws: Whether noise is drawn on the way.
-        paired: Whether x_1 still belongs to its noise x_0, so that both can be a reflow pair.
-        completes: Whether a condition is needed.
-        needs: Attribute of the generators that the sampler can run.
+        draws: Whether the sampler is stochastic: it draws noise after x_0.
+        paired: Whether x_1 is a deterministic function of x_0, so that both can be a reflow pair.
+        completes: Whether a condition is required.
+        needs: Attribute that a generator must have.
     """
 
     draws: ClassVar[bool] = False
@@ -77,43 +77,43 @@ class Sampler(ABC):
 
     @abstractmethod
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        """x_1 in model space, (B, C, H, W).
+        """Generate x_1 in model space, (B, C, H, W).
 
         Args:
-            generator: One that has `needs`.
+            generator: A generator with the attribute `needs`.
             noise: (B, *noise_shape), on the generator's device, float32 or float64.
             condition: Condition of each scan.
-            draws: Noise of step j; given where `draws` is True.
-            progress: Called after every evaluation of the network.
+            draws: Noise of step j; required if `self.draws`.
+            progress: Called after every network evaluation.
         """
 
     @property
     def name(self) -> str:
-        """Its name in `SAMPLERS`."""
+        """Name in `SAMPLERS`."""
         from r2flow.samplers import SAMPLERS
 
         return SAMPLERS.name_of(type(self))
 
     def evaluations(self, generator: Any) -> int | None:
-        """Network evaluations of a batch; None where they depend on the scans."""
+        """Network evaluations per scan; None if they depend on the scans."""
         return getattr(self, "steps", None)
 
     def check(self, generator: Any) -> None:
         """Refuse a generator that the sampler cannot run."""
         if getattr(generator, self.needs, None) is None:
             kind = type(generator).__name__
-            raise InputError(f"sampler {self.name} needs a generator with a {self.needs}, which a {kind} is not.")
+            raise InputError(f"sampler {self.name} needs a generator with a {self.needs}; a {kind} has none.")
 
     def solve(self, *args: Any, **options: Any) -> Solution:
-        """The state at t_1 of the ODE, by an `ODESampler`."""
+        """Solve the ODE to t_1; only an `ODESampler` can."""
         raise InputError(f"sampler {self.name} does not follow the flow's paths: give a solver, such as adams3.")
 
     def knot_times(self, knots: int) -> Tensor:
-        """Times of both ends and of the inner states that a solution keeps, (knots + 2,) float64."""
-        raise InputError(f"sampler {self.name} keeps no inner states; give a solver of fixed steps, such as adams3.")
+        """Times of x_0, of the inner states that a solution keeps, and of x_1, (knots + 2,) float64."""
+        raise InputError(f"sampler {self.name} keeps no inner states; give a fixed-step solver, such as adams3.")
 
     def changed(self, **options: Any) -> Self:
-        """The same sampler with the options that are not None."""
+        """A copy with the options that are not None."""
         options = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in options.items()}
         options = {key: value for key, value in options.items() if value is not None}
         check_options(f"sampler '{self.name}'", type(self), {**self._fields(), **options})
@@ -123,12 +123,12 @@ class Sampler(ABC):
         return replace(self, **_with_steps(options))  # type: ignore[type-var]
 
     def asdict(self) -> dict[str, Any]:
-        """Name and fields as plain values, as a config or a checkpoint holds them."""
+        """Name and fields as plain values, as stored in a config or a checkpoint."""
         return {"name": self.name, **self._fields()}
 
     def _fields(self) -> dict[str, Any]:
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
-        if values.get("method") == self.name:  # a solver, whose name says it
+        if values.get("method") == self.name:  # a solver's name is its method
             del values["method"]
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
@@ -139,11 +139,11 @@ class Sampler(ABC):
 
 @dataclass(frozen=True)
 class OnGrid(Sampler):
-    """A sampler that steps from time to time.
+    """A sampler with fixed steps on a time grid.
 
     Attributes:
-        steps: Steps from t = 0 to t = 1.
-        grid: Where they begin and end: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
+        steps: Number of steps from t = 0 to t = 1.
+        grid: Time grid: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
     """
 
     steps: Steps = 32
@@ -157,17 +157,17 @@ class OnGrid(Sampler):
         self.times()
 
     def times(self, t_0: float = 0.0, t_1: float = 1.0, fewer: int = 0) -> Tensor:
-        """From t_0 to t_1, (steps - fewer + 1,) float64."""
-        with torch.device("cpu"):  # also where weights are made on the meta device
+        """Time grid from t_0 to t_1, (steps - fewer + 1,) float64."""
+        with torch.device("cpu"):  # even if the default device is meta
             return build_grid(self.times_or_name, t_0, t_1, self.steps - fewer)
 
     @property
     def times_or_name(self) -> str | Tensor:
-        """The grid as solvers take it."""
+        """The grid as passed to solvers."""
         return self.grid if isinstance(self.grid, str) else torch.tensor(self.grid, dtype=torch.float64)
 
 
 def _with_steps(options: dict[str, Any]) -> dict[str, Any]:
-    """Options in which given times decide the number of steps."""
+    """Add `steps` to options whose grid is a list of times."""
     grid = options.get("grid")
     return options if not isinstance(grid, list | tuple) else {"steps": len(grid) - 1, **options}

@@ -1,4 +1,4 @@
-"""Samplers of a flow map X_{t->s}(x) = x + (s - t) u(x, t, s): one evaluation a step."""
+"""Samplers of a flow map X_{t->s}(x) = x + (s - t) u(x, t, s): one evaluation per step."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,14 +14,14 @@ from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Sa
 
 @dataclass(frozen=True)
 class Jump(OnGrid):
-    """X_{t->s} from each time of the grid to the next."""
+    """Apply X_{t->s} from each time of the grid to the next."""
 
     needs: ClassVar[str] = "map"
 
     steps: Steps = 4
 
     def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
-        """x_s, with fresh noise e where the sampler draws."""
+        """x_s; e is fresh noise if the sampler is stochastic."""
         return jump(u, t, x, s)
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
@@ -35,14 +35,14 @@ class Jump(OnGrid):
 
 @dataclass(frozen=True)
 class Chord(Jump):
-    """x_s = x_t + (s - t) u(x_t, t, 1), on the straight line to the end of a jump.
+    """x_s = x_t + (s - t) u(x_t, t, 1), a point on the straight line to X_{t->1}(x_t).
 
-    The next jump sees that end under less of the same noise and corrects it. This is DDIM's step (Song et al. 2021)
-    with X_{t->1}(x_t) for the estimate of the scan; exact where paths are straight. Elsewhere x_s does not have the
-    density of the flow at s even for the exact map, and each jump adds grain to the reflectance.
+    This is DDIM's step (Song et al. 2021) with X_{t->1}(x_t) as the estimate of the scan: the next jump starts with
+    less of the same noise and corrects the estimate. It is exact if paths are straight. Otherwise x_s does not have
+    the flow's density at s, even for the exact map, and each jump adds grain to the reflectance.
 
     Attributes:
-        grid: None for `late`.
+        grid: None: `late`.
     """
 
     steps: Steps = 2
@@ -59,7 +59,7 @@ class Chord(Jump):
 class Renoise(Jump):
     """x_s = (1 - s) e + s X_{t->1}(x_t) with fresh noise e (Song et al. 2023, consistency models, algorithm 1).
 
-    A sample of the same distribution where the map is exact, and not the end of this noise's own path.
+    If the map is exact, x_1 has the right distribution, but is not the end of the path of x_0.
     """
 
     draws: ClassVar[bool] = True
@@ -70,7 +70,7 @@ class Renoise(Jump):
 
 @dataclass(frozen=True)
 class Transport(Sampler):
-    """One evaluation, by which a generator carries the noise of each ray to the density of its answer."""
+    """One evaluation: map the noise of each ray to the predicted density (`TransferFlow.transported`)."""
 
     needs: ClassVar[str] = "transported"
 
@@ -84,7 +84,7 @@ class Transport(Sampler):
 
 
 def late(steps: int, k: float = 32.0) -> Tensor:
-    """One long step, the rest near t = 1: 1 - t falls evenly on a log scale about 1 / k, from at most 2 / k.
+    """Time grid of one long step and short steps near t = 1: 1 - t_j is log-spaced between 2 / k and 1 / (2 k).
 
     1 - t_j = 2^(1 - (2 j - 1) / (N - 1)) / k for j = 1 to N - 1 of N steps.
     """

@@ -1,4 +1,4 @@
-"""The ODE dx/dt = v(t, x) of a flow, by a solver of `r2flow.flow.solvers`."""
+"""ODE samplers: solve dx/dt = v(t, x) by a solver of `r2flow.flow.solvers`."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Progress
 
 
 class ODESampler(Sampler):
-    """A sampler that follows the flow's own paths, forward and backward in time."""
+    """A sampler that solves the flow's ODE, forward or backward in time."""
 
     def options(self) -> dict[str, Any]:
         """Options of `r2flow.flow.solvers.solve`."""
@@ -28,7 +28,7 @@ class ODESampler(Sampler):
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
-        """The state at t_1 from x at t_0, (B, ...); options are those of `r2flow.flow.solvers.solve`."""
+        """Solve from x at t_0, (B, ...), to t_1; for the options see `r2flow.flow.solvers.solve`."""
         how = {**self.options(), **options}
         return solve(generator.field(condition), x, t_0, t_1, progress=progress, **how)
 
@@ -42,8 +42,8 @@ class FixedSteps(OnGrid, ODESampler):
     """Fixed steps of a solver.
 
     Attributes:
-        method: Name of the solver, which is the sampler's name too.
-        finish: Length of the last step, by Euler's rule: it smooths surfaces of a flow that was not trained to the end.
+        method: Name of the solver, and of the sampler.
+        finish: Length of a last Euler step, 0 for none; it smooths surfaces if the flow is undertrained near t = 1.
     """
 
     method: str = "euler"
@@ -54,9 +54,9 @@ class FixedSteps(OnGrid, ODESampler):
         return self.method
 
     def evaluations(self, generator: Any) -> int:
-        last = int(bool(self.finish) and self.steps > 1)
-        count: int = SOLVERS[self.method].cost(self.steps - last)  # type: ignore[union-attr]
-        return count + last
+        final = int(bool(self.finish) and self.steps > 1)
+        multistep: int = SOLVERS[self.method].cost(self.steps - final)  # type: ignore[union-attr]
+        return multistep + final
 
     def options(self) -> dict[str, Any]:
         return {"method": self.method, "steps": self.steps, "grid": self.times_or_name}
@@ -71,17 +71,18 @@ class FixedSteps(OnGrid, ODESampler):
     def knot_times(self, knots: int) -> Tensor:
         if self.steps % (knots + 1) or self.finish or not isinstance(self.grid, str):
             raise InputError(
-                f"{self} keep no {knots} inner states: the steps must be a multiple of {knots + 1} on a named grid."
+                f"{self} cannot keep {knots} inner states: give a named grid, no finish, and a multiple of "
+                f"{knots + 1} steps."
             )
         return named_grid(self.grid)(0.0, 1.0, knots + 1)
 
 
 @dataclass(frozen=True)
 class Adaptive(ODESampler):
-    """Steps that a solver chooses for each scan.
+    """Adaptive steps of a solver, chosen per scan.
 
     Attributes:
-        method: Name of the solver, which is the sampler's name too.
+        method: Name of the solver, and of the sampler.
         tolerance: Absolute and relative tolerance of the local error (`r2flow.flow.solvers.solve`).
     """
 
@@ -98,12 +99,12 @@ class Adaptive(ODESampler):
 
 @dataclass(frozen=True)
 class TorchDiffEq(ODESampler):
-    """A method of torchdiffeq.
+    """A solver of the package torchdiffeq.
 
     Attributes:
-        method: Its name there.
-        tolerance: Of an adaptive method.
-        steps: Of a method of fixed steps.
+        method: Name in torchdiffeq.
+        tolerance: Tolerance of an adaptive method.
+        steps: Steps of a fixed-step method.
     """
 
     method: str = "dopri5"

@@ -1,8 +1,7 @@
-"""Samples given a part of x_1, by a flow that was trained without a condition.
+"""Posterior samplers: sample x_1 given a part of it, by a flow that was trained without a condition.
 
-A sampler takes the states x_t of a flow from noise at t = 0 to x_1 at t = 1, where the values of a mask are known. With
-u = v(t, x_t), x_1hat = x_t + (1 - t) u is the mean E[x_1 | x_t]. With a flow map, `Replace` and `Repaint` jump to the
-next time; `MMPS` needs that mean and takes the map's velocity u(x, t, t).
+With u = v(t, x_t), x_1hat = x_t + (1 - t) u is the mean E[x_1 | x_t]. With a flow map, `Replace` and `Repaint` jump to
+the next time; `MMPS` needs the mean and takes the map's velocity u(x, t, t).
 """
 
 from abc import abstractmethod
@@ -20,13 +19,13 @@ from r2flow.registry import Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid, Steps
 from r2flow.samplers.stochastic import back, sde
 
-GROWN = 10.0  # times |y - A x_1hat|^2: a larger residual has diverged
-EARLIEST = 0.1  # earlier times take the Jacobian of this one: the formula divides by t
+GROWN = 10.0  # largest growth of |y - A x_1hat|^2 in conjugate gradients: a larger residual has diverged
+EARLIEST = 0.1  # earliest time of the Jacobian in `MMPS`: Cov(x_1 | x_t) divides it by t
 
 
 @dataclass(frozen=True)
 class Posterior(OnGrid):
-    """A sampler with `image` and `known` of each scan as its condition; known values arrive as given."""
+    """A sampler conditioned on `image` and `known` of each scan; known values are returned unchanged."""
 
     completes: ClassVar[bool] = True
     paired: ClassVar[bool] = False
@@ -39,13 +38,13 @@ class Posterior(OnGrid):
 
     @abstractmethod
     def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Any) -> Tensor:
-        """x_1 from noise x, (B, ...), given y where `known`, (B, ...) bool."""
+        """x_1 from noise x, (B, ...), given the values of y where `known`, (B, ...) bool."""
 
     def check(self, generator: Any) -> None:
         super().check(generator)
         if generator.told:
             kind = type(generator).__name__
-            raise InputError(f"sampler {self.name} asks a flow of whole scans; a {kind} completes by jump.")
+            raise InputError(f"sampler {self.name} needs an unconditional flow; complete with a {kind} by jump.")
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if condition is None:
@@ -55,7 +54,7 @@ class Posterior(OnGrid):
             velocity: Tensor = generator.mean_velocity(t, x, s).to(x)
             progress()
             if velocity.requires_grad:
-                velocity.register_hook(lambda _: progress())  # each product with the Jacobian
+                velocity.register_hook(lambda _: progress())  # one call per product with the Jacobian
             return velocity
 
         y, known = condition["image"].to(noise), condition["known"].to(noise) > 0
@@ -64,8 +63,8 @@ class Posterior(OnGrid):
     def given(
         self, u: MeanVelocity, x_0: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Fresh = None
     ) -> Tensor:
-        """x_1 given y, (B, ...), on times from 0 to 1."""
-        if torch.is_inference_mode_enabled():  # products with a Jacobian need tensors that autograd may keep
+        """x_1 given y, (B, ...), on a time grid from 0 to 1."""
+        if torch.is_inference_mode_enabled():  # vector-Jacobian products need tensors that autograd can save
             with torch.inference_mode(False), torch.no_grad():
                 return self.given(u, x_0.clone(), y.clone(), known.clone(), times.clone(), noise)
         return torch.where(known, y, self.run(u, x_0, y, known, times.to(x_0), noise))
@@ -73,9 +72,9 @@ class Posterior(OnGrid):
 
 @dataclass(frozen=True)
 class Replace(Posterior):
-    """Euler steps, after each of which the known values lie on the line from this scan's own noise to y.
+    """Euler steps, each followed by replacing the known values by the line from x_0 to y.
 
-    x_t' = M (t' y + (1 - t') x_0) + (1 - M) (x_t + (t' - t) u). One evaluation a step, no noise.
+    x_t' = M (t' y + (1 - t') x_0) + (1 - M) (x_t + (t' - t) u). One evaluation per step, deterministic.
     """
 
     def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Any) -> Tensor:
@@ -87,15 +86,15 @@ class Replace(Posterior):
 
 @dataclass(frozen=True)
 class Repaint(Posterior):
-    """`Replace` with fresh noise, which takes every step several times (Lugmayr et al. 2022, RePaint, algorithm 1).
+    """`Replace` with fresh noise and repeated steps (Lugmayr et al. 2022, RePaint, algorithm 1).
 
-    Before it takes a step again it goes back from t' to t by fresh noise (`back`), which leaves the law of the flow's
-    x_t as it is. The first step is taken once: at t = 0 nothing of x_t' is left. A generator with a `repaint` of its
-    own, as a diffusion, is run by that.
+    Before repeating a step, it goes back from t' to t by fresh noise (`back`), which preserves the distribution of x_t.
+    The first step is taken once, since x_0 does not depend on x_t'. If the generator has a method `repaint`, as a
+    diffusion model has, that method is used instead.
 
     Attributes:
-        repeats: How often a step is taken.
-        jump: Equal parts of a step.
+        repeats: How often each step is taken.
+        jump: Number of equal parts of a step.
     """
 
     draws: ClassVar[bool] = True
@@ -134,16 +133,16 @@ class Repaint(Posterior):
 
 @dataclass(frozen=True)
 class MMPS(Posterior):
-    """The posterior mean by the flow's own covariance (Rozet et al. 2024, moment matching posterior sampling).
+    """Moment matching posterior sampling (Rozet et al. 2024): posterior mean by the flow's covariance.
 
     Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J with J = d x_1hat / d x_t, the second-order Tweedie formula, so that
-    E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T)^-1 (y - A x_1hat), which is exact where x_1 is Gaussian given x_t. The
-    linear system is solved by conjugate gradients (`_solved`), each step one product with J; where C is not positive in
-    a direction, as a network's may be, they end. With that mean `sde` takes the steps.
+    E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T)^-1 (y - A x_1hat), which is exact if x_1 is Gaussian given x_t. Conjugate
+    gradients (`_solved`) solve the linear system with one product with J per iteration; they stop at a direction in
+    which C is not positive, which a network does not exclude. `sde` takes the steps with this mean.
 
     Attributes:
-        products: Products with the Jacobian in a step.
-        churn: Noise that is replaced, as in `SDE`.
+        products: Products with the Jacobian per step.
+        churn: Noise replacement, as in `SDE`.
     """
 
     products: Count = 2
@@ -154,7 +153,7 @@ class MMPS(Posterior):
         return self.churn > 0
 
     def evaluations(self, generator: Any = None) -> int:
-        """A vector-Jacobian product counts as one."""
+        """Network evaluations per scan; a vector-Jacobian product counts as one."""
         return self.steps * (1 + self.products)
 
     def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Noise) -> Tensor:
@@ -176,34 +175,34 @@ class MMPS(Posterior):
 
 
 def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, steps: int) -> Tensor:
-    """B S^-1 r for a positive S, each scan for itself, with `multiply(p)` = (B p, S p).
+    """B S^-1 r for a positive S, per scan, with `multiply(p)` = (B p, S p).
 
-    By conjugate gradients or, where these have left more than `GROWN` r r, by the combination of the same directions
-    that leaves the least: a network's J is not quite symmetric, and their residual may then grow without end. A scan
-    ends where its residual is 0 to rounding, or in a direction in which S is not positive.
+    The result is that of conjugate gradients or, if their squared residual exceeds `GROWN` r r, of the combination of
+    the same directions with the smallest residual: a network's J is not exactly symmetric, so that the residual of
+    conjugate gradients can grow. A scan stops at a residual of 0 (to rounding) or if S is not positive along p.
     """
-    p, rr, found = r, _dot(r, r), torch.zeros(())
-    goes = torch.ones_like(rr, dtype=torch.bool)
-    enough, most = torch.finfo(r.dtype).eps ** 2 * rr, GROWN * rr
-    rest, least = r, torch.zeros(())
-    last: tuple[Tensor, Tensor] | None = None  # the direction before, S p orthogonal to the others' and of length 1
+    p, rr, solution = r, _dot(r, r), torch.zeros(())
+    active = torch.ones_like(rr, dtype=torch.bool)
+    tolerance, limit = torch.finfo(r.dtype).eps ** 2 * rr, GROWN * rr
+    least_residual, least = r, torch.zeros(())
+    last: tuple[Tensor, Tensor] | None = None  # the previous B p and S p, the S p being orthonormal
     for _ in range(steps):
-        moved, q = multiply(p)
+        product, q = multiply(p)
         curvature = _dot(p, q)
-        goes = goes & (rr > enough) & (curvature > 0)
-        step = torch.where(goes, rr / curvature, 0)
-        found, r = found + step * moved, r - step * q
-        former, rr = rr, _dot(r, r)
-        p = r + torch.where(goes, rr / former, 0) * p
+        active = active & (rr > tolerance) & (curvature > 0)
+        step = torch.where(active, rr / curvature, 0)
+        solution, r = solution + step * product, r - step * q
+        previous, rr = rr, _dot(r, r)
+        p = r + torch.where(active, rr / previous, 0) * p
         if last is not None:
             share = _dot(last[1], q)
-            moved, q = moved - share * last[0], q - share * last[1]
+            product, q = product - share * last[0], q - share * last[1]
         length = _dot(q, q).sqrt()
-        goes = goes & (length > 0)
-        last = torch.where(goes, moved / length, 0), torch.where(goes, q / length, 0)
-        share = _dot(rest, last[1])
-        least, rest = least + share * last[0], rest - share * last[1]
-    return torch.where(rr <= most, found, least)
+        active = active & (length > 0)
+        last = torch.where(active, product / length, 0), torch.where(active, q / length, 0)
+        share = _dot(least_residual, last[1])
+        least, least_residual = least + share * last[0], least_residual - share * last[1]
+    return torch.where(rr <= limit, solution, least)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
