@@ -1,4 +1,4 @@
-"""LightningModules: how a generator is learned."""
+"""Registry of stages: LightningModules that train a generator."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -30,25 +30,25 @@ STAGES: Registry[type[Stage]] = Registry(
 
 
 def check_roll(augment: Augmentation, generator: Generator) -> None:
-    """Refuse turned scans for a generator that learns a vector for each direction."""
+    """Refuse rotation augmentation for a generator that learns one vector per direction."""
     if augment.roll and generator.learns_directions:
         raise InputError(
-            "data.augment.roll makes all directions alike, and backbone.position=learnable (the paper's APE) learns a "
-            "vector of its own for each; give backbone.position=none, whose attention knows differences in azimuth "
-            "alone, or leave roll out."
+            "data.augment.roll makes all directions alike, but backbone.position=learnable (the paper's APE) learns "
+            "one vector per direction; give backbone.position=none, whose attention sees only differences in azimuth, "
+            "or leave roll out."
         )
 
 
 def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
-    """The LightningModule of a config's `stage`, around a generator; it carries the config into its checkpoints.
+    """Build the LightningModule of a config's `stage` around a generator; its checkpoints store the config.
 
-    The config's `sampler`, where it has one, becomes the generator's.
+    The config's `sampler`, if given, becomes the generator's default.
     """
-    of_run = {"batch_size": config["data"]["batch_size"], "seed": config["seed"]}
+    run_options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"]}
     for name, where in (("batch_size", "data.batch_size"), ("seed", "seed")):
         if name in config["stage"]:
             raise InputError(f"stage.{name} is the run's: leave it out, and give {where}.")
-    options = {**config["stage"], **of_run}
+    options = {**config["stage"], **run_options}
     options.pop("init", None)  # the generator has its weights already
     stage: Stage = STAGES.build(options, generator)
     stage.config = dict(config)
@@ -58,13 +58,13 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
 
 
 def _choose(generator: Generator, config: Mapping[str, Any]) -> None:
-    """Give a generator the samplers of a config's `sampler` and `few`."""
-    own, asked = generator.sampler, dict(config.get("sampler") or {})
-    sampler, few = generator.choose(**asked), config.get("few")
-    if generator.fixed and sampler != own:
+    """Set a generator's default samplers from a config's `sampler` and `few`."""
+    default, options = generator.sampler, dict(config.get("sampler") or {})
+    sampler, few = generator.choose(**options), config.get("few")
+    if generator.fixed and sampler != default:
         raise InputError(
-            f"this stage trains for one sampler alone, {own}: leave sampler.* out; in a chain give it to one link, as "
-            "chain.rf1.sampler.steps=32."
+            f"this stage trains for one sampler alone, {default}: leave sampler.* out; in a chain give it to one link, "
+            "such as chain.rf1.sampler.steps=32."
         )
     if sampler.completes:
         raise InputError(f"sampler.name={sampler.name} completes scans: give it to r2flow complete by --sampler.")

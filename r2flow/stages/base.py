@@ -1,4 +1,4 @@
-"""What every stage has in common: a generator that learns, its optimiser, and what a checkpoint says of it."""
+"""Base classes of stages: a generator in training, its optimisers, and the notes in its checkpoints."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -24,37 +24,36 @@ Batch = dict[str, Tensor]
 
 
 class Stage(L.LightningModule):
-    """How a generator is learned. A subclass gives `training_step`.
+    """Trains a generator. A subclass defines `training_step`.
 
-    A batch is what the DataModule brings: `x_1` the scans in model space, (B, C, H, W); `x_0` noise, (B, *noise_shape);
-    `u` uniform draws in [0, 1), (B,); `k` the number of each image in the run, (B,), from which further draws are
-    counted (`r2flow.noise`).
+    A batch has the keys `x_1`, scans in model space, (B, C, H, W); `x_0`, noise, (B, *noise_shape); `u`, uniform draws
+    in [0, 1), (B,); and `k`, the number of each image in the run, (B,), which seeds further draws (`r2flow.noise`).
 
-    A stage of several losses and optimisers sets `automatic_optimization = False`, makes them by `optimizers_for` and
-    takes a step of each in every `training_step`: `take_step(optimizer, loss)` for each of `own_optimizers()`.
+    A stage with several losses and optimisers sets `automatic_optimization = False`, creates the optimisers by
+    `optimizers_for` and, in every `training_step`, calls `take_step(optimizer, loss)` for each of `own_optimizers()`.
 
     Args:
-        generator: What learns. Its weights, and no others, are those of a checkpoint.
-        learning_rate: AdamW's; warmed up linearly, then a cosine to 0 at the run's last step.
-        betas: AdamW's.
-        weight_decay: AdamW's.
-        muon: Learning rate of the weight matrices by `Muon`, scheduled as AdamW's; None leaves them to AdamW.
+        generator: The generator to train. Checkpoints store its weights and no others.
+        learning_rate: AdamW's learning rate; linear warm-up, then a cosine to 0 at the run's last step.
+        betas: AdamW's betas.
+        weight_decay: AdamW's weight decay.
+        muon: Learning rate of the weight matrices by `Muon`, with the same schedule; None: AdamW for all weights.
         warmup_images: Images seen during the warm-up.
-        batch_size: Images a step, which turns images into steps.
+        batch_size: Images per step, to convert images into steps.
         seed: Run seed.
 
     Attributes:
         learns: Class of the generators that it can train.
-        config: The run's, which goes into its checkpoints.
-        gradient_clip_val: The run's, for a stage with manual optimisation, which clips for itself.
-        further: What a batch holds beside, made of x_1, (C, H, W), and draws of each image by the loader's workers.
+        config: The run's config, which its checkpoints store.
+        gradient_clip_val: Gradient clipping of the run, for a stage with manual optimisation.
+        further: Makes additional batch entries of x_1, (C, H, W), and draws of each image, in the loader's workers.
     """
 
     learns: ClassVar[type[Generator]] = Generator
-    generator_name: ClassVar[str | None] = None  # what it trains; None: the parent's, or a rectified flow
-    needs_pairs: ClassVar[bool] = False  # whether a batch's x_0 and x_1 belong together
-    needs_parent: ClassVar[bool] = False  # whether it starts from another run, also where it learns from scans
-    anneals: ClassVar[bool] = True  # whether the learning rate falls to 0 at the run's last step
+    generator_name: ClassVar[str | None] = None  # generator to train; None: the parent's, or a rectified flow
+    needs_pairs: ClassVar[bool] = False  # whether it trains on pairs of x_0 and x_1
+    needs_parent: ClassVar[bool] = False  # whether it must start from another run, even if it trains on scans
+    anneals: ClassVar[bool] = True  # whether the learning rate decays to 0 at the run's last step
 
     def __init__(
         self,
@@ -81,17 +80,17 @@ class Stage(L.LightningModule):
         self.further: Further | None = None
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
-        """Refuse a config's `data` that the stage of this name cannot learn from."""
+        """Refuse a config's `data` that the stage of this name cannot train on."""
         on_pairs = data["name"] == "pairs"
         if self.needs_pairs and not on_pairs:
             raise InputError(f"stage={name} learns from pairs: give data=pairs, found {data['name']}.")
         if data.get("scans") is not None:
             raise InputError(f"stage={name} learns from pairs alone: leave data.scans out, or give stage=flow_map.")
         if on_pairs and not self.needs_pairs:
-            raise InputError(f"stage={name} learns from scans, and data=pairs has none; give stage=reflow.")
+            raise InputError(f"stage={name} learns from scans, not from data=pairs; give stage=reflow.")
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        # Dropout draws from torch's own generator: seeded by position, a resumed run draws the same.
+        # Dropout uses torch's global generator: seeding it by position makes a resumed run draw the same numbers.
         position = batch_idx * self.trainer.world_size + self.global_rank
         seed_torch(self.seed, "dropout", position)
 
@@ -99,7 +98,7 @@ class Stage(L.LightningModule):
         return self.optimizers_for(self.generator.parameters())
 
     def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
-        """AdamW or `Muon` with its schedule for each group of parameters, as `configure_optimizers` returns them."""
+        """AdamW or `Muon` with a schedule for each group of parameters, in the format of `configure_optimizers`."""
         options: dict[str, Any] = {
             "lr": self.learning_rate,
             "betas": (self.betas[0], self.betas[1]),
@@ -116,28 +115,28 @@ class Stage(L.LightningModule):
             torch.optim.AdamW(group, **options) if self.muon is None else Muon(group, self.muon, **options)
             for group in groups
         ]
-        schedules = [torch.optim.lr_scheduler.LambdaLR(one, factor) for one in optimizers]
+        schedules = [torch.optim.lr_scheduler.LambdaLR(optimizer, factor) for optimizer in optimizers]
         return optimizers, [{"scheduler": schedule, "interval": "step"} for schedule in schedules]
 
     def own_optimizers(self) -> list[LightningOptimizer]:
         """The optimisers of a stage with manual optimisation, in the order of `optimizers_for`.
 
-        A step of the first advances `global_step`, at which a run resumes and which therefore must count batches.
+        Only steps of the first one advance `global_step`, since a run resumes by it and it must count batches.
         """
-        found = self.optimizers()
-        several = found if isinstance(found, list) else [found]
-        for other in several[1:]:  # Lightning would count a step of each
+        optimizers = self.optimizers()
+        as_list = optimizers if isinstance(optimizers, list) else [optimizers]
+        for other in as_list[1:]:  # Lightning would count the steps of each
             other._on_before_step = other._on_after_step = lambda: None
-        return several
+        return as_list
 
     def take_step(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
-        """One step of one of `own_optimizers` down the gradient of a loss, clipped and scheduled as the run says.
+        """Take one step of one of `own_optimizers` on a loss, with the run's gradient clipping and schedule.
 
-        Gradients of the loss by other optimisers' parameters are left; they are cleared before their own step.
+        Gradients of other optimisers' parameters are not cleared here, but before those optimisers' steps.
         """
         optimizer.zero_grad()
         model = self.trainer.strategy.model
-        # DDP waits for gradients of all parameters in every backward pass, and a loss has those of some.
+        # DDP waits for gradients of all parameters in every backward pass; a loss may have gradients of some only.
         with model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext():
             self.manual_backward(loss)
         average_gradients(parameter for group in optimizer.param_groups for parameter in group["params"])
@@ -148,7 +147,7 @@ class Stage(L.LightningModule):
                 schedule.step()  # type: ignore[call-arg]
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        if not self.automatic_optimization:  # gradients of float16 have been scaled back only now
+        if not self.automatic_optimization:  # float16 gradients are unscaled only now
             self.clip_gradients(optimizer, self.gradient_clip_val)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -157,10 +156,10 @@ class Stage(L.LightningModule):
 
 
 class SingleLoss(Stage):
-    """A stage with one loss of a batch. A subclass gives `regression_loss`."""
+    """A stage with one loss per batch. A subclass defines `regression_loss`."""
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        """The mean loss at the times that the stage makes of uniform draws u in [0, 1), (B,)."""
+        """Mean loss at the times that the stage computes from uniform draws u in [0, 1), (B,)."""
         raise NotImplementedError
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -169,14 +168,14 @@ class SingleLoss(Stage):
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        # A low-discrepancy sequence over [0, 1) instead of random times: a steadier figure from few scans.
+        # A low-discrepancy sequence over [0, 1) instead of random times reduces the variance over few scans.
         u = golden_sequence(batch["k"])
         loss = self.regression_loss(batch, u)
         self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)
 
 
 def learning_rate_factor(step: int, warmup: int, total: int) -> float:
-    """step / warmup during the warm-up, then (1 + cos(pi s)) / 2 with s the share of the rest done."""
+    """step / warmup during the warm-up, then (1 + cos(pi s)) / 2 with s from 0 to 1 over the remaining steps."""
     if step < warmup:
         return step / warmup
     return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(total - warmup, 1)))

@@ -1,4 +1,4 @@
-"""A flow map: jumps of any length, learned from the paths of an earlier flow, from its pairs or from scans."""
+"""Flow map training: jumps of any length, from the paths of an earlier flow, its pairs or scans."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -20,16 +20,16 @@ from r2flow.stages.reflow import Reflow
 class LearnFlowMap(Reflow):
     """Flow map: regress u(x_t, t, s) onto the target of an objective of `r2flow.flow.maps`.
 
-    It learns from pairs of a 1-RF or a 2-RF, with the inner states of their paths (`data.pairs.knots`) for the
-    objective `knots`. With scans next to the pairs (`data.scans`) velocities, s = t, are learned from the scans, as by
-    `Rectify`, and jumps from the pairs. Pairs of a map by its own `chord` or `renoise` have no inner states; by `knots`
-    their jumps are those of straight lines.
+    The data are pairs of a 1-RF or 2-RF, with inner states of their paths (`data.pairs.knots`) for the objective
+    `knots`. With additional scans (`data.scans`), velocities (s = t) are learned from the scans, as in `Rectify`, and
+    jumps from the pairs. Pairs drawn from a flow map by `chord` or `renoise` have no inner states; the objective
+    `knots` then takes straight lines.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
         jumps: Options of `r2flow.flow.maps.JumpTimes`.
-        rho: Where the share rho ends that a bootstrapped objective takes from the path: it falls from 1, by equal
-            factors, over the run. It is always 1 where s = t and, on pairs, for the jump from 0 to 1.
+        rho: Final value of rho, the share of the path in the target of a bootstrapped objective; it decays
+            exponentially from 1 over the run. rho is always 1 for s = t and, on pairs, for the jump from 0 to 1.
     """
 
     learns = FlowMap
@@ -46,7 +46,7 @@ class LearnFlowMap(Reflow):
         **options: Any,
     ) -> None:
         if options.pop("time", None) is not None:
-            raise InputError("a flow map learns jumps from time to time: give stage.jumps and leave stage.time out.")
+            raise InputError("a flow map learns jumps between times: give stage.jumps and leave stage.time out.")
         super().__init__(generator, time={"name": "uniform"}, **options)
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
         check_options("stage.jumps", JumpTimes, jumps or {})
@@ -72,24 +72,26 @@ class LearnFlowMap(Reflow):
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
         if not (self.training or self.on_pairs):
-            t = s = self.jumps.velocities(u)  # of scans velocities alone are known
-        of_scans = t == s
+            t = s = self.jumps.velocities(u)  # scans have velocities only
+        diagonal = t == s
         paths, u_ts = paths_of(batch), self.generator.map(self.condition(batch))
         if self.training:
-            known = of_scans | (self.on_pairs & (s - t == 1))  # the end of independent noise is no scan of the data
-            rho = torch.where(known, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
-            aim = self.objective(u_ts, paths, t, torch.where(of_scans, t, s), rho)
-        else:  # one figure for all objectives
+            exact = diagonal | (
+                self.on_pairs & (s - t == 1)
+            )  # with independent noise, x_1 is not the end of x_0's path
+            rho = torch.where(exact, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
+            aim = self.objective(u_ts, paths, t, torch.where(diagonal, t, s), rho)
+        else:  # the same validation loss for all objectives
             aim = along_knots(u_ts, paths, t, s, torch.ones_like(t))
         if "scan" in batch:
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
-            here = expand_time(of_scans, x_t)
-            aim = Aim(torch.where(here, x_t, aim.x_t), torch.where(here, v, aim.target))
+            mask = expand_time(diagonal, x_t)
+            aim = Aim(torch.where(mask, x_t, aim.x_t), torch.where(mask, v, aim.target))
         return self.loss(u_ts(t, aim.x_t, s), aim.target).mean()
 
 
 def paths_of(batch: Batch) -> Paths:
-    """The paths from x_0 to x_1 of a batch, straight ones where it has no inner states."""
+    """The paths from x_0 to x_1 of a batch; straight lines if it has no inner states."""
     ends = batch["x_0"][:, None], batch["x_1"][:, None]
     if "knots" not in batch:
         return Paths(torch.tensor([0.0, 1.0], device=batch["x_1"].device), torch.cat(ends, 1))

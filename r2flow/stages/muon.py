@@ -1,4 +1,4 @@
-"""Muon: momentum whose singular values are made equal, for weight matrices; AdamW for all other weights."""
+"""Muon: momentum with equalised singular values for weight matrices, AdamW for all other weights."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 NEWTON_SCHULZ = 3.4445, -4.7750, 2.0315
-LEAST_CHANNELS = 8  # fewer are an image's
+LEAST_CHANNELS = 8  # fewer: input or output layer of an image
 
 
 class Muon(torch.optim.AdamW):
@@ -18,20 +18,20 @@ class Muon(torch.optim.AdamW):
 
         M <- m M + (1 - m) G,    W <- W - rate sqrt(max(1, rows / columns)) orthogonalised((1 - m) G + m M)
 
-    All singular directions of the momentum are learned at one speed, not the few large ones first. Biases, norms and
-    matrices of fewer than 8 rows or columns, such as those that see two or six channels of an image, are AdamW's.
+    All singular directions of the momentum are learned at the same speed, instead of the few large ones first. AdamW
+    trains biases, norms and matrices with fewer than 8 rows or columns, such as those of an image's channels.
 
     Args:
-        parameters: What is learned.
+        parameters: Parameters to train.
         rate: Learning rate of the matrices.
         momentum: m.
-        options: AdamW's, for all others.
+        options: Options of AdamW, for all other parameters.
     """
 
     def __init__(self, parameters: Iterable[Tensor], rate: float, momentum: float = 0.95, **options: Any) -> None:
-        found = list(parameters)
-        matrices = [p for p in found if is_hidden_matrix(p)]
-        others = [p for p in found if not is_hidden_matrix(p)]
+        weights = list(parameters)
+        matrices = [p for p in weights if is_hidden_matrix(p)]
+        others = [p for p in weights if not is_hidden_matrix(p)]
         groups: list[dict[str, Any]] = [
             {"params": others, "momentum": None},
             {"params": matrices, "lr": rate, "momentum": momentum},
@@ -42,7 +42,7 @@ class Muon(torch.optim.AdamW):
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
         """One step of all weights."""
         loss = None
-        if closure is not None:  # it clears, clips and computes the gradients of all groups
+        if closure is not None:  # it clears, computes and clips the gradients of all groups
             with torch.enable_grad():
                 loss = closure()
         groups = self.param_groups
@@ -62,7 +62,7 @@ class Muon(torch.optim.AdamW):
         state = self.state[p]
         if not state:
             state["momentum"] = torch.zeros_like(p, memory_format=torch.preserve_format)
-            state["step"] = torch.tensor(0.0)  # AdamW asks every state for it when it is loaded
+            state["step"] = torch.tensor(0.0)  # AdamW requires it in every loaded state
         average: Tensor = state["momentum"]
         average.lerp_(gradient, 1 - group["momentum"])
         direction = orthogonalised(gradient.lerp(average, group["momentum"]).flatten(1))
@@ -72,14 +72,14 @@ class Muon(torch.optim.AdamW):
 
 
 def is_hidden_matrix(p: Tensor) -> bool:
-    """Whether a weight has at least `LEAST_CHANNELS` rows and columns; of a convolution, channels out and in."""
+    """Whether a weight has at least `LEAST_CHANNELS` rows and columns (output and input channels)."""
     return p.ndim >= 2 and min(p.shape[:2]) >= LEAST_CHANNELS
 
 
 def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
-    """U V^T, nearly, of a matrix U S V^T, (rows, columns): singular values become 0.68 to 1.14, tiny ones less.
+    """Approximate U V^T of a matrix U S V^T, (rows, columns): singular values become 0.68 to 1.14, tiny ones less.
 
-    Each step is the polynomial a X + (b A + c A A) X of A = X X^T, in bfloat16, which needs no division.
+    Newton-Schulz iteration: each step is the polynomial a X + (b A + c A A) X with A = X X^T, in bfloat16.
     """
     a, b, c = NEWTON_SCHULZ
     x = matrix.T if matrix.shape[0] > matrix.shape[1] else matrix

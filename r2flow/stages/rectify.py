@@ -1,4 +1,4 @@
-"""1-RF: a velocity learned on straight lines from noise to data."""
+"""1-RF training: velocity regression on straight lines from noise to data."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -20,10 +20,10 @@ class Rectify(SingleLoss):
         generator: A flow.
         loss: Name in `r2flow.flow.losses.LOSSES`.
         time: Name and options of a density in `r2flow.flow.times.TIMES`.
-        options: Those of `Stage`.
+        options: Options of `Stage`.
 
     Raises:
-        InputError: the generator is no flow, or takes a condition; an unknown loss or density.
+        InputError: the generator is not a flow or takes a condition; an unknown loss or density.
     """
 
     learns: ClassVar[type[Generator]] = Flow
@@ -35,14 +35,14 @@ class Rectify(SingleLoss):
         super().__init__(generator, **options)
         if generator.told and type(self).condition is Rectify.condition:
             raise InputError(
-                f"a {type(generator).__name__} is told a part of each scan, and this stage tells it nothing: give "
-                "stage=transfer, or the stage by which it was trained."
+                f"a {type(generator).__name__} needs a condition, and this stage gives none: give "
+                "stage=transfer, or the stage that it was trained with."
             )
         self.loss = LOSSES[loss]
         self.time = TIMES.build(time or {"name": "uniform"})
 
     def condition(self, batch: Batch) -> Condition | None:
-        """What the velocity is told of each scan beside x_t; nothing here."""
+        """Condition of the velocity; None here."""
         return None
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""k-RF and k-TD: the same regression, on pairs that an earlier flow has drawn."""
+"""k-RF and k-TD training: velocity regression on pairs drawn from an earlier flow."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,10 +12,9 @@ from r2flow.stages.rectify import Rectify
 
 
 class Reflow(Rectify):
-    """k-RF: regress v(t, x_t) onto x_1 - x_0 for x_1 the end of the earlier flow from x_0 (paper, eq. 3).
+    """k-RF: regress v(t, x_t) onto x_1 - x_0 with x_1 the end of the earlier flow's path from x_0 (paper, eq. 3).
 
-    It starts from the earlier flow's averaged weights. The pairs come from the data (`data=pairs`); a batch's x_0 and
-    x_1 belong together, which is all that straightens the flow.
+    It starts from the earlier flow's averaged weights. The pairs (x_0, x_1) come from `data=pairs`.
     """
 
     needs_pairs = True
@@ -24,15 +23,15 @@ class Reflow(Rectify):
         self, generator: Generator, loss: str = "pseudo_huber", time: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
         super().__init__(generator, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
-        generator.run_by(ode_sampler(self.generator), generator.few)  # with fresh noise x_0 does not end at x_1
+        generator.run_by(ode_sampler(self.generator), generator.few)  # fresh noise would break the pairing
 
 
 class Distill(Reflow):
     """k-TD: the reflow regression at t in {0, 1/k, ..., (k-1)/k}, the times that k Euler steps visit.
 
     Args:
-        steps: k, the steps that the flow is to be sampled with.
-        grid: Where they fall: uniform as in the paper, or another of `r2flow.flow.solvers.grids.named_grid`.
+        steps: k, the number of sampling steps.
+        grid: Time grid: uniform as in the paper, or another one of `r2flow.flow.solvers.grids.named_grid`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Flows from scan to scan: learned on scans of which a part is hidden."""
+"""Training of transfer flows on partially hidden scans."""
 
 import math
 from collections.abc import Mapping
@@ -22,17 +22,17 @@ from r2flow.stages.base import Batch, SingleLoss
 
 @dataclass(frozen=True)
 class Tasks:
-    """A part of each training scan, and what is known of it, drawn for each image of a run.
+    """Draws a crop and a mask of known rays for each image of a run.
 
-    Known are the rows of a sparser sensor (every 2nd to 8th, half of them every 4th or 2nd), a random share of the
-    rows, or a random share of the rays (3 to 80 %).
+    Masks: the rows of a sparser sensor (every 2nd to 8th, mostly every 4th or 2nd), a random share of the rows, or a
+    random share of the rays (3 to 80 %).
 
     Args:
-        rows: Of a part.
-        columns: Of a part.
-        halved: Share of the parts at half the rows and a quarter of the columns, as a coarser image shows them.
-        silent: Share whose reflectance is not known.
-        unnumbered: Share for which what was learned of single rows is not told, as of another sensor.
+        rows: Rows of a crop.
+        columns: Columns of a crop.
+        halved: Share of crops at half the rows and a quarter of the columns, to train for coarser images.
+        silent: Share of crops with unknown reflectance.
+        unnumbered: Share of crops without the vectors learned per row, to train for other sensors.
     """
 
     rows: Count = 32
@@ -42,7 +42,7 @@ class Tasks:
     unnumbered: Portion = 0.1
 
     def __call__(self, space: ModelSpace, x_1: Tensor, draws: np.random.Generator) -> Batch:
-        """`target`, `image` and `known` of the part in model space, (C, h, w); `elevations` (h,), `steps` (2,)."""
+        """`target`, `image` and `known` of a crop in model space, (C, h, w); `elevations` (h,), `steps` (2,)."""
         halve, silent, unnumbered, top, left = draws.random(5)
         elevations = space.rays[0, :, 0]
         if halve < self.halved and x_1.shape[1] >= 2 * self.rows and x_1.shape[2] >= 4 * self.columns:
@@ -64,7 +64,7 @@ class Tasks:
 
 
 def coarser(space: ModelSpace, x: Tensor) -> Tensor:
-    """A scan in model space, (C, H, W), at half the rows and a quarter of the columns: the nearest return of each."""
+    """Downsample a scan in model space, (C, H, W), by 2 rows and 4 columns, keeping the nearest return of a block."""
     image = space.decode(x[None])[0]
     blocks = image.unflatten(1, (-1, 2)).unflatten(3, (-1, 4)).movedim(2, 3).flatten(3)
     r = torch.where(blocks[:1] > 0, blocks[:1], torch.inf)
@@ -84,9 +84,9 @@ def _measured(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
 
 
 class Transfer(SingleLoss):
-    """Learn the density of the hidden rays of scans, of which a flow's velocity is the mean (`TransferFlow`).
+    """Train a `TransferFlow` on the negative log-likelihood of hidden rays.
 
-    Half of the images are learned at t = 0, where one evaluation answers, the others at uniform t.
+    Half of the images are trained at t = 0, for sampling in one evaluation, the others at uniform t.
 
     Args:
         tasks: Options of `Tasks`.
@@ -109,7 +109,7 @@ class Transfer(SingleLoss):
             target, {IMAGE: batch[IMAGE], KNOWN: batch[KNOWN]}, (2 * u - 1).clamp(min=0), noise,
             batch["steps"], rows,
         )  # fmt: skip
-        where = "train" if self.training else "val"
+        split = "train" if self.training else "val"
         for name, value in parts.items():
-            self.log(f"{where}/{name}", value, batch_size=len(target), sync_dist=True)
+            self.log(f"{split}/{name}", value, batch_size=len(target), sync_dist=True)
         return torch.stack([WEIGHTS[name] * value for name, value in parts.items()]).sum()
