@@ -22,13 +22,13 @@ def mse(v_t: Tensor, u_t: Tensor) -> Tensor:
 def pseudo_huber(v_t: Tensor, u_t: Tensor) -> Tensor:
     """(sqrt(|r|^2 + c^2) - c) / sqrt(d) with r = v_t - u_t, c = 0.00054 sqrt(d): the paper's eq. 3 over sqrt(d).
 
-    The division does not move the minimum and brings gradients to the scale of the other losses; without it they are
-    sqrt(d) = 362 times those of the element-wise form, and every gradient would be clipped at 1.
+    The division keeps the minimum and brings gradients to the scale of the other losses. Without it they are
+    sqrt(d) = 362 times those of the element-wise form, and gradient clipping at 1 would affect every step.
     """
     r = (v_t.float() - u_t.float()).flatten(1)
     d = r.shape[1]
-    # vector_norm has gradient 0 at r = 0, where sqrt of a sum of squares has NaN; the quotient has no cancellation at
-    # small r. Where an element's square leaves float32, r is scaled and c no longer seen.
+    # vector_norm has gradient 0 at r = 0, sqrt of a sum of squares has NaN; the quotient avoids cancellation at small
+    # r. If an element's square overflows float32, r is scaled and c is negligible.
     largest = r.detach().abs().amax(1)
     scale = torch.where(largest > HUGE, largest, torch.ones_like(largest))
     rms = torch.linalg.vector_norm(r / scale[:, None], dim=1) / math.sqrt(d) * scale
@@ -38,7 +38,7 @@ def pseudo_huber(v_t: Tensor, u_t: Tensor) -> Tensor:
 
 
 def pseudo_huber_elementwise(v_t: Tensor, u_t: Tensor) -> Tensor:
-    """mean_i (sqrt(r_i^2 + c^2) - c), c = 0.00054 sqrt(d): what the published weights were trained with."""
+    """mean_i (sqrt(r_i^2 + c^2) - c), c = 0.00054 sqrt(d): the loss of the published weights."""
     r = (v_t.float() - u_t.float()).flatten(1)
     c = PSEUDO_HUBER_SCALE * math.sqrt(r.shape[1])
     return (r.square() / ((r.square() + c**2).sqrt() + c)).mean(1)

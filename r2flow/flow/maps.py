@@ -1,8 +1,8 @@
-"""Flow maps: where the flow carries a state from time t to time s, by its mean velocity u on the way.
+"""Flow maps: X_{t->s} maps the flow's state at t to its state at s, by the mean velocity u between t and s.
 
     X_{t->s}(x) = x + (s - t) u(x, t, s),    u(x, t, t) = v(t, x)
 
-An objective gives the point x_t at which u is learned and its target there. None needs forward-mode derivatives.
+An objective returns a point x_t and the regression target of u there, without forward-mode derivatives.
 """
 
 import math
@@ -22,8 +22,8 @@ from r2flow.flow.solvers.solution import selected
 from r2flow.flow.times import TIMES
 from r2flow.registry import Portion, Registry
 
-MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # u(t, x, s), as a backbone of two times takes them
-NEAREST = 4  # knots of the polynomial between two of them: its error is of order 4 in their distance
+MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # u(t, x, s), in the argument order of backbones
+NEAREST = 4  # knots per interpolating polynomial: error of order 4 in their distance
 
 
 def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
@@ -32,12 +32,12 @@ def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
 
 
 class Paths:
-    """A path of each scan by its states at some times: a polynomial through the four nearest.
+    """A path per scan, interpolated between states at given times by a polynomial through the four nearest.
 
-    With the two ends alone it is the straight line between them.
+    With only the two ends, the path is a straight line.
 
     Args:
-        times: Rising, (N,), N >= 2.
+        times: Increasing times of the states, (N,), N >= 2.
         states: (B, N, ...).
     """
 
@@ -67,15 +67,15 @@ class Paths:
         return mean if bool(apart.all()) else torch.where(expand_time(apart, mean), mean, self.velocity(t))
 
     def _weights(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The first of the nearest knots, (B,), and the weights of x_t and of its derivative in them, (B, n) each."""
-        knots, count = self.times, min(NEAREST, len(self.times))
+        """Index of the first of n nearest knots, (B,), and the knots' weights in x_t and in dx_t / dt, (B, n) each."""
+        times, n = self.times, min(NEAREST, len(self.times))
         t = t.double()
-        interval = torch.searchsorted(knots[1:-1].contiguous(), t.contiguous(), right=True)
-        first = (interval - (count // 2 - 1)).clamp(0, len(knots) - count)
-        nodes = knots[first[:, None] + torch.arange(count, device=t.device)]
+        interval = torch.searchsorted(times[1:-1].contiguous(), t.contiguous(), right=True)
+        first = (interval - (n // 2 - 1)).clamp(0, len(times) - n)
+        nodes = times[first[:, None] + torch.arange(n, device=t.device)]
         values, slopes = [], []
-        for i in range(count):
-            others = [j for j in range(count) if j != i]
+        for i in range(n):
+            others = [j for j in range(n) if j != i]
             scale = torch.stack([nodes[:, i] - nodes[:, j] for j in others]).prod(0)
             factors = torch.stack([t - nodes[:, j] for j in others])
             values.append(factors.prod(0) / scale)
@@ -94,15 +94,15 @@ class Paths:
 
 @dataclass(frozen=True)
 class JumpTimes:
-    """Which jumps (t, s) are learned: those of some numbers of steps, velocities (s = t), ends, and any others.
+    """Distribution of the jumps (t, s) in training: steps of time grids, velocities (s = t), jumps to s = 1, others.
 
     Args:
-        steps: Numbers of steps; one that stands here twice is asked for twice as often.
-        grid: Where these steps fall, of `r2flow.flow.solvers.grids.named_grid`.
-        share: Of the jumps that these steps take.
+        steps: Numbers of steps of the grids, drawn uniformly; repeat a number to draw it more often.
+        grid: Time grid of the steps (`r2flow.flow.solvers.grids.named_grid`).
+        share: Share of jumps that are steps of these grids.
         diagonal: Share of the rest with s = t.
-        ends: Share of the rest that goes to the end, s = 1, from times of the density `time`.
-        time: Density of the times of velocities, of `r2flow.flow.times.TIMES`; None: `u_shaped`, as in reflow.
+        ends: Share of the rest with s = 1 and t from the density `time`.
+        time: Time density (`r2flow.flow.times.TIMES`) for s = t and s = 1; None: `u_shaped`, as in reflow.
     """
 
     steps: Sequence[int] = (1, 1, 1, 2, 4, 8)
@@ -115,23 +115,23 @@ class JumpTimes:
     def __post_init__(self) -> None:
         if not self.steps or min(self.steps) < 1:
             raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
-        _ = self.velocities, self.times  # an unknown density or grid is refused now
+        _ = self.velocities, self.times  # refuse an unknown density or grid early
         if self.diagonal + self.ends > 1:
-            raise InputError(f"diagonal and ends are shares of one rest; found {self.diagonal} and {self.ends}.")
+            raise InputError(f"diagonal + ends must be at most 1; found {self.diagonal} and {self.ends}.")
 
     @cached_property
     def velocities(self) -> Callable[[Tensor], Tensor]:
-        """The times of velocities, (B,), from uniform draws."""
+        """The time density: maps uniform draws to times, (B,) each."""
         return TIMES.build(self.time or {"name": "u_shaped"})
 
     @cached_property
     def times(self) -> Tensor:
-        """Where the steps of each number begin and end, (len(steps), max(steps) + 1) float64; NaN behind the last."""
+        """The time grid of each number of steps, (len(steps), max(steps) + 1) float64, padded with NaN."""
         rows = [build_grid(self.grid, 0.0, 1.0, count) for count in self.steps]
         return pad_sequence(rows, batch_first=True, padding_value=math.nan)
 
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """t and s, (B,) each, from uniform draws in [0, 1), (B, 3)."""
+        """Draw t and s, (B,) each, from uniform numbers in [0, 1), (B, 3)."""
         which, a, b = u.unbind(1)
         times, counts = self.times.to(u), torch.tensor(tuple(self.steps), device=u.device)
         row = (a * len(counts)).long()
@@ -140,14 +140,14 @@ class JumpTimes:
         rest = (which - self.share) / (1 - self.share)
         velocity = self.velocities(a)
         low, high = (torch.where(rest < self.diagonal, velocity, time) for time in (low, high))
-        last = rest >= 1 - self.ends
-        low, high = torch.where(last, velocity, low), torch.where(last, 1.0, high)
-        given = which < self.share
-        return torch.where(given, times[row, step], low), torch.where(given, times[row, step + 1], high)
+        to_end = rest >= 1 - self.ends
+        low, high = torch.where(to_end, velocity, low), torch.where(to_end, 1.0, high)
+        on_grid = which < self.share
+        return torch.where(on_grid, times[row, step], low), torch.where(on_grid, times[row, step + 1], high)
 
 
 class Aim(NamedTuple):
-    """Where u is learned and its target, (B, ...) each."""
+    """The point at which u is trained and its target, (B, ...) each."""
 
     x_t: Tensor
     target: Tensor
@@ -157,15 +157,15 @@ Objective = Callable[[MeanVelocity, Paths, Tensor, Tensor, Tensor], Aim]
 
 
 def along_knots(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """u(x_t, t, s) = (x_s - x_t) / (s - t) on the path of an earlier flow, by its knots."""
+    """Target u(x_t, t, s) = (x_s - x_t) / (s - t) on the path of an earlier flow, interpolated from its knots."""
     return Aim(paths.at(t), paths.mean_velocity(t, s))
 
 
 def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """u(x_t, t, s) = rho v + (1 - rho) u(x_l, l, s), l = t + rho (s - t), x_l = x_t + rho (s - t) v.
+    """Target u(x_t, t, s) = rho v + (1 - rho) u(x_l, l, s), l = t + rho (s - t), x_l = x_t + rho (s - t) v.
 
-    On the straight line from x_0 to x_1, v = x_1 - x_0; the second u has no gradient (Luo et al. 2025, SoFlow; Zhang et
-    al. 2025, alpha-Flow). rho = 1 is k-TD's regression, rho to 0 is MeanFlow's.
+    x_t lies on the straight line from x_0 to x_1, v = x_1 - x_0; the target has no gradient (Luo et al. 2025, SoFlow;
+    Zhang et al. 2025, alpha-Flow). rho = 1 is k-TD's regression; rho -> 0 gives MeanFlow.
     """
     chord = paths.chord
     x_t, v = chord.at(t), chord.velocity(t)

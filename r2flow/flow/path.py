@@ -4,7 +4,7 @@ from torch import Tensor
 
 
 def expand_time(t: Tensor, x: Tensor) -> Tensor:
-    """t of shape (B,) or () in a shape that multiplies x, (B, ...)."""
+    """Reshape t, (B,) or (), to broadcast with x, (B, ...)."""
     return t.reshape(-1, *(1,) * (x.ndim - 1)) if t.ndim else t
 
 

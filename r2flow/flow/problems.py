@@ -1,8 +1,8 @@
-"""Flows with a known solution, against which solvers are tested.
+"""Test problems for solvers: flows with a known solution.
 
-All act on states of any shape (B, ...). `Gaussian`, `Anisotropic`, the mixtures and `PointMass` are rectified flows:
-x_0 ~ N(0, 1), x_1 drawn independently of it, v(t, x) = E[x_1 - x_0 | x_t = x]. `Straight` is such a flow reflowed. The
-others model no data; each is hard for a solver in another way.
+States have any shape (B, ...). `Gaussian`, `Anisotropic`, the mixtures and `PointMass` are rectified flows:
+x_0 ~ N(0, 1), x_1 independent of x_0, v(t, x) = E[x_1 - x_0 | x_t = x]. `Straight` is a reflowed Gaussian. The others
+do not model data; each has a different difficulty for solvers.
 """
 
 import functools
@@ -32,14 +32,14 @@ class Gaussian(Problem):
     """x_1 ~ N(mean, std^2): x_t = t mean + sigma_t x_0 with sigma_t^2 = (1 - t)^2 + t^2 std^2.
 
     Args:
-        std: The narrower, the later and the sharper the turn.
+        std: Standard deviation; smaller values give later and sharper turns of the paths.
     """
 
     def __init__(self, mean: float = 0.7, std: float = 0.25) -> None:
         self.mean, self.std = mean, std
 
     def deviation(self, x: Tensor) -> Tensor | float:
-        """std in a shape that multiplies x."""
+        """std, broadcastable with x."""
         return self.std
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
@@ -53,7 +53,7 @@ class Gaussian(Problem):
 
 
 class Anisotropic(Gaussian):
-    """Every element has a Gaussian of its own, with std from `narrowest` to `widest` in equal ratios."""
+    """A Gaussian per element, with std log-spaced from `narrowest` to `widest`."""
 
     def __init__(self, narrowest: float = 1e-4, widest: float = 10.0) -> None:
         super().__init__(mean=0.0)
@@ -65,7 +65,7 @@ class Anisotropic(Gaussian):
 
 
 def _normal_cdf(x: Tensor) -> Tensor:
-    """Phi(x) with all digits in the lower tail, where `torch.special.ndtr` has none beyond 6 standard deviations."""
+    """Phi(x), accurate in the lower tail, where `torch.special.ndtr` loses all digits beyond 6 standard deviations."""
     return torch.special.erfc(-x / math.sqrt(2)) / 2
 
 
@@ -74,7 +74,7 @@ class GaussianMixture(Problem):
 
     In component i, x_t has mean t m_i and variance c_i = (1 - t)^2 + t^2 s_i^2, and x_1 - x_0 the conditional mean
     m_i + (t s_i^2 - (1 - t)) (x - t m_i) / c_i; v is their mean over the posterior of i. Paths of a scalar do not
-    cross, so that the distribution function is constant along a path: x_t solves F_t(x_t) = F_0(x_0).
+    cross; the distribution function is therefore constant along a path: x_t solves F_t(x_t) = F_0(x_0).
     """
 
     def __init__(self, weights: Sequence[float], means: Sequence[float], stds: Sequence[float]) -> None:
@@ -96,7 +96,7 @@ class GaussianMixture(Problem):
         means = torch.stack([t * mean + torch.zeros_like(x_0) for mean in self.means])
         stds = torch.stack([((1 - t) ** 2 + (t * std) ** 2).sqrt() + torch.zeros_like(x_0) for std in self.stds])
         weights = torch.tensor(self.weights, dtype=torch.float64, device=x_0.device).view(-1, *(1,) * x_0.ndim)
-        # The tail in which x_0 lies: 1 - F(x) would lose digits.
+        # Compare the tail in which x_0 lies: 1 - F(x) would lose digits.
         side = torch.where(x_0 < 0, 1.0, -1.0)
         level = _normal_cdf(side * x_0)
         low, high = (means + stds * x_0).amin(0), (means + stds * x_0).amax(0)
@@ -109,14 +109,14 @@ class GaussianMixture(Problem):
 
 
 class TwoModes(GaussianMixture):
-    """Half of the paths go to -apart, half to +apart."""
+    """Mixture of two Gaussians of equal weight at -apart and +apart."""
 
     def __init__(self, apart: float = 0.5, std: float = 0.05) -> None:
         super().__init__((0.5, 0.5), (-apart, apart), (std, std))
 
 
 class RayDrop(GaussianMixture):
-    """A pixel of a scan: -1 (within `std`) where the ray was dropped, else a range around 0.3."""
+    """Mixture like a pixel of a scan: -1 (within `std`) for a dropped ray, else a range around 0.3."""
 
     def __init__(self, dropped: float = 0.3, std: float = 1e-3) -> None:
         super().__init__((dropped, 1 - dropped), (-1.0, 0.3), (std, 0.3))
@@ -152,7 +152,7 @@ class Straight(Problem):
 
 
 class Rotating(Problem):
-    """x' = w J x: elements of the first half rotate with those of the second, `turns` full circles until t = 1."""
+    """x' = w J x: pairs of elements, from the first and the second half, make `turns` full rotations until t = 1."""
 
     def __init__(self, turns: float = 0.5) -> None:
         self.speed = 2 * math.pi * turns
@@ -170,7 +170,7 @@ class Rotating(Problem):
 
 
 class StiffLinear(Problem):
-    """x' = -rate (x - sin t) + cos t: a slow path that all others approach within 1 / rate.
+    """x' = -rate (x - sin t) + cos t: all paths approach a slow one within a time of 1 / rate.
 
     Prothero, Robinson, On the stability and accuracy of one-step methods for solving stiff systems, 1974.
     """
@@ -188,7 +188,7 @@ class StiffLinear(Problem):
 
 
 class Discontinuous(Problem):
-    """x' = -x before t = `at`, -x + jump from then on."""
+    """x' = -x before t = `at`, -x + jump from there."""
 
     def __init__(self, jump: float = 3.0, at: float = math.sqrt(2) - 1) -> None:
         self.jump, self.at = jump, at
@@ -202,7 +202,7 @@ class Discontinuous(Problem):
 
 
 class NarrowJet(Problem):
-    """x' = -x + N(t; at, width^2): an impulse of 1 within a few widths, which a long step misses."""
+    """x' = -x + N(t; at, width^2): an impulse of 1 within a few widths, which a long step can miss."""
 
     def __init__(self, width: float = 2e-3, at: float = 0.6) -> None:
         self.width, self.at = width, at
@@ -219,7 +219,7 @@ class NarrowJet(Problem):
 
 
 class Pulse(Problem):
-    """x' = 1 / width within width / 2 of `at`, 0 elsewhere, whatever x: it moves all paths by 1."""
+    """x' = 1 / width within width / 2 of `at`, else 0, for any x: moves all paths by 1."""
 
     def __init__(self, width: float = 0.2, at: float = 0.45) -> None:
         self.width, self.at = width, at
@@ -234,7 +234,7 @@ class Pulse(Problem):
 
 
 def _exact(x_0: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor]:
-    """x_0 and t in float64, t in a shape that multiplies x_0."""
+    """x_0 and t in float64, t broadcastable with x_0."""
     x_0 = x_0.double()
     return x_0, expand_time(torch.as_tensor(t, dtype=torch.float64, device=x_0.device), x_0)
 

@@ -1,12 +1,12 @@
-"""Straightness of a flow's paths: the paper's s(t) (eq. 5), its integral, and the pixels that bend most.
+"""Straightness of a flow's paths: the paper's s(t) (eq. 5), its integral, and the most curved pixels.
 
     s(t) = |d - v_t|^2,  d = Phi(x_0, 1) - x_0,  v_t = v(t, Phi(x_0, t)),
 
-which is 0 on a straight path, where one Euler step is exact. Along n equal Euler steps d is the mean of v_t, so that
-the integral of s is the variance of v_t over the path: one pass. s(t) itself needs d, which is known only at the end:
-`straightness` makes a second pass instead of keeping n images.
+which is 0 on a straight path, where one Euler step is exact. Along n equal Euler steps d is the mean of v_t; the
+integral of s is thus the variance of v_t over the path and needs one pass. s(t) itself needs d, which is known only at
+the end: `straightness` makes a second pass instead of storing n images.
 
-An untrained flow with v = 0 is perfectly straight: read s together with s / |d|^2.
+An untrained flow with v = 0 is perfectly straight: report s together with s / |d|^2.
 """
 
 import math
@@ -26,7 +26,7 @@ class Curvature(NamedTuple):
 
     Attributes:
         x_0, x_1: Start and end of each path, (B, ...).
-        per_pixel: int_0^1 (d - v_t)^2 dt of every element, (B, ...), float64.
+        per_pixel: int_0^1 (d - v_t)^2 dt per element, (B, ...), float64.
     """
 
     x_0: Tensor
@@ -45,20 +45,19 @@ class Curvature(NamedTuple):
 
     @property
     def normalised(self) -> Tensor:
-        """int_0^1 s(t) dt / |d|^2, (B,); NaN where a path has no length."""
+        """int_0^1 s(t) dt / |d|^2, (B,); NaN for d = 0."""
         return self.total / self.squared_length
 
 
 class Straightness(NamedTuple):
-    """s(t) of every scene, and the paths of the elements that bend most.
+    """s(t) per scene, and the paths of the most curved elements.
 
     Attributes:
         t: The times 0, 1/n, ..., (n - 1)/n, (n,), float64.
         s: s(t), (B, n), float64.
         curvature: The integral of s.
-        pixels: Elements of the flattened batch that bend most, the most bent first, (k,); those of a path that is not
-            finite come last.
-        trajectories: Their values at 0, 1/n, ..., 1, (k, n + 1).
+        pixels: Indices into the flattened batch by decreasing curvature, (k,); elements of non-finite paths come last.
+        trajectories: Values of these elements at 0, 1/n, ..., 1, (k, n + 1).
     """
 
     t: Tensor
@@ -69,27 +68,27 @@ class Straightness(NamedTuple):
 
     @property
     def s_normalised(self) -> Tensor:
-        """s(t) / |d|^2, (B, n); NaN where a path has no length."""
+        """s(t) / |d|^2, (B, n); NaN for d = 0."""
         return self.s / self.curvature.squared_length[:, None]
 
 
 @torch.no_grad()
 def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progress = None) -> Curvature:
-    """The integral of s over the path, pixel by pixel, in one pass of Euler steps from x_0, (B, ...)."""
+    """Integral of s over the path, per pixel, in one pass of Euler steps from x_0, (B, ...)."""
     first: Tensor | None = None
     mean, mean_square = torch.zeros(2, *x_0.shape, dtype=torch.float64, device=x_0.device)
 
-    def watched(t: Tensor, x: Tensor) -> Tensor:
+    def recorded(t: Tensor, x: Tensor) -> Tensor:
         nonlocal first
         v = velocity(t, x).to(x.dtype)
-        # Deviations from the first velocity: with v^2 itself, a small variance would be lost in the last digits.
+        # Deviations from the first velocity avoid the cancellation of a variance computed from v^2.
         first = v.clone() if first is None else first
         deviation = (v - first).double()
         mean.add_(deviation / steps)
         mean_square.add_(deviation.square() / steps)
         return v
 
-    x_1 = solve(watched, x_0, steps=steps, progress=progress).x
+    x_1 = solve(recorded, x_0, steps=steps, progress=progress).x
     return Curvature(x_0, x_1, (mean_square - mean.square()).clamp(min=0))
 
 
@@ -97,28 +96,28 @@ def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progr
 def straightness(
     velocity: Velocity, x_0: Tensor, steps: int = 256, most_curved: int = 0, progress: Progress = None
 ) -> Straightness:
-    """s(t) of every scan at the times of `steps` Euler steps, in two passes: 2 x steps evaluations.
+    """s(t) per scan at the times of `steps` Euler steps, in two passes: 2 x steps evaluations.
 
     Args:
         x_0: Noise, (B, ...).
-        most_curved: How many elements, of all scans together, have their path kept.
+        most_curved: Number of elements, over all scans, whose path is returned.
     """
-    bent = curvature(velocity, x_0, steps, progress)
-    d = bent.x_1 - bent.x_0
-    bends = bent.per_pixel.flatten().nan_to_num(-math.inf, -math.inf)
-    pixels = bends.topk(min(most_curved, len(bends))).indices
+    total = curvature(velocity, x_0, steps, progress)
+    d = total.x_1 - total.x_0
+    values = total.per_pixel.flatten().nan_to_num(-math.inf, -math.inf)
+    pixels = values.topk(min(most_curved, len(values))).indices
     s, trajectories = [], []
 
-    def watched(t: Tensor, x: Tensor) -> Tensor:
+    def recorded(t: Tensor, x: Tensor) -> Tensor:
         v = velocity(t, x).to(x.dtype)
         s.append(_squared_norm(d - v))
         trajectories.append(x.flatten()[pixels])
         return v
 
-    x_1 = solve(watched, x_0, steps=steps, progress=progress).x
+    x_1 = solve(recorded, x_0, steps=steps, progress=progress).x
     t = torch.arange(steps, dtype=torch.float64) / steps
     paths = torch.stack([*trajectories, x_1.flatten()[pixels]], 1)
-    return Straightness(t, torch.stack(s, 1), bent, pixels, paths)
+    return Straightness(t, torch.stack(s, 1), total, pixels, paths)
 
 
 def _squared_norm(x: Tensor) -> Tensor:

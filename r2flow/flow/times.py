@@ -1,7 +1,7 @@
-"""Time densities: p(t) of the times at which a flow is trained, each given by its inverse CDF.
+"""Time densities p(t) for training, given by their inverse CDF.
 
-A density maps u ~ Uniform[0, 1) to t. The uniform draw comes from outside (counter-based, one per image), so that the
-time of image k depends on k alone.
+A density maps u ~ Uniform[0, 1) to t. The caller draws u (counter-based, one per image), so that the time of image k
+depends on k alone.
 """
 
 import math
@@ -30,8 +30,8 @@ class Uniform:
 class UShaped:
     """p(t) proportional to e^(a t) + e^(a (1 - t)), a = 4 (Lee et al. 2024, as the paper uses it).
 
-    The paper prints e^(-a t) for the second term, which is not U-shaped on [0, 1]: a slip. Each branch is
-    taken half of the time; one has the inverse CDF t = ln(u (e^a - 1) + 1) / a, the other is its mirror.
+    The paper prints e^(-a t) for the second term, which is not U-shaped on [0, 1]: a typo. Each branch has probability
+    1/2; the first has the inverse CDF t = ln(u (e^a - 1) + 1) / a, the second is its mirror image.
     """
 
     def __init__(self, a: Annotated[float, Bound("above 0 and at most 80", lambda a: 0 < a <= 80)] = 4.0) -> None:
@@ -41,7 +41,7 @@ class UShaped:
         rising = u < 0.5
         v = torch.where(rising, 2 * u, 2 * u - 1)
         t = torch.log1p(v * math.expm1(self.a)) / self.a
-        # float32 can return 1 + 1e-7, which is outside the path.
+        # float32 can round to 1 + 1e-7.
         return torch.where(rising, t, 1 - t).clamp(0, 1)
 
 
@@ -57,10 +57,9 @@ class LogitNormal:
 
 
 class Late:
-    """p(t) = 1 - share + share q(t) with logit(t) ~ N(mean, std^2) under q: uniform, and more near t = 1.
+    """p(t) = 1 - share + share q(t) with logit(t) ~ N(mean, std^2) under q: uniform, with more weight near t = 1.
 
-    The last hundredths before t = 1, of which a uniform density shows as many hundredths of the images, are where
-    surfaces become smooth.
+    Surfaces become smooth in the last few hundredths before t = 1, which a uniform density rarely draws.
     """
 
     def __init__(self, share: Portion = 0.5, mean: float = 2.0, std: Positive = 1.6) -> None:
@@ -83,15 +82,15 @@ class Discrete:
 
 
 def golden_sequence(k: Tensor) -> Tensor:
-    """(k + 1/2) (sqrt(5) - 1) / 2 mod 1 of integers k, float32: a low-discrepancy sequence over [0, 1).
+    """(k + 1/2) (sqrt(5) - 1) / 2 mod 1 for integers k, float32: a low-discrepancy sequence over [0, 1).
 
-    In 64-bit integers that wrap around, so that no k is too large.
+    Computed in 64-bit integers that wrap around, so that any k is valid.
     """
     return _turns(k, GOLDEN)
 
 
 def plastic_sequence(k: Tensor) -> Tensor:
-    """The same in two dimensions, (..., 2) float32: steps 1 / p and 1 / p^2 with p^3 = p + 1 (Roberts 2018, R2)."""
+    """Low-discrepancy sequence over [0, 1)^2, (..., 2) float32: steps 1/p, 1/p^2, p^3 = p + 1 (Roberts 2018, R2)."""
     return torch.stack([_turns(k, step) for step in PLASTIC], -1)
 
 

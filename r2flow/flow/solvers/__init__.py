@@ -1,4 +1,4 @@
-"""ODE solvers: dx/dt = v(t, x) from one end of the flow to the other."""
+"""ODE solvers for dx/dt = v(t, x)."""
 
 import math
 from collections.abc import Callable
@@ -40,8 +40,8 @@ SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
     exprb43=exprb43,
     auto=automatic,
 )
-# The second solution's tolerance is the first's divided by this. At 10, sometimes at 30, its own error is as large as
-# the first's where the velocity jumps in time; at 100 more scenes exceed their budget of evaluations.
+# For the error estimate, the tolerance is divided by this. At 10, sometimes at 30, the second solution's error is as
+# large as the first's if the velocity jumps in time; at 100, more scenes exceed their budget of evaluations.
 TIGHTER = 60.0
 
 
@@ -63,17 +63,17 @@ def solve(
 ) -> Solution:
     """Solve dx/dt = v(t, x) from x at t_0 to t_1, forward or backward in time.
 
-    The state and t stay in float32 (float64 when x is) whatever the network computes in. Our own methods evaluate v
-    only between t_0 and t_1. A scene has its own steps. A scene that cannot be solved is flagged; no exception is
-    raised.
+    The state and t are float32 (float64 if x is), regardless of the network's precision. Methods of r2flow evaluate v
+    only between t_0 and t_1. Each scene has its own adaptive steps. A scene that cannot be solved is flagged
+    (`Solution.converged`) without an exception.
 
     Args:
         velocity: v(t, x) with t of shape () in a fixed-step method, (B,) in an adaptive one, where B shrinks as scenes
-            arrive; a velocity that differs between scenes has a method `select` (see `Evaluations`).
+            finish; a velocity that differs between scenes has a method `select` (see `Evaluations`).
         x: State at t_0, (B, ...).
-        method: A name in `SOLVERS`, or `torchdiffeq:NAME` for one of torchdiffeq's. `auto` is dopri5, and exprb43 from
-            where a scene turns out to be stiff; exprb43 gives no gradient and does not look for pulses and jumps.
-        steps: Steps of a fixed-step method on a named grid; an adaptive one ignores it.
+        method: A name in `SOLVERS`, or `torchdiffeq:NAME`. `auto` is dopri5, and exprb43 for scenes once they become
+            stiff; exprb43 is not differentiable and does not search for pulses and jumps.
+        steps: Steps of a fixed-step method on a named grid; ignored by adaptive methods.
         tolerance: Absolute and relative tolerance of an adaptive method, for the local error e of a step:
             (mean |e / (tolerance + tolerance |x|)|^6)^(1/6) <= 1 over a scene's elements. It does not bound the error
             at t_1. Tolerances below `LEAST_TOLERANCE` of the state's or the velocity's type are raised to it, with a
@@ -82,57 +82,57 @@ def solve(
         grid: Time grid of a fixed-step method: `uniform`, `power:P` (t = 1 - (1 - u)^P), `power-start:P` (t = u^P),
             or the times themselves, (N + 1,) from t_0 to t_1.
         max_evaluations: Budget of a scene in an adaptive method.
-        max_step: Longest step of our adaptive methods as a share of the interval. They leave no 0.16 of the interval
-            unseen and locate jumps of v in time; a narrower pulse can be missed without a flag. 1/64 finds all that are
-            longer than a 128th.
-        global_error: Estimate the error at t_1 of an adaptive method by a second solution at a sixtieth of the
-            tolerance; its evaluations are counted.
-        knots: Inner states to keep, equally many steps apart, of one of our methods of fixed steps.
+        max_step: Longest step of r2flow's adaptive methods as a share of the interval. They evaluate v in every 0.16 of
+            the interval and locate jumps of v in time; a narrower pulse can be missed without a flag. 1/64 finds all
+            pulses longer than 1/128.
+        global_error: Estimate the error at t_1 of an adaptive method by a second solution at 1/60 of the tolerance; its
+            evaluations are counted.
+        knots: Number of inner states to keep, at equal numbers of steps; for r2flow's fixed-step methods.
 
     Raises:
-        InputError: an unknown method or grid, or a number out of its range.
+        InputError: an unknown method or grid, or a number out of range.
     """
-    how = method_of(method)
+    solver = method_of(method)
     _check_numbers(t_0, t_1, steps, tolerance, max_evaluations, max_step)
     x = wide(x)
     if t_0 == t_1 or not len(x):
         return _at_rest(x, global_error, knots)
-    times = torch.tensor([t_0, t_1], dtype=torch.float64) if how.adapts else build_grid(grid, t_0, t_1, steps)
-    assert not knots or isinstance(how, FixedStep)
+    times = torch.tensor([t_0, t_1], dtype=torch.float64) if solver.adapts else build_grid(grid, t_0, t_1, steps)
+    assert not knots or isinstance(solver, FixedStep)
     limits = Limits(tolerance, max_evaluations, max_step=max_step, knots=knots)
-    solution = how.solve(Evaluations(velocity, len(x), progress), x, times, limits)
-    if not (global_error and how.adapts):
+    solution = solver.solve(Evaluations(velocity, len(x), progress), x, times, limits)
+    if not (global_error and solver.adapts):
         return solution
-    return _with_global_error(solution, how, velocity, x, times, limits._replace(tighter=TIGHTER), progress)
+    return _with_global_error(solution, solver, velocity, x, times, limits._replace(tighter=TIGHTER), progress)
 
 
 def method_of(name: str) -> Method:
-    """The method of a solver's name."""
+    """The solver of a name."""
     return TorchDiffEqMethod(name.removeprefix(TORCHDIFFEQ)) if name.startswith(TORCHDIFFEQ) else SOLVERS[name]
 
 
 def usual_grid(name: str) -> str:
-    """The default grid of a method: denser towards t = 1 for predictor-correctors, else equal steps."""
+    """The default grid of a method: denser towards t = 1 for predictor-correctors, else uniform."""
     return "power:1.75" if getattr(SOLVERS[name], "corrects", False) else "uniform"
 
 
 def _with_global_error(
     solution: Solution,
-    how: Method,
+    solver: Method,
     velocity: Velocity,
     x: Tensor,
     times: Tensor,
     limits: Limits,
     progress: Callable[[], None] | None,
 ) -> Solution:
-    """The solution with an estimate of its error: the difference to a tighter one, for the scenes that converged."""
+    """Add an error estimate to a solution: the difference to one at a lower tolerance, for converged scenes."""
     scenes = solution.converged.nonzero()[:, 0]
     error = torch.full((len(x),), math.inf, dtype=torch.float64)
     extra = torch.zeros_like(solution.evaluations)
     if len(scenes):
-        here, own = scenes.to(x.device), selected(velocity, scenes)
-        second = how.solve(Evaluations(own, len(scenes), progress), x[here], times, limits)
-        rms = flat((solution.x[here] - second.x).detach().double().square()).mean(1).sqrt().cpu()
+        index, velocity_of_scenes = scenes.to(x.device), selected(velocity, scenes)
+        second = solver.solve(Evaluations(velocity_of_scenes, len(scenes), progress), x[index], times, limits)
+        rms = flat((solution.x[index] - second.x).detach().double().square()).mean(1).sqrt().cpu()
         error[scenes], extra[scenes] = torch.where(second.converged, rms, math.inf), second.evaluations
     return replace(solution, evaluations=solution.evaluations + extra, global_error=error)
 
@@ -149,7 +149,7 @@ def _at_rest(x: Tensor, global_error: bool, knots: int) -> Solution:
 
 def _check_numbers(t_0: float, t_1: float, steps: int, tolerance: float, max_evaluations: int, max_step: float) -> None:
     for good, message in (
-        (math.isfinite(t_0) and math.isfinite(t_1), f"a solution needs two times, found {t_0} and {t_1}."),
+        (math.isfinite(t_0) and math.isfinite(t_1), f"a solution needs two finite times, found {t_0} and {t_1}."),
         (steps >= 1, f"a solver needs at least 1 step, found {steps}."),
         (0 < tolerance < math.inf, f"a solver's tolerance must be positive and finite, found {tolerance:g}."),
         (max_evaluations >= 1, f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}."),

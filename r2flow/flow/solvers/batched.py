@@ -1,4 +1,4 @@
-"""Arithmetic on batches in which every scene has numbers of its own."""
+"""Per-scene arithmetic on batches."""
 
 import math
 from collections.abc import Sequence
@@ -9,17 +9,16 @@ from torch import Tensor
 
 from r2flow.flow.solvers.solution import flat
 
-# The error of a step is (mean |e|^6)^(1/6) over a scene's elements. In a scene of dropped and measured pixels, few
-# elements turn towards one or the other in any one step. A root mean square hides their error; the maximum would let a
-# single element set the step.
+# The error of a step is (mean |e|^6)^(1/6) over a scene's elements. Few pixels turn towards dropped or measured in any
+# one step: a root mean square would hide their error, and with the maximum a single element would set the step.
 NORM = 6
 
 
 def norms(*values: Tensor) -> np.ndarray:
     """Root mean square over each scene's elements, (len(values), B) float64, in one transfer to the host.
 
-    Summed in float64 and rounded to float32: the order of summation may depend on the size of the batch, and a scene's
-    steps must not. The rounding removes the difference in nearly all cases.
+    Sums are in float64 and rounded to float32: the order of summation may depend on the batch size, but a scene's steps
+    must not. The rounding removes the difference in nearly all cases.
     """
     sums = [torch.linalg.vector_norm(flat(value), dim=1, dtype=torch.float64) for value in values]
     count = max(values[0][0].numel(), 1)
@@ -28,14 +27,14 @@ def norms(*values: Tensor) -> np.ndarray:
 
 
 def powered(value: Tensor) -> Tensor:
-    """What `norms` takes for the norm of order `NORM`; see `unpowered`. Overwrites the value."""
+    """Raise a value in place to the power with which `norms` computes the norm of order `NORM`; see `unpowered`."""
     return value.pow_(NORM // 2)
 
 
 def unpowered(norm: np.ndarray) -> np.ndarray:
     """The norm of order `NORM` from that of the powered values."""
-    found: np.ndarray = (norm ** (2 / NORM)).astype(np.float32).astype(np.float64)
-    return found
+    result: np.ndarray = (norm ** (2 / NORM)).astype(np.float32).astype(np.float64)
+    return result
 
 
 def weighted(weights: Sequence[float | Tensor], k: Sequence[Tensor]) -> Tensor:
@@ -51,5 +50,5 @@ def weighted(weights: Sequence[float | Tensor], k: Sequence[Tensor]) -> Tensor:
 
 
 def rows(x: Tensor, places: np.ndarray) -> Tensor:
-    """Some of the scenes."""
+    """Select scenes by index."""
     return x[torch.from_numpy(places).to(x.device)]

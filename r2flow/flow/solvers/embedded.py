@@ -1,4 +1,4 @@
-"""Embedded Runge-Kutta methods: a step and an estimate of its error from the same stages."""
+"""Tableaus of embedded Runge-Kutta methods."""
 
 import math
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from r2flow.flow.solvers.solution import Evaluations, Limits, Solution
 class EmbeddedMethod:
     """The Butcher tableau of an explicit embedded method whose last stage is the next step's first (FSAL).
 
-    Its last two stages are at the same t, by which stiffness is seen.
+    Its last two stages are at the same t; stiffness detection compares them.
 
     Attributes:
-        order: Order of the solution that is carried on.
+        order: Order of the propagated solution.
         nodes: c_i of stages 2 to s.
         rows: a_ij of stages 2 to s; the last row is the new state.
         error: b_i - b*_i, the weights of the error estimate.
@@ -26,11 +26,11 @@ class EmbeddedMethod:
         stability: |h lambda| above which a step counts as stiff; near the end of the stability region on the negative
             real axis.
         bump: d_i, the weights of the quartic term of the interpolant.
-        rough: Stages whose third divided difference shows how rough v is along a step.
+        rough: Stages of the third divided difference that measures the roughness of v along a step.
         defect: Largest defect of a step in tolerances: several times that of accurate steps of the exact problems.
     """
 
-    adapts: ClassVar[bool] = True  # whether steps are chosen by a tolerance
+    adapts: ClassVar[bool] = True  # whether step sizes follow from a tolerance
 
     order: int
     nodes: tuple[float, ...]
@@ -44,36 +44,36 @@ class EmbeddedMethod:
     defect: float
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
-        """Solve every scene of x, (B, ...), from the first time to the last by steps of its own."""
+        """Solve every scene of x, (B, ...), from the first time to the last with its own steps."""
         from r2flow.flow.solvers.adaptive import advance
 
         return advance(v, x, float(times[0]), float(times[-1]), self, limits)[0]
 
     @property
     def stages(self) -> int:
-        """Evaluations a step."""
+        """Evaluations per step."""
         return len(self.rows)
 
     @property
     def distinct(self) -> dict[float, int]:
-        """The stage at each time of the step, the last one where there are several, in the order of time."""
+        """The stage at each time of the step, the last one of several, in increasing time."""
         return dict(sorted({c: i for i, c in enumerate((0.0, *self.nodes))}.items()))
 
     @property
     def third_difference(self) -> tuple[float, ...]:
-        """Weights of the stages that annihilate quadratic functions of t, the largest 1."""
+        """Weights of the stages that annihilate quadratic functions of t, normalised to a largest weight of 1."""
         times = [(0.0, *self.nodes)[i] for i in self.rough]
         weights = [1 / math.prod(c - other for other in times if other != c) for c in times]
-        found = [0.0] * (len(self.nodes) + 1)
+        result = [0.0] * (len(self.nodes) + 1)
         for i, weight in zip(self.rough, weights, strict=True):
-            found[i] = weight / max(map(abs, weights))
-        return tuple(found)
+            result[i] = weight / max(map(abs, weights))
+        return tuple(result)
 
     def interpolant(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """w_i and dw_i / dtheta of x + h sum_i w_i(theta) k_i, each (stages + 1, B).
 
-        The cubic Hermite interpolant and a quartic bump: Hairer, Norsett, Wanner, Solving Ordinary Differential
-        Equations I, II.6. It is continuous with its derivative.
+        Cubic Hermite interpolant plus a quartic bump, continuously differentiable: Hairer, Norsett, Wanner, Solving
+        Ordinary Differential Equations I, II.6.
         """
         last = len(self.nodes)
         b, d = (np.array([*row, *[0.0] * (last + 1 - len(row))])[:, None] for row in (self.rows[-1], self.bump))
@@ -100,7 +100,7 @@ dopri5 = EmbeddedMethod(
     ),
     error=(71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40),
     safety=0.95,
-    grow=10.0,  # as in dopri5.f; of 32 ray-drop scenes, more were missed with smaller factors
+    grow=10.0,  # as in dopri5.f; smaller factors missed more of 32 ray-drop scenes
     stability=3.0,  # the region ends at 3.31; Hairer's 3.25 is for longer steps
     bump=(
         -12715105075 / 11282082432,

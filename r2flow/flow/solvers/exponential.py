@@ -1,9 +1,9 @@
-"""An exponential Rosenbrock method for stiff scenes, and its choice for scenes that turn out to be stiff.
+"""Exponential Rosenbrock method for stiff scenes, and automatic switching to it.
 
 pexprb43: Luan, Ostermann, Parallel exponential Rosenbrock methods, 2016, order 4 with an estimate of order 3. The
-Jacobian J of (t, x) -> (1, v) is never formed: functions of it act in Krylov spaces by Arnoldi's method (Saad, Analysis
-of some Krylov subspace approximations to the matrix exponential operator, 1992), and its products with vectors are
-finite differences of v, one evaluation each. Scenes are solved one after another, each with its own steps.
+Jacobian J of (t, x) -> (1, v) is never formed: functions of J are computed in Krylov spaces by Arnoldi's method (Saad,
+Analysis of some Krylov subspace approximations to the matrix exponential operator, 1992), and products of J with
+vectors are finite differences of v, one evaluation each. Scenes are solved one after another, each with its own steps.
 """
 
 import math
@@ -21,7 +21,7 @@ from r2flow.flow.solvers.batched import norms, powered, unpowered
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
 from r2flow.flow.solvers.solution import Evaluations, Limits, Solution
 
-LARGEST = 40  # dimension of a Krylov space; where that is not enough the step is halved
+LARGEST = 40  # dimension of a Krylov space; if that is not enough, the step is halved
 KRYLOV = 0.05  # error of a function of J, in tolerances
 SAFETY, SHRINK, GROW = 0.8, 0.2, 8.0
 
@@ -31,28 +31,28 @@ class ExponentialMethod:
     """An exponential method.
 
     Attributes:
-        start: The explicit method that solves the scenes which are not stiff; None where all are taken for stiff.
+        start: Explicit method for scenes that are not stiff; None: treat all scenes as stiff.
     """
 
-    adapts: ClassVar[bool] = True  # whether steps are chosen by a tolerance
+    adapts: ClassVar[bool] = True  # whether step sizes follow from a tolerance
 
     order: int = 4
     start: EmbeddedMethod | None = None
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
-        """Solve every scene of x, (B, ...), from t_0 to t_1: the stiff ones, or all, one after another."""
+        """Solve every scene of x, (B, ...), from t_0 to t_1; stiff scenes one after another."""
         t_0, t_1 = float(times[0]), float(times[-1])
         if self.start is None:
-            at = np.full(len(x), t_0)
+            reached = np.full(len(x), t_0)
             first = Solution.build(x, v.counts, 0, 0, False, False)
         else:
-            first, at = advance(v, x, t_0, t_1, self.start, limits._replace(until_stiff=True))
+            first, reached = advance(v, x, t_0, t_1, self.start, limits._replace(until_stiff=True))
         ends, converged = first.x.clone(), first.converged.numpy().copy()
         accepted, rejected = first.accepted.numpy().copy(), first.rejected.numpy().copy()
         stiff = first.stiff.numpy() | (self.start is None)
         for place in (stiff & ~converged).nonzero()[0]:
             v.only(np.array([place]))
-            scene = _Scene(v, first.x[place].detach(), float(at[place]), t_0, t_1, limits)
+            scene = _Scene(v, first.x[place].detach(), float(reached[place]), t_0, t_1, limits)
             converged[place] = scene.solve()
             ends[place] = scene.u.view(x.shape[1:])
             accepted[place] += scene.accepted
@@ -66,11 +66,11 @@ automatic = ExponentialMethod(start=dopri5)
 
 
 class _Spent(Exception):
-    """The scene has used its budget of evaluations."""
+    """The scene has used up its budget of evaluations."""
 
 
 class _Scene:
-    """One scene on its way; vectors are (n + 1,), the elements of x and, last, t."""
+    """State of one scene; vectors are (n + 1,), the elements of x followed by t."""
 
     def __init__(self, v: Evaluations, x: Tensor, t: float, t_0: float, t_1: float, limits: Limits) -> None:
         self.v, self.shape, self.limits = v, x.shape, limits
@@ -86,8 +86,8 @@ class _Scene:
 
     @torch.no_grad()
     def solve(self) -> bool:
-        """Go to the end; whether it is reached."""
-        with self._of_steps:  # products of states have all digits, whatever the network's have
+        """Solve to t_end; whether it was reached."""
+        with self._of_steps:  # full precision for the solver, whatever the network's precision is
             return self._solve()
 
     def _solve(self) -> bool:
@@ -95,7 +95,7 @@ class _Scene:
             f = self.velocity(self.t, self.u)
             self.tolerance = attainable(self.limits, self.v.precision)
             self.roundoff = torch.finfo(self.v.precision).eps
-            # Differences of a velocity with noise (dropout, sampling inside the network) say nothing of J.
+            # Differences of a noisy velocity (dropout, sampling inside the network) do not approximate J.
             again = self.velocity(self.t, self.u)
             if _rms(again - f) > math.sqrt(self.roundoff) * _rms(f):
                 return False
@@ -132,41 +132,41 @@ class _Scene:
         with self._of_network:
             return self.v(u.new_full((1,), min(max(t, low), high)), u.view(1, *self.shape)).flatten()
 
-    def product(self, f: Tensor, way: Tensor) -> Tensor:
-        """J times a vector: a difference of v, forward in time, so that no time beyond the interval is needed."""
-        ahead = float(way[-1]) * self.direction
+    def product(self, f: Tensor, direction: Tensor) -> Tensor:
+        """J times a vector, by a difference of v forward in time, so that v is not evaluated outside the interval."""
+        ahead = float(direction[-1]) * self.direction
         scale = (1 + _rms(self.u)) * math.sqrt(len(self.u))
-        length = math.hypot(float(torch.linalg.vector_norm(way[:-1])) / scale, ahead)
+        length = math.hypot(float(torch.linalg.vector_norm(direction[:-1])) / scale, ahead)
         if not length:
-            return torch.zeros_like(way)
+            return torch.zeros_like(direction)
         step = math.sqrt(self.roundoff) / length
         step = math.copysign(min(step, abs(self.t_end - self.t) / max(abs(ahead), 1e-300)), ahead)
-        moved = self.velocity(self.t + step * float(way[-1]), self.u + step * way[:-1])
+        moved = self.velocity(self.t + step * float(direction[-1]), self.u + step * direction[:-1])
         return torch.cat([(moved - f) / step, f.new_zeros(1)])
 
     def _shortest(self) -> float:
         return 4 * torch.finfo(self.u.dtype).eps * max(abs(self.t), 1e-3 * self.length)
 
     def _first_step(self, f: Tensor) -> float:
-        """As the explicit methods', but not limited by how fast x changes: that is what J tells."""
+        """First step size as in explicit methods, but not limited by the rate of change of x, which J covers."""
         slope = _rms(f / (self.tolerance * (1 + self.u.abs())))
         return min((0.01 / slope) ** 0.25, self.length) if slope > 0 else self.length
 
     def _try(self, f: Tensor, krylov: "_Krylov", h: float) -> tuple[float, float, Tensor]:
-        """A step's error in tolerances, its length, which may be less than asked for, and its end."""
+        """Try a step: its error in tolerances, its length (at most h) and its end."""
         scale = self.tolerance * (1 + self.u.abs())
         while not krylov.enough(1, self.direction * h, scale):
             h /= 2
             if not krylov.finite or h < self._shortest():
                 return math.inf, h, self.u
         signed = self.direction * h
-        ways = [krylov.combination(1, share * signed) for share in (0.5, 1.0)]
+        combinations = [krylov.combination(1, share * signed) for share in (0.5, 1.0)]
         remainders = []
-        for share, y in zip((0.5, 1.0), ways, strict=True):
+        for share, y in zip((0.5, 1.0), combinations, strict=True):
             moved, linear = krylov.vector(y)[:-1], krylov.image(y)[:-1]
             found = self.velocity(self.t + share * signed, self.u + share * signed * moved)
             remainders.append(found - f - share * signed * linear)
-        end = self.u + signed * krylov.vector(ways[1])[:-1]
+        end = self.u + signed * krylov.vector(combinations[1])[:-1]
         parts = ((3, 16 * remainders[0] - 2 * remainders[1]), (4, 12 * remainders[1] - 48 * remainders[0]))
         for order, start in parts:
             part = torch.zeros_like(end)
@@ -184,7 +184,7 @@ class _Scene:
 
 
 class _Krylov:
-    """The space of b, J b, J^2 b, ..., with orthonormal vectors V and J V_m = V_(m+1) H."""
+    """Krylov space of b, J b, J^2 b, ..., with orthonormal basis V and J V_m = V_(m+1) H."""
 
     def __init__(self, product: Callable[[Tensor], Tensor], start: Tensor) -> None:
         self._product, self.size = product, float(torch.linalg.vector_norm(start.double()))
@@ -194,7 +194,7 @@ class _Krylov:
         self.m = 0
 
     def enough(self, order: int, h: float, scale: Tensor) -> bool:
-        """Extend the space until h phi_order(h J) b is known to `KRYLOV` tolerances; False where it would be too large.
+        """Extend the space until h phi_order(h J) b has an error of `KRYLOV` tolerances; False if `LARGEST` is reached.
 
         The error is about |b| h_(m+1,m) |h^2 phi_(order+1)(h H)_(m,1)| along the next vector (Saad).
         """
@@ -210,15 +210,15 @@ class _Krylov:
 
     @property
     def finite(self) -> bool:
-        """Whether all products with J were."""
+        """Whether all products with J are finite."""
         return bool(np.isfinite(self.matrix).all())
 
     def _extend(self) -> None:
         m = self.m
-        following, known = self._product(self.basis[m]), self.basis[: m + 1]
-        for _ in range(2):  # the second time for what rounding has left
-            along = known @ following
-            following = following - along @ known
+        following, basis = self._product(self.basis[m]), self.basis[: m + 1]
+        for _ in range(2):  # twice, against rounding errors
+            along = basis @ following
+            following = following - along @ basis
             self.matrix[: m + 1, m] += along.double().cpu().numpy()
         beyond = float(torch.linalg.vector_norm(following))
         self.matrix[m + 1, m] = beyond
@@ -226,15 +226,15 @@ class _Krylov:
         self.m += 1
 
     def _phi(self, order: int, h: float) -> np.ndarray:
-        """phi_order(h H) e_1 by the exponential of a larger matrix (Al-Mohy, Higham, 2011)."""
+        """phi_order(h H) e_1 by the exponential of an augmented matrix (Al-Mohy, Higham, 2011)."""
         m = self.m
-        larger = torch.zeros(m + order, m + order, dtype=torch.float64)
-        larger[:m, :m] = h * torch.from_numpy(self.matrix[:m, :m])
-        larger[0, m] = 1
+        augmented = torch.zeros(m + order, m + order, dtype=torch.float64)
+        augmented[:m, :m] = h * torch.from_numpy(self.matrix[:m, :m])
+        augmented[0, m] = 1
         for i in range(m, m + order - 1):
-            larger[i, i + 1] = 1
-        found: np.ndarray = torch.linalg.matrix_exp(larger)[:m, -1].numpy()
-        return found
+            augmented[i, i + 1] = 1
+        result: np.ndarray = torch.linalg.matrix_exp(augmented)[:m, -1].numpy()
+        return result
 
     def combination(self, order: int, h: float) -> np.ndarray:
         """phi_order(h J) b in the basis."""

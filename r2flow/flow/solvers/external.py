@@ -1,4 +1,4 @@
-"""torchdiffeq's methods, scene by scene."""
+"""Solvers of torchdiffeq, applied scene by scene."""
 
 import logging
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, finite
 log = logging.getLogger(__name__)
 
 TORCHDIFFEQ = "torchdiffeq:"
-# Its Adams methods need equal steps, which it does not check: on others their order falls to 2. With its default order
-# of 12 the error of the explicit one grows with every halving of equal steps. SciPy's count no steps.
+# Its Adams methods need equal steps, which it does not check: on other grids their order drops to 2. At its default
+# order of 12, the error of the explicit one grows with every halving of equal steps. SciPy's solver counts no steps.
 LEFT_OUT = ("explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver")
 
 
@@ -29,7 +29,7 @@ def torchdiffeq_methods() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class TorchDiffEqMethod:
-    """A method of torchdiffeq by its name there."""
+    """A solver of torchdiffeq by name."""
 
     name: str
 
@@ -40,21 +40,21 @@ class TorchDiffEqMethod:
 
     @property
     def adapts(self) -> bool:
-        """Whether steps are chosen by a tolerance."""
+        """Whether step sizes follow from a tolerance."""
         from torchdiffeq._impl.solvers import FixedGridODESolver
 
         return not issubclass(torchdiffeq_methods()[self.name], FixedGridODESolver)
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
-        """Solve one scene after another, since torchdiffeq has one error norm for a batch, which hides a hard scene.
+        """Solve scenes one after another: torchdiffeq's error norm of a whole batch would hide a hard scene.
 
         Args:
-            times: The time grid of a fixed-step method; an adaptive one goes from its first to its last time.
+            times: Time grid of a fixed-step method; an adaptive method uses its first and last time.
         """
         import torchdiffeq
 
         grid = times.to(x)
-        # By the state's type: the velocity has not been called yet.
+        # From the state's type, since the velocity has not been evaluated yet.
         tolerance = attainable(limits, v.coarsest(x)) if self.adapts else limits.tolerance
         options = {} if self.adapts else {"grid_constructor": lambda field, start, span: grid}
         scenes = [_Scene(v, start, limits.max_evaluations, self.adapts) for start in x.split(1)]
@@ -68,7 +68,7 @@ class TorchDiffEqMethod:
                 )[-1]  # fmt: skip
                 converged[i] = bool(end.isfinite().all())
                 scenes[i].last = end if converged[i] else scenes[i].last
-            except (_Spent, AssertionError) as error:  # it asserts that steps do not underflow, values are finite
+            except (_Spent, AssertionError) as error:  # it asserts on underflowing steps, non-finite values
                 converged[i] = False
                 log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, self.name, i, error)
         v.only(np.arange(len(x)))
@@ -80,11 +80,11 @@ class TorchDiffEqMethod:
 
 
 class _Spent(Exception):
-    """A scene has used its budget of evaluations."""
+    """A scene has used up its budget of evaluations."""
 
 
 class _Scene:
-    """One scene's velocity, and what torchdiffeq reports on the way."""
+    """One scene's velocity, and the steps that torchdiffeq reports."""
 
     def __init__(self, v: Evaluations, x: Tensor, max_evaluations: int, adapts: bool) -> None:
         self._v, self._left = v, max_evaluations

@@ -1,4 +1,4 @@
-"""Solvers that take the steps of a time grid: Runge-Kutta and Adams methods."""
+"""Fixed-step solvers on a time grid: Runge-Kutta and Adams methods."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,19 +17,19 @@ Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class FixedStep:
-    """One step x(t) -> x(t + h).
+    """A fixed-step method x(t) -> x(t + h).
 
     Attributes:
-        step: A function of v, t, h and x; of a multistep method, what makes that function from the times of a
-            solution, (N + 1,) float64.
-        order: Of the global error.
-        evaluations: Of the velocity, in a step.
-        start: Further ones in the first step.
-        multistep: Whether `step` makes the step function.
-        corrects: Whether that function has a corrector.
+        step: Step function of v, t, h and x; for a multistep method, a factory of step functions that takes the times
+            of a solution, (N + 1,) float64.
+        order: Order of the global error.
+        evaluations: Evaluations of v per step.
+        start: Additional evaluations in the first step.
+        multistep: Whether `step` is a factory.
+        corrects: Whether the step function has a corrector.
     """
 
-    adapts: ClassVar[bool] = False  # whether steps are chosen by a tolerance
+    adapts: ClassVar[bool] = False  # whether step sizes follow from a tolerance
 
     step: Callable[..., Any]
     order: int
@@ -39,13 +39,13 @@ class FixedStep:
     corrects: bool = False
 
     def cost(self, steps: int) -> int:
-        """Evaluations of a number of steps."""
+        """Evaluations of v for a number of steps."""
         return self.start + steps * self.evaluations
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
-        """Take the steps of a time grid, (N + 1,) float64; keep inner states, equally many steps apart.
+        """Take the steps of a time grid, (N + 1,) float64; keep inner states at equal numbers of steps.
 
-        A scene whose state is no longer finite keeps its last finite one; the others are not affected.
+        A scene whose state becomes non-finite keeps its last finite state; other scenes are not affected.
         """
         step: Step = self.step(times) if self.multistep else self.step
         low, high = sorted((float(times[0]), float(times[-1])))
@@ -54,13 +54,13 @@ class FixedStep:
             return v(t.clamp(low, high), state)  # t + h can round to 1 + 1e-7
 
         knots = limits.knots
-        alive, kept, apart = finite(x), [], (len(times) - 1) // (knots + 1)
+        alive, inner_states, interval = finite(x), [], (len(times) - 1) // (knots + 1)
         for n, (t, following) in enumerate(pairwise(times)):
-            if knots and n and n % apart == 0:
-                kept.append(x)
+            if knots and n and n % interval == 0:
+                inner_states.append(x)
             x, alive = stepped(x, step(inside, t.to(x), (following - t).to(x), x), alive)
         solution = Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
-        return replace(solution, knots=torch.stack(kept, 1)) if knots else solution
+        return replace(solution, knots=torch.stack(inner_states, 1)) if knots else solution
 
 
 def euler(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
@@ -95,19 +95,19 @@ def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
 
 
 def adams(predictor: int, corrector: int = 0) -> FixedStep:
-    """An Adams method for steps of any lengths, with one evaluation a step.
+    """An Adams method for variable step sizes, with one evaluation per step.
 
-    The predictor x_n + integral of P dt, where the polynomial P passes through the last velocities, gives the point at
-    which v is evaluated next. The corrector takes the step again, with that velocity among those of P (PEC mode:
-    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, III.1 and III.5). The last step is not
-    corrected, which would take v(1, x). The order is the greater of the two numbers.
+    The predictor x_n + integral of P dt, where the polynomial P interpolates the last velocities, gives the point at
+    which v is evaluated next. The corrector repeats the step with this velocity included in P (PEC mode: Hairer,
+    Norsett, Wanner, Solving Ordinary Differential Equations I, III.1 and III.5). The last step is not corrected, which
+    would need v(1, x). The order is the larger one of predictor and corrector.
 
-    The first steps have fewer velocities. Up to order 3 the order survives that. A corrector of 4 takes Heun's step
-    first, with one evaluation more, and corrects the first two steps together.
+    The first steps have fewer velocities, which preserves the order up to 3. A corrector of 4 starts with Heun's step,
+    at one more evaluation, and corrects the first two steps together.
 
     Args:
-        predictor: Velocities in the predictor.
-        corrector: Velocities in the corrector, the new one included; 0 for no corrector (Adams-Bashforth).
+        predictor: Number of velocities in the predictor.
+        corrector: Number of velocities in the corrector, including the new one; 0: no corrector (Adams-Bashforth).
     """
     return FixedStep(
         partial(_Adams, predictor, corrector), max(predictor, corrector), evaluations=1, start=int(corrector > 3),
@@ -116,17 +116,17 @@ def adams(predictor: int, corrector: int = 0) -> FixedStep:
 
 
 class _Adams:
-    """The steps of one solution.
+    """Step function of one solution.
 
-    The state between two steps is a predicted one: each call evaluates v there, corrects the step before and predicts.
+    The state between two steps is predicted: each call evaluates v there, corrects the previous step and predicts.
     """
 
     def __init__(self, predictor: int, corrector: int, times: Tensor) -> None:
         self.predictor, self.corrector, self.times = predictor, corrector, times.tolist()
         self.heun_first = corrector > 3
         self.taken = 0
-        self.velocities: list[Tensor] = []  # at the last times, the newest at the end
-        self.corrected: tuple[int, Tensor] | None = None  # a step and its state, from which the next correction starts
+        self.velocities: list[Tensor] = []  # at the last times, newest last
+        self.corrected: tuple[int, Tensor] | None = None  # step and state at which the next correction starts
 
     def __call__(self, v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
         n = self.taken
@@ -135,8 +135,8 @@ class _Adams:
         if self.corrector and self.corrected is None:
             self.corrected = 0, x
         elif self.corrected is not None and not (self.heun_first and n == 1):
-            start, before = self.corrected
-            x = self._moved(before, start, n, self.corrector)
+            start, state = self.corrected
+            x = self._moved(state, start, n, self.corrector)
             self.corrected = n, x
         if self.heun_first and n == 0:
             k = self.velocities[0]
@@ -144,18 +144,18 @@ class _Adams:
         return self._moved(x, n, n + 1, self.predictor)
 
     def _moved(self, x: Tensor, first: int, last: int, nodes: int) -> Tensor:
-        """x and the integral over the steps from `first` to `last` of the polynomial through the last velocities."""
-        known = self.velocities[-nodes:]
-        at = self.times[self.taken - len(known) : self.taken]
-        for weight, velocity in zip(weights(at, self.times[first], self.times[last]), known, strict=True):
+        """x plus the integral, over the steps `first` to `last`, of the polynomial through the last velocities."""
+        velocities = self.velocities[-nodes:]
+        times = self.times[self.taken - len(velocities) : self.taken]
+        for weight, velocity in zip(weights(times, self.times[first], self.times[last]), velocities, strict=True):
             x = x + weight * velocity
         return x
 
 
 def weights(nodes: Sequence[float], start: float, end: float) -> list[float]:
-    """w such that sum w_i f_i is the integral from start to end of the polynomial through the (nodes_i, f_i).
+    """w such that sum w_i f_i is the integral from start to end of the polynomial through (nodes_i, f_i).
 
-    For up to 4 nodes: Gauss-Legendre's rule of two points is exact for cubic polynomials.
+    Valid for up to 4 nodes: two-point Gauss-Legendre quadrature is exact for cubic polynomials.
     """
     middle, half = (start + end) / 2, (end - start) / 2
     points = (middle - half / math.sqrt(3), middle + half / math.sqrt(3))

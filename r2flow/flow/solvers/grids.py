@@ -1,4 +1,4 @@
-"""Time grids: the times between t_0 and t_1 at which fixed steps begin and end."""
+"""Time grids of fixed steps."""
 
 import math
 from collections.abc import Callable
@@ -15,12 +15,12 @@ def uniform(t_0: float, t_1: float, steps: int) -> Tensor:
 
 
 def power(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
-    """t = 1 - (1 - u)^p at equal steps of u: for p above 1 denser towards t = 1, where a 1-RF is curved most."""
+    """t = 1 - (1 - u)^p at equal steps of u: for p > 1 denser towards t = 1, where a 1-RF is most curved."""
     return 1 - power_start(1 - t_0, 1 - t_1, steps, p)
 
 
 def power_start(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
-    """t = u^p at equal steps of u: for p above 1 denser towards t = 0."""
+    """t = u^p at equal steps of u: for p > 1 denser towards t = 0."""
     assert min(t_0, t_1) >= 0, "a power grid ends at the time towards which it gets denser"
     return uniform(t_0 ** (1 / p), t_1 ** (1 / p), steps) ** p
 
@@ -29,9 +29,9 @@ NAMED = {"power": power, "power-start": power_start}
 
 
 def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
-    """The times of a grid by its name: uniform, power:P or power-start:P with 1 <= P <= 10.
+    """A time grid by name: uniform, power:P or power-start:P with 1 <= P <= 10.
 
-    Forward and backward in time they are the same.
+    The times are the same forward and backward in time.
     """
     if name == "uniform":
         return uniform
@@ -46,20 +46,20 @@ def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
 
 
 def build_grid(grid: str | Tensor, t_0: float, t_1: float, steps: int) -> Tensor:
-    """Times from t_0 to t_1, (N + 1,) float64 on the CPU, N = steps unless the times are given.
+    """Times from t_0 to t_1, (N + 1,) float64 on the CPU; N = steps unless `grid` is a tensor of times.
 
     Raises:
-        InputError: an unknown name, steps that are too short for float64, or given times that do not run from t_0 to
-            t_1 in one direction.
+        InputError: an unknown name, steps too short for float64, or times that do not run monotonically from t_0 to
+            t_1.
     """
     if isinstance(grid, str):
         times = named_grid(grid)(t_0, t_1, steps)
     else:
         times = grid.detach().to("cpu", torch.float64, copy=True)
     if times.ndim != 1 or len(times) < 2 or not ((times[1:] - times[:-1]) * (t_1 - t_0) > 0).all():
-        found = grid if not isinstance(grid, str) else f"{steps} steps on {grid}, too short for float64"
-        raise InputError(f"a time grid must be (N + 1,) times that run in one direction, found {found}.")
+        given = grid if not isinstance(grid, str) else f"{steps} steps on {grid}, too short for float64"
+        raise InputError(f"a time grid must be (N + 1,) times that run in one direction, found {given}.")
     if max(abs(times[0] - t_0), abs(times[-1] - t_1)) > 1e-6:
         raise InputError(f"this time grid runs from {times[0]:g} to {times[-1]:g}, the solution from {t_0} to {t_1}.")
-    times[0], times[-1] = t_0, t_1  # what a grid kept in float32, or a power, has lost
+    times[0], times[-1] = t_0, t_1  # undo rounding by float32 or powers
     return times

@@ -1,4 +1,4 @@
-"""The arguments and results that all solvers share."""
+"""Arguments and results of all solvers."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -21,16 +21,16 @@ class Solution:
     """The state at t_1, its cost and its accuracy.
 
     Attributes:
-        x: State at t_1, (B, ...), float32 (float64 when x_0 was); the last finite state of a scene that has not
-            converged.
-        evaluations: Network evaluations per scene, (B,) int64, those of the error estimate included.
+        x: State at t_1, (B, ...), float32 (float64 if x_0 is); for a scene that has not converged, the last finite
+            state.
+        evaluations: Network evaluations per scene, (B,) int64, including those of the error estimate.
         accepted: Steps taken per scene, (B,) int64.
         rejected: Steps rejected per scene, (B,) int64; 0 for fixed steps.
-        stiff: Scenes whose steps were limited by stability, not by accuracy, (B,) bool; False where not looked for.
+        stiff: Scenes whose steps were limited by stability, not by accuracy, (B,) bool; False if not detected.
         converged: Scenes that reached t_1 with finite values, (B,) bool.
-        global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf where there is no
-            estimate; None when not asked for.
-        knots: Inner states that were asked for, (B, K, ...); None when not asked for.
+        global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf without an estimate
+            for the scene; None if not requested.
+        knots: Inner states, (B, K, ...); None if not requested.
     """
 
     x: Tensor
@@ -52,23 +52,25 @@ class Solution:
         stiff: PerScene,
         converged: PerScene,
     ) -> "Solution":
-        """From one value for all scenes or one for each."""
-        of = len(x)
-        counts = [torch.from_numpy(np.broadcast_to(n, of).astype(np.int64)) for n in (evaluations, accepted, rejected)]
-        flags = [torch.from_numpy(np.broadcast_to(flag, of).astype(bool)) for flag in (stiff, converged)]
+        """A solution from values per scene, or single values for all scenes."""
+        batch = len(x)
+        counts = [
+            torch.from_numpy(np.broadcast_to(n, batch).astype(np.int64)) for n in (evaluations, accepted, rejected)
+        ]
+        flags = [torch.from_numpy(np.broadcast_to(flag, batch).astype(bool)) for flag in (stiff, converged)]
         return cls(x, *counts, *flags)
 
 
 class Limits(NamedTuple):
-    """The options of a solution.
+    """Options of a solver.
 
     Attributes:
-        tolerance: Absolute and relative tolerance of one step's error, as asked for.
-        max_evaluations: Budget of one scene.
-        tighter: The tolerance used is the attainable one divided by this.
+        tolerance: Requested absolute and relative tolerance of a step's error.
+        max_evaluations: Budget per scene.
+        tighter: Divisor of the attainable tolerance.
         max_step: Longest step as a share of the interval.
-        until_stiff: Whether a scene is left where it turns out to be stiff.
-        knots: Inner states to keep, of a method of fixed steps.
+        until_stiff: Whether to stop a scene once it is stiff.
+        knots: Number of inner states to keep, in a fixed-step method.
     """
 
     tolerance: float
@@ -80,16 +82,16 @@ class Limits(NamedTuple):
 
 
 class Evaluations:
-    """The velocity as solvers call it: evaluations are counted per scene, and v has the state's type.
+    """The velocity as called by solvers: counts evaluations per scene and returns v in the state's type.
 
     A velocity that differs between scenes has a method `select(scenes)`, which returns the velocity of these scenes,
-    int64 indices into its batch. The precision is the coarsest type among that of v, the surrounding autocast, the
-    parameters of a module and, where it has one, the velocity's attribute `precision`.
+    int64 indices into its batch. The precision is the coarsest type among those of v, of the surrounding autocast, of a
+    module's parameters and of the velocity's attribute `precision`, if any.
 
     Attributes:
-        counts: Evaluations of every scene of the batch, (B,).
-        scenes: The scenes that the state holds now, indices into the batch.
-        precision: The precision of the last evaluation.
+        counts: Evaluations per scene of the batch, (B,).
+        scenes: Scenes of the current state, indices into the batch.
+        precision: Precision of the last evaluation.
     """
 
     def __init__(self, velocity: Velocity, scenes: int, progress: Callable[[], None] | None = None) -> None:
@@ -111,7 +113,7 @@ class Evaluations:
         return v.to(x.dtype, copy=True)  # a runtime may write each output into the same buffer
 
     def some(self, places: np.ndarray, t: Tensor, x: Tensor) -> Tensor:
-        """v of some of the scenes that the state holds now."""
+        """v of some scenes of the current state."""
         scenes = self.scenes
         if len(places) < len(scenes):
             self.only(scenes[places])
@@ -122,27 +124,27 @@ class Evaluations:
                 self.only(scenes)
 
     def coarsest(self, *tensors: Tensor) -> torch.dtype:
-        """The type with the fewest digits among those of the tensors, the autocast and the velocity itself."""
+        """The type with the fewest digits among those of the tensors, of autocast and of the velocity."""
         kind = tensors[0].device.type
-        around = [torch.get_autocast_dtype(kind)] if torch.is_autocast_enabled(kind) else []
-        return max([*(x.dtype for x in tensors), *around, *self._own_types], key=lambda dtype: torch.finfo(dtype).eps)
+        autocast = [torch.get_autocast_dtype(kind)] if torch.is_autocast_enabled(kind) else []
+        return max([*(x.dtype for x in tensors), *autocast, *self._own_types], key=lambda dtype: torch.finfo(dtype).eps)
 
     def only(self, scenes: np.ndarray) -> None:
-        """The state now holds these scenes, indices into the original batch."""
+        """Set the scenes of the current state, indices into the original batch."""
         self.scenes = scenes
         self._velocity = selected(self._whole, torch.from_numpy(scenes))
 
 
 def selected(velocity: V, scenes: Tensor) -> V:
-    """The velocity of some scenes, (N,) int64, where it differs between them: by its method `select`."""
+    """The velocity of some scenes, (N,) int64: by its method `select`, if any."""
     select: Callable[[Tensor], V] | None = getattr(velocity, "select", None)
     return velocity if select is None else select(scenes)
 
 
 def _own_types(velocity: Velocity) -> set[torch.dtype]:
-    """The types of a module's parameters and of the attribute `precision`."""
-    said = getattr(velocity, "precision", None)
-    types = {said} if isinstance(said, torch.dtype) else set()
+    """Types of a module's parameters, and the attribute `precision`."""
+    precision = getattr(velocity, "precision", None)
+    types = {precision} if isinstance(precision, torch.dtype) else set()
     module = velocity if isinstance(velocity, torch.nn.Module) else getattr(velocity, "__self__", None)
     if isinstance(module, torch.nn.Module):
         types |= {parameter.dtype for parameter in module.parameters() if parameter.is_floating_point()}
@@ -150,21 +152,21 @@ def _own_types(velocity: Velocity) -> set[torch.dtype]:
 
 
 def finite(x: Tensor) -> Tensor:
-    """Which scenes of x, (B, ...), hold no NaN and no infinity, (B,) bool."""
+    """Which scenes of x, (B, ...), are finite, (B,) bool."""
     return flat(torch.isfinite(x)).all(1)
 
 
 def flat(x: Tensor) -> Tensor:
-    """x, (B, ...), as (B, N); N = 1 of (B,), and B may be 0."""
+    """Reshape x, (B, ...), to (B, N); N = 1 for (B,); B may be 0."""
     return x.reshape(len(x), math.prod(x.shape[1:]))
 
 
 def wide(x: Tensor) -> Tensor:
-    """x in float32 at least: states of fewer digits lose a flow's small steps."""
+    """x in at least float32: small steps are lost in types of fewer digits."""
     return x if x.dtype == torch.float64 else x.float()
 
 
 def stepped(x: Tensor, following: Tensor, alive: Tensor) -> tuple[Tensor, Tensor]:
-    """The states after a step, (B, ...), and which are finite still, (B,); one that is not stays in its last state."""
+    """States after a step, (B, ...), and which are still finite, (B,); non-finite scenes keep the last finite one."""
     alive = alive & finite(following)
     return torch.where(expand_time(alive, x), following, x), alive

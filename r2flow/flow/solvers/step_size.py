@@ -1,4 +1,4 @@
-"""Step size control for many scenes at once, on the host and in float64."""
+"""Step size control of all scenes of a batch, on the host in float64."""
 
 import math
 
@@ -11,19 +11,19 @@ from r2flow.flow.solvers.solution import Limits, Solution
 
 SHRINK = 0.2  # smallest factor between one step size and the next
 MEMORY = 0.04  # beta of the PI controller, the weight of the previous error: steadier steps at a stability limit
-REMEMBERED = 3  # steps for which a rejection raises the suspicion of a jump
-STIFF_AFTER, SMOOTH_AFTER = 15, 6  # Hairer: stiff after 15 such steps without 6 others in a row between them
-# Eigenvalues near the imaginary axis limit steps at a smaller |h lambda|, where accuracy can limit them as well: a
-# scene is handed over after more such steps, but not called stiff otherwise.
+REMEMBERED = 3  # steps for which a rejection makes a jump likely
+STIFF_AFTER, SMOOTH_AFTER = 15, 6  # Hairer: stiff after 15 touching steps without 6 other steps in a row between them
+# Eigenvalues near the imaginary axis limit steps at a smaller |h lambda|, where accuracy can limit them as well: only
+# with `until_stiff`, and after more such steps, does a scene count as stiff.
 OSCILLATING, OSCILLATING_AFTER = 1.0, 200
-FAR, DECADES = 0.02, 3  # share of its size that x moves in a step; powers of ten of the step size that tell a pole
+FAR, DECADES = 0.02, 3  # share of its size that x moves in a step; number of powers of ten of h that indicate a pole
 
 
 class StepController:
     """Time, step size and step counts of every scene of a batch.
 
-    The arrays have one entry for each scene still in the batch, except those that `solution` returns for all. Progress
-    is a length from t_0, so that forward and backward in time are the same.
+    The arrays have one entry per scene still in the batch, except those that `solution` returns for all. Progress is
+    measured as a length from t_0, which makes forward and backward in time equal.
     """
 
     def __init__(
@@ -36,41 +36,44 @@ class StepController:
         self.longest = limits.max_step * self.length
         self.eps = eps
         self.scenes, self.places = scenes, np.arange(len(scenes))
-        of = len(scenes)
-        self.reached, self.h, self.grow = np.zeros(of), np.full(of, self.length), np.full(of, method.grow)
-        self.last_error = np.full(of, 1e-4)  # dopri5.f
-        self.stiff_run, self.smooth_run = np.zeros(of, int), np.zeros(of, int)
-        self.oscillating_run, self.calm_run = np.zeros(of, int), np.zeros(of, int)
-        self.arrived, self.leaving = np.zeros(of, bool), np.zeros(of, bool)
-        self.accepted, self.rejected = np.zeros(of, int), np.zeros(of, int)
-        self.stiff, self.converged, self.times = np.zeros(of, bool), np.zeros(of, bool), np.full(of, t_0)
-        # A jump of the velocity: the lengths from t_0 between which it lies, and the step size behind it.
-        self.begin, self.end, self.resume = np.full(of, np.inf), np.full(of, np.inf), np.zeros(of)
-        self.crossing = np.zeros(of, bool)
-        self.roughness, self.rough = np.zeros(of), np.full(of, np.nan)  # third difference; of the last step, over h^4
-        self.troubled = np.zeros(of, int)  # steps for which a rejection is remembered
-        self.decades = np.zeros(of, int)  # of short steps that have moved x far: a bit for each power of ten
-        self.factor = np.full(of, np.inf)  # between a step that does not hold and the next one
+        count = len(scenes)
+        self.reached, self.h, self.grow = np.zeros(count), np.full(count, self.length), np.full(count, method.grow)
+        self.last_error = np.full(count, 1e-4)  # dopri5.f
+        self.stiff_run, self.smooth_run = np.zeros(count, int), np.zeros(count, int)
+        self.oscillating_run, self.calm_run = np.zeros(count, int), np.zeros(count, int)
+        self.arrived, self.leaving = np.zeros(count, bool), np.zeros(count, bool)
+        self.accepted, self.rejected = np.zeros(count, int), np.zeros(count, int)
+        self.stiff, self.converged, self.times = np.zeros(count, bool), np.zeros(count, bool), np.full(count, t_0)
+        # A jump of the velocity: its bracket, as lengths from t_0, and the step size after it.
+        self.begin, self.end, self.resume = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
+        self.crossing = np.zeros(count, bool)
+        self.roughness, self.rough = (
+            np.zeros(count),
+            np.full(count, np.nan),
+        )  # third difference; of the last step, over h^4
+        self.troubled = np.zeros(count, int)  # steps for which a rejection is remembered
+        self.decades = np.zeros(count, int)  # of the length of short steps that moved x far: one bit per power of ten
+        self.factor = np.full(count, np.inf)  # from a rejected step to the next one
 
     def time(self, reached: np.ndarray) -> np.ndarray:
-        """t at a length from t_0, never beyond the end."""
+        """t at a length from t_0, clipped to the interval."""
         t = self.t_0 + self.direction * np.minimum(reached, self.length)
         t = np.where(reached >= self.length, self.t_end, t)
         return np.minimum(np.maximum(t, self.low), self.high)
 
     def shortest(self) -> np.ndarray:
-        """Step sizes below which the stages' times are equal in the state's type, (B,)."""
+        """Smallest step sizes, (B,): below them the stages' times are equal in the state's type."""
         return 4 * self.eps * np.maximum(np.abs(self.time(self.reached)), 1e-3 * self.length)
 
     def now(self, x: Tensor) -> Tensor:
-        """t of every scene, (B,), on the device and in the type of x."""
+        """Current t per scene, (B,), with the device and type of x."""
         return torch.from_numpy(self.time(self.reached)).to(x.device, x.dtype)
 
     def start(self, state: np.ndarray, slope: np.ndarray, evaluations: np.ndarray) -> None:
-        """The first step size, from the norms of x and v in tolerances; a scene whose v is not finite leaves.
+        """Set the first step size from the norms of x and v in tolerances; scenes with a non-finite v leave.
 
-        Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, II.4, without its evaluation for the
-        second derivative: a step that is too long is rejected or does not hold.
+        Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, II.4, without the evaluation for the second
+        derivative, since steps that are too long are rejected.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             h = np.fmin((0.01 / slope) ** (1 / self.method.order), np.where(state < 1e-5, np.inf, state / slope))
@@ -80,7 +83,7 @@ class StepController:
     def propose(self) -> np.ndarray:
         """Times of the stages and signed steps, (stages + 1, B).
 
-        The last two steps to the end, or to a jump, share what is left.
+        The last two steps before the end, or before a jump, are of equal length.
         """
         goal = np.minimum(self.length, self.begin)
         left = goal - self.reached
@@ -91,31 +94,31 @@ class StepController:
         return np.concatenate([stages, self.direction * h[None]])
 
     def within(self, error: np.ndarray, dk: np.ndarray, dy: np.ndarray, size: np.ndarray) -> np.ndarray:
-        """Whose step is finite and within the tolerance, (B,) bool.
+        """Which steps are finite and within the tolerance, (B,) bool.
 
-        Stages that are further apart than the state's size 1 + |x| lie about a pole: the error estimate means nothing.
+        If the stages differ by more than the state's size 1 + |x|, a pole makes the error estimate meaningless.
         """
-        apart = ~(dy <= size)
-        self.factor[apart] = SHRINK
-        good: np.ndarray = (error <= 1) & np.isfinite(dk) & ~apart
+        pole = ~(dy <= size)
+        self.factor[pole] = SHRINK
+        good: np.ndarray = (error <= 1) & np.isfinite(dk) & ~pole
         return good
 
     def rougher(self, least: float, by: float) -> np.ndarray:
-        """Whose third difference is above `least` and `by` times what the step before it foretells, (B,) bool."""
+        """Whether the third difference exceeds `least`, and `by` times its extrapolation from the last step, (B,)."""
         with np.errstate(invalid="ignore", over="ignore"):
-            found: np.ndarray = (self.roughness > least) & ~(self.roughness <= by * self.rough * self.h**4)
-        return found & ~self.stiff[self.places]
+            exceeds: np.ndarray = (self.roughness > least) & ~(self.roughness <= by * self.rough * self.h**4)
+        return exceeds & ~self.stiff[self.places]
 
     def able(self, evaluations: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Which of these scenes can be evaluated once more, (N,) bool."""
+        """Which of these scenes have budget for one more evaluation, (N,) bool."""
         return np.asarray(evaluations[self.scenes[places]] < self.limits.max_evaluations)
 
     def shorten(self, place: int, share: float) -> None:
-        """A scene's step does not hold: try again with about this share of it."""
+        """Reject a scene's step; retry with about this share of its length."""
         self.factor[place] = min(max(share, SHRINK), 0.7)
 
     def stop_at(self, place: int, left: float, right: float) -> None:
-        """A scene's velocity jumps between two shares of its step."""
+        """Note a jump of a scene's velocity between two shares of its step."""
         h = self.h[place]
         self.begin[place], self.end[place] = (self.reached[place] + share * h for share in (left, right))
         self.resume[place] = h
@@ -123,9 +126,9 @@ class StepController:
     def judge(
         self, good: np.ndarray, error: np.ndarray, dk: np.ndarray, dy: np.ndarray, evaluations: np.ndarray
     ) -> None:
-        """Accept the good steps, reject the others, and choose every scene's next step size.
+        """Accept the good steps, reject the others, and set every scene's next step size.
 
-        `error` is the norm of the local error over the tolerance; `dk` and `dy` are those of the differences in v and x
+        `error` is the norm of the local error in tolerances; `dk` and `dy` are the norms of the differences of v and x
         between the last two stages.
         """
         finite = np.isfinite(error) & np.isfinite(dk) & np.isfinite(dy)
@@ -148,48 +151,48 @@ class StepController:
         self.leaving = self.arrived | stuck | spent | handed_over
 
     def note_pole(self, places: np.ndarray, h: np.ndarray, share: np.ndarray, back: np.ndarray) -> None:
-        """A scene leaves without having arrived once the path does not shorten with the step.
+        """Give up scenes whose path does not shorten with the step, which indicates a pole.
 
-        About a pole without an integral, as 1 / (t - a), steps of 1e-4, 1e-5 and 1e-6 of the interval all move x by the
-        same share |h v| / |1 + |x|| of its size, and a step that happens to straddle the pole can meet a loose
-        tolerance. Where v points back at the end of the step, a pole is told one power of ten earlier.
+        Near a non-integrable pole, such as 1 / (t - a), steps of 1e-4, 1e-5 and 1e-6 of the interval all move x by the
+        same share |h v| / |1 + |x|| of its size, and a step that straddles the pole by chance can meet a loose
+        tolerance. If v points back at the end of the step, one power of ten less is required.
         """
         decade = 2 ** np.floor(-np.log10(h / self.length)).astype(int)
         self.decades[places] |= np.where(share > FAR, decade, 0)
         self.give_up(places[np.bitwise_count(self.decades[places]) >= DECADES - (back & (share > FAR))])
 
     def cross(self) -> np.ndarray:
-        """Time after and signed length of the crossing of a jump, (2, N); these scenes stand behind it then."""
-        here, end = self.reached[self.crossing], np.minimum(self.end[self.crossing], self.length)
+        """Move scenes across their jump; returns the time after it and the signed length of the crossing, (2, N)."""
+        begin, end = self.reached[self.crossing], np.minimum(self.end[self.crossing], self.length)
         self.reached[self.crossing], self.h[self.crossing] = end, self.resume[self.crossing]
         self.begin[self.crossing] = self.end[self.crossing] = np.inf
         self.arrived |= self.crossing & (self.reached >= self.length)
         self.leaving |= self.arrived
         self.grow[self.crossing] = 1.0
-        return np.stack([self.time(end), self.direction * (end - here)])
+        return np.stack([self.time(end), self.direction * (end - begin)])
 
     def give_up(self, places: np.ndarray) -> None:
-        """These scenes leave without having arrived."""
+        """Remove these scenes from the batch without convergence."""
         self.arrived[places], self.leaving[places] = False, True
 
     def _spent(self, evaluations: np.ndarray) -> np.ndarray:
         return evaluations + self.method.stages > self.limits.max_evaluations
 
     def _factors(self, good: np.ndarray, finite: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """h_new / h = S err^-(1/q - 3/4 beta) err_before^beta, the PI controller of dopri5.f; 1/5 where not finite."""
+        """h_new / h = S err^-(1/q - 3/4 beta) err_before^beta, the PI controller of dopri5.f; 1/5 if not finite."""
         error = np.where(finite, np.maximum(error, 1e-10), np.inf)
         q = 1 / self.method.order
         steady = self.method.safety * error ** -(q - 0.75 * MEMORY) * self.last_error**MEMORY
         retry = self.method.safety * error ** -(q - 0.75 * MEMORY)
         shorter = np.minimum(np.clip(retry, SHRINK, 1.0), self.factor)
         factors = np.where(good, np.clip(steady, SHRINK, self.grow), shorter)
-        # Rounded as in `norms`, so that a difference of one ulp is not carried on.
+        # Rounded as in `norms`, so that differences of one ulp do not propagate.
         return factors.astype(np.float32).astype(np.float64)
 
     def _look_for_stiffness(self, good: np.ndarray, dk: np.ndarray, dy: np.ndarray) -> None:
         """Hairer, Wanner, Solving Ordinary Differential Equations II, IV.2: h |dk| / |dy| estimates |h lambda|.
 
-        Where it stays at the boundary of the stability region, stability limits the steps, not accuracy.
+        If it stays at the boundary of the stability region, stability limits the steps, not accuracy.
         """
         with np.errstate(invalid="ignore", over="ignore"):
             touching = good & (self.h * dk > self.method.stability * dy)
@@ -204,7 +207,7 @@ class StepController:
         self.stiff[self.places] |= self.stiff_run >= STIFF_AFTER
 
     def keep(self, rest: np.ndarray) -> None:
-        """Keep these scenes; of the others, note which have arrived, and where the others are."""
+        """Keep these scenes in the batch; record convergence and time of all."""
         self.converged[self.places] |= self.arrived
         self.times[self.places] = self.time(self.reached)
         for name in (
@@ -215,5 +218,5 @@ class StepController:
             setattr(self, name, getattr(self, name)[rest])
 
     def solution(self, x: Tensor, evaluations: np.ndarray) -> Solution:
-        """The solution of all scenes from their final states."""
+        """Solution of all scenes, given their final states."""
         return Solution.build(x, evaluations, self.accepted, self.rejected, self.stiff, self.converged)
