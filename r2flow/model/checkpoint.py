@@ -1,4 +1,4 @@
-"""A trained generator on disk, whatever its family: written whole, checked when read, no code from it run."""
+"""Checkpoints: trained generators on disk, written atomically, checked on reading, without code execution."""
 
 import json
 import os
@@ -33,20 +33,20 @@ from r2flow.samplers import build_sampler
 FOLDER = "checkpoints"
 PREFIX = "generator."  # of the generator's weights in a LightningModule
 BACKBONE = "backbone."  # of a flow's network in the generator
-NOTES = "r2flow"  # of a .safetensors: all that it says beside its tensors, as JSON under one key
-SMALL = 256  # the most numbers of a matrix that half precision leaves as it is, as it does all vectors
+NOTES = "r2flow"  # key of the JSON metadata in a .safetensors
+SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained generator. `Checkpoint(generator, config)` is one that was trained without a run.
+    """A trained generator. `Checkpoint(generator, config)` wraps a generator that was trained without a run.
 
     Attributes:
-        generator: With its averaged weights, in eval mode.
-        config: The config it was trained with, as plain dicts; `build_generator` makes the same generator of it.
+        generator: The generator with its averaged weights, in eval mode.
+        config: The training config, as plain dicts; `build_generator(config)` builds the same architecture.
         step: Optimiser steps taken.
-        path: Where it was read from.
-        format: `r2flow`, or `published` for the reference implementation's files.
+        path: File that it was read from.
+        format: `r2flow`, or `published` for files of the original implementations.
     """
 
     generator: Generator
@@ -64,12 +64,12 @@ class Checkpoint:
 
     @property
     def sensor(self) -> Sensor:
-        """What the images look through."""
+        """Sensor of the images."""
         return self.generator.space.sensor
 
     @property
     def encoding(self) -> Encoding:
-        """Between model space and metres."""
+        """Encoding between model space and metres."""
         return self.generator.space.encoding
 
     def sample(self, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
@@ -81,19 +81,19 @@ class Checkpoint:
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
     def complete(self, images: Tensor, state: Tensor | None = None, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
-        """Scans completed from what is known of them, (B, num, 2 or 1, H, W), as `sample` gives them.
+        """Complete partial scans, (B, num, 2 or 1, H, W), in the format of `sample`.
 
         Args:
-            images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W).
+            images: Range in metres and optionally reflectance, (B, 2 or 1, H, W).
             state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`.
             how: Options of `r2flow.model.completion.complete`: name, steps, batch_size, ...
         """
-        return torch.stack([found.images for found in complete(self, images, state, num, seed, **how)])
+        return torch.stack([completed.images for completed in complete(self, images, state, num, seed, **how)])
 
     def through(self, sensor: Sensor, numbered: bool = True) -> "Checkpoint":
         """The same model for another sensor's images; see `TransferFlow.at`."""
         if not isinstance(self.generator, TransferFlow):
-            raise InputError(f"{self.path} is a model of its own sensor alone: leave --to and --size out.")
+            raise InputError(f"{self.path} is a model of one sensor: leave --to and --size out.")
         return replace(self, generator=self.generator.at(self.generator.space.through(sensor), numbered))
 
     def points(self, images: Tensor) -> list[np.ndarray]:
@@ -101,47 +101,47 @@ class Checkpoint:
         return self.generator.space.points(images)
 
     def save(self, path: str | Path) -> None:
-        """Write it as one file that `r2flow.load` reads; see `save_checkpoint`."""
+        """Write one file that `r2flow.load` reads; see `save_checkpoint`."""
         save_checkpoint(self, path)
 
 
 def step_of(path: Path) -> int:
-    """The step in a checkpoint's file name, -1 where there is none."""
+    """The step in a checkpoint's file name; -1 without one."""
     match = re.search(r"step-(\d+)", path.name)
     return int(match.group(1)) if match else -1
 
 
 def checkpoints_of(run: str | Path) -> list[Path]:
     """The checkpoints of a run folder, the latest first."""
-    found = [path for path in Path(run, FOLDER).glob("step-*.ckpt") if path.is_file() and not path.is_symlink()]
-    return sorted(found, key=step_of, reverse=True)
+    paths = [path for path in Path(run, FOLDER).glob("step-*.ckpt") if path.is_file() and not path.is_symlink()]
+    return sorted(paths, key=step_of, reverse=True)
 
 
 def find_checkpoint(path: str | Path) -> Path:
-    """A checkpoint file, the latest one of a run folder, or the file of a model of this name.
+    """Path of a checkpoint file, of the latest checkpoint of a run folder, or of a model's file by its name.
 
-    A file or a run of a model's name in the current folder comes before the model.
+    A file or a run in the current folder takes precedence over a model of the same name.
     """
     name, path = str(path), Path(path).expanduser()
     if path.is_file():
         return path
-    found = checkpoints_of(path) or sorted(path.glob("step-*.ckpt"), key=step_of, reverse=True)
-    if found:
-        return found[0]
+    checkpoints = checkpoints_of(path) or sorted(path.glob("step-*.ckpt"), key=step_of, reverse=True)
+    if checkpoints:
+        return checkpoints[0]
     if name in MODELS and (path.is_dir() or not path.exists()):
         return find_model(name)
     hint = f"Give a checkpoint file, a run folder or a model ({', '.join(MODELS)})."
     if path.is_dir():
-        runs = sorted(str(one.parent) for one in path.glob(f"*/{FOLDER}") if checkpoints_of(one.parent))
+        runs = sorted(str(folder.parent) for folder in path.glob(f"*/{FOLDER}") if checkpoints_of(folder.parent))
         hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
         raise InputError(f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt). {hint}")
-    if path.exists():  # a pipe would be waited for
+    if path.exists():  # reading a pipe would block
         raise InputError(f"{path} is not a regular file. {hint}")
     raise InputError(f"no checkpoint at {path}. {hint}{did_you_mean(name, [*MODELS])}")
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """The dict in a checkpoint file of ours. Only tensors and plain values are read: a file cannot run code."""
+    """Read the dict in an r2flow checkpoint. Only tensors and plain values are read: a file cannot run code."""
     content = _read(path, map_location)
     if not isinstance(content, dict):
         raise InputError(_not_a_checkpoint(path, Path(path).stat().st_size))
@@ -149,8 +149,8 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
 
 
 def _read(path: str | Path, map_location: Any = "cpu") -> Any:
-    """What a torch file holds, ours or a published one, which may be a list."""
-    if not Path(path).is_file():  # a pipe would be waited for
+    """Content of a torch file, of r2flow or published; the latter may be a list."""
+    if not Path(path).is_file():  # reading a pipe would block
         raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
     try:
         with open(path, "rb") as file:
@@ -160,41 +160,41 @@ def _read(path: str | Path, map_location: Any = "cpu") -> Any:
 
 
 def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
-    """Tensors and plain values of one of torch's files. It cannot run code.
+    """Read tensors and plain values from a torch file, without code execution.
 
     Args:
-        name: What the file is called in a message.
+        name: Name of the file in messages.
 
     Raises:
-        InputError: another file, a damaged one, or one that holds more than plain values.
+        InputError: not a torch file, a damaged one, or one with other objects than tensors and plain values.
     """
     _refuse_unpacking(file, name)
     try:
-        with warnings.catch_warnings(action="ignore"), inert():  # warnings of torch's, on bytes that are no checkpoint
+        with warnings.catch_warnings(action="ignore"), inert():  # torch may warn
             content = torch.load(file, map_location=map_location, weights_only=True)
             if not isinstance(content, dict):
                 return content
             content = {key: plain(value) for key, value in content.items()}
             check_tree(content.get("config") or {})
             return content
-    except Exception as error:  # torch's reader raises nearly anything on bytes that are none of its own
+    except Exception as error:  # torch.load raises nearly any exception on other files
         if isinstance(error, OSError) and error.errno is not None:
             raise
-        held = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
-        if held is None or not isinstance(error, pickle.UnpicklingError):
+        code = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
+        if code is None or not isinstance(error, pickle.UnpicklingError):
             raise InputError(_not_a_checkpoint(name, file.seek(0, os.SEEK_END))) from None
         raise InputError(
-            f"{name} is refused: it holds objects that would run code when loaded ({held[1]}), not only tensors and "
+            f"{name} is refused: it holds objects that would run code when loaded ({code[1]}), not only tensors and "
             "plain values. Ask its author for a weights-only file."
         ) from None
 
 
 def _refuse_unpacking(file: IO[bytes], name: object) -> None:
-    """Refuse a zip archive that holds more than its own bytes: torch writes storages as they are."""
+    """Refuse zip archives with compressed entries (zip bombs): torch writes storages uncompressed."""
     try:
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
-    except Exception:  # torch's older format, or damaged: torch.load says which
+    except Exception:  # torch's legacy format, or damaged: torch.load tells
         entries = []
     packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
     if packed or sum(entry.file_size for entry in entries) > file.seek(0, os.SEEK_END):
@@ -207,32 +207,31 @@ def _not_a_checkpoint(name: object, size: int) -> str:
 
 
 def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averaged: bool = True) -> Checkpoint:
-    """A generator from a checkpoint file or run folder, of ours or of the published R2Flow format, or a model's name.
+    """Load a generator from a checkpoint file (of r2flow or published), a run folder, or by a model's name.
 
     Args:
-        averaged: Take the averaged weights, which a model is judged by; False takes the raw ones of a run
-            of ours.
+        averaged: Load the averaged weights, the default for evaluation; False: the raw weights of an r2flow run.
 
     Raises:
-        InputError: nothing usable is there, or its weights do not fit its config.
+        InputError: no usable checkpoint, or weights that do not fit the config.
     """
     path = find_checkpoint(path)
     content = read_safetensors(path) if path.suffix == ".safetensors" else _read(path)
     try:
-        found = _built(content, path, averaged)
+        checkpoint = _built(content, path, averaged)
     except InputError as error:
         raise type(error)(str(error) if str(path) in str(error) else f"{path}: {error}") from None
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         reason = (str(error).splitlines() or [""])[0][:160]
         raise InputError(
-            f"{path} cannot be used: what it holds is of another kind than r2flow writes ({type(error).__name__}: "
+            f"{path} cannot be used: its content is not what r2flow writes ({type(error).__name__}: "
             f"{reason}). Is it of another program, or damaged?"
         ) from error
-    return replace(found, generator=found.generator.to(device))
+    return replace(checkpoint, generator=checkpoint.generator.to(device))
 
 
 def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
-    """What a file holds, as a generator on the CPU; see `load_checkpoint`."""
+    """Build the generator of a file's content, on the CPU; see `load_checkpoint`."""
     published = format_of(content)
     if published is not None:
         with garbled(path):
@@ -244,11 +243,11 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
         for key in ("data", "stage", "trainer"):
             if not isinstance(config.get(key) or {}, Mapping):
-                raise InputError(f"its '{key}' has no named values. Is it of another program?")
+                raise InputError(f"its '{key}' is not a group of keys. Is it of another program?")
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         drawing = content
     elif isinstance(content, dict):
-        systems = ", ".join(one.system for _, one in FORMATS.items())
+        systems = ", ".join(known.system for _, known in FORMATS.items())
         raise InputError(
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor the layout of a published one ({systems}); found {', '.join(map(repr, list(content)[:6]))}."
@@ -269,39 +268,39 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
 
 
 def weights_hash(checkpoint: Checkpoint) -> str:
-    """A generator in 16 hex digits: its averaged weights and what its images mean, whatever file they came from."""
+    """Hash of a generator in 16 hex digits: averaged weights, sensor and encoding, independent of the file format."""
     meaning = {key: checkpoint.config[key] for key in ("sensor", "encoding")}
     state = {name.removeprefix(BACKBONE): value for name, value in checkpoint.generator.state_dict().items()}
     return state_hash(state, json.dumps(meaning, sort_keys=True).encode())[:16]
 
 
 def as_parent(config: Mapping[str, Any], path: Path, step: int, weights: str | None) -> dict[str, Any]:
-    """What a child's config says of the generator that it starts from; of a grown one also what that came from."""
-    before = None if config.get("stage") else config.get("parent")
-    grown_from = {"grown_from": {key: value for key, value in before.items() if key != "path"}} if before else {}
-    stage = (before or {}).get("stage") or (config.get("stage") or {}).get("name", "rectify")
+    """Entry `parent` in a child's config: the checkpoint that it starts from; for a grown one also its origin."""
+    origin = None if config.get("stage") else config.get("parent")
+    grown_from = {"grown_from": {key: value for key, value in origin.items() if key != "path"}} if origin else {}
+    stage = (origin or {}).get("stage") or (config.get("stage") or {}).get("name", "rectify")
     return {"path": str(path), "weights": weights, "step": step, "stage": stage, **grown_from}
 
 
 def read_safetensors(path: Path) -> dict[str, Any]:
-    """Weights and config of a `.safetensors` of ours, in the shape of our other checkpoints."""
+    """Read weights and config of an r2flow `.safetensors`, in the layout of the other checkpoints."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="pt") as file:
-            kept = file.metadata() or {}
+            metadata = file.metadata() or {}
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        notes = parse_json(kept[NOTES])
-        whole = notes.pop("digest", None) == _digest(notes, weights)
+        notes = parse_json(metadata[NOTES])
+        intact = notes.pop("digest", None) == _digest(notes, weights)
         config, step = notes["config"], int(notes["step"])
     except KeyError as error:
         raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
     except (SafetensorError, OSError, OverflowError, ValueError) as error:
         raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
     except (TypeError, AttributeError):
-        raise InputError(f"{path} holds weights, and notes that are not r2flow's.") from None
-    if not whole:
-        raise InputError(f"{path} is damaged: its checksum does not fit. Copy it again, or take another checkpoint.")
+        raise InputError(f"{path} holds weights, but its metadata is not r2flow's.") from None
+    if not intact:
+        raise InputError(f"{path} is damaged: its checksum differs. Copy it again, or use another checkpoint.")
     state = {PREFIX + name: value for name, value in weights.items()}
     drawing = {key: notes.get(key) for key in ("sampler", "few", "fixed")}
     return {"config": config, "global_step": step, "state_dict": state, **drawing}
@@ -314,43 +313,43 @@ def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False) -> None:
     """Write a generator with its config as a `.safetensors`.
 
-    The bytes are a function of the generator alone: of its config the file holds what was learned
-    (`r2flow.config.learned`), and no folder of this machine.
+    The bytes depend on the generator alone: of its config, the file stores the keys of `r2flow.config.learned`, without
+    paths of this machine.
 
     Args:
-        half: Round large matrices to float16, which halves the file.
+        half: Round large matrices to float16, which halves the file size.
     """
     from safetensors.torch import save
 
     path = Path(path)
     if path.suffix != ".safetensors":
-        raise InputError(f"{path}: a checkpoint is written as a .safetensors.")
+        raise InputError(f"{path}: a checkpoint is written as .safetensors.")
     weights = {name: value.detach().cpu().contiguous() for name, value in checkpoint.generator.state_dict().items()}
     if half:
         parameters = checkpoint.generator.named_parameters()
         weights |= {n: weights[n].half() for n, value in parameters if value.ndim > 1 and value.numel() > SMALL}
     notes = {"config": learned(checkpoint.config), "step": checkpoint.step, **checkpoint.generator.drawing()}
-    # Under one key: several keys of metadata come in no fixed order.
+    # Under one key, since the order of several metadata keys is not fixed.
     data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})
     with atomic_write(path) as file:
         file.write(data)
 
 
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
-    """Account for every name and shape before anything is loaded."""
-    own = model.state_dict()
-    missing, surplus = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
-    wrong = [f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"]
+    """Check all names, shapes and types before loading."""
+    expected = model.state_dict()
+    missing, surplus = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
+    problems = [f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"]
     if not (missing or surplus):
-        wrong = [
-            f"'{name}' has shape {tuple(there.shape)} ({there.layout}, {there.dtype}), the config makes it "
+        problems = [
+            f"'{name}' has shape {tuple(given.shape)} ({given.layout}, {given.dtype}), the config makes it "
             f"{tuple(value.shape)} ({value.dtype})"
-            for name, value in own.items()
-            if (there := weights[name]).shape != value.shape
-            or there.layout != torch.strided
-            or there.is_meta
-            or there.is_complex()
-            or value.is_floating_point() != there.is_floating_point()
+            for name, value in expected.items()
+            if (given := weights[name]).shape != value.shape
+            or given.layout != torch.strided
+            or given.is_meta
+            or given.is_complex()
+            or value.is_floating_point() != given.is_floating_point()
         ]
-    if wrong:
-        raise InputError(f"the weights in {path} do not fit its config: {wrong[0]}.")
+    if problems:
+        raise InputError(f"the weights in {path} do not fit its config: {problems[0]}.")

@@ -1,4 +1,4 @@
-"""Scans completed from a part of each: answer a to scan i is a function of (seed, i, a), up to the network's rounding.
+"""Completion of partial scans: answer a to scan i depends on (seed, i, a) alone, up to the network's rounding.
 
 for completed in complete(checkpoint, images, state, num=8):
     completed.images, completed.spread
@@ -19,18 +19,17 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, Samples, draw
 from r2flow.samplers import Transport, build_sampler
 
-ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
+ANSWER = 2**32  # offset of the noise number between answers: answer 0 to scan i has the noise of sample i
 
 
 class Completed(Samples):
-    """The answers to one scan, whose number is `first`; answers have reflectance if the model has it."""
+    """The answers to scan number `first`, with reflectance if the model has it."""
 
     @property
     def spread(self) -> Tensor:
-        """Standard deviation of the range in metres and share with a return of each ray over the answers, (2, H, W).
+        """Per ray over the answers: standard deviation of the range in metres, and share of returns, (2, H, W).
 
-        The standard deviation is over the answers with a return, with num - 1 below the fraction line; 0 where fewer
-        than two have one.
+        The standard deviation is over answers with a return, with denominator n - 1; 0 if fewer than two have one.
         """
         r = self.images[:, 0].double()
         returned = r > 0
@@ -41,11 +40,11 @@ class Completed(Samples):
 
 
 def completing(generator: Generator, name: str | None = None, *, several: bool = False, **changes: Any) -> Sampler:
-    """The sampler by which a generator completes scans: its own if it takes a condition, else a flow's completer.
+    """The sampler for completion: the generator's default if it takes a condition, else the flow's first completer.
 
     Args:
-        name: Of another sampler.
-        several: Whether answers shall differ: then a transfer flow's is `transport`.
+        name: Name of another sampler.
+        several: Whether answers must differ; a transfer flow then uses `transport`.
         changes: Fields of the sampler.
     """
     if not (generator.told or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
@@ -77,32 +76,30 @@ def complete(
     progress: Progress = None,
     **changes: Any,
 ) -> Iterator[Completed]:
-    """Complete scans of which a part is known, scan by scan. Known rays come back as they were given, to the bit.
+    """Complete partial scans, one after another. Known rays are returned bit for bit.
 
-    A scan of which everything is known costs no evaluation. One of which nothing is known is drawn as
-    `r2flow.model.sampling.sample` draws it: answer 0 of scan i is sample i of the seed.
+    A fully known scan costs no evaluation. A fully unknown scan is sampled as by `r2flow.model.sampling.sample`: answer
+    0 to scan i is sample i of the seed.
 
     Args:
-        source: A checkpoint or its generator; one that draws no scans needs a known ray in each.
-        images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W), 0 without a return. A model with
-            reflectance completes that of a scan without; a model of range alone leaves reflectance out.
-        state: `r2flow.lidar.known.Ray` of each ray, (B, H, W). If left out, a ray without a return counts as not
-            measured.
-        num: Answers to each scan.
-        sampler: How the generator is run; if left out, that of `completing`, and `transport` for several answers where
-            the generator has it.
-        batch_size: Answers to a scan at once. It does not change a fixed-step result beyond rounding.
+        source: A checkpoint or its generator. Generators with `draws = False` need a known ray in each scan.
+        images: Range in metres and optionally reflectance, (B, 2 or 1, H, W), 0 without a return. A model with
+            reflectance adds it to scans without; a model of range alone ignores it.
+        state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); None: rays without a return count as not measured.
+        num: Answers per scan.
+        sampler: Sampler; None: that of `completing`, for several answers `transport` if the generator has it.
+        batch_size: Answers per batch. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
         progress: Called after every network evaluation of a batch.
         changes: `name` and fields of the sampler: steps, grid, ...
 
     Raises:
-        InputError: a generator that cannot complete, images or states that do not fit it, values outside the range of
-            its sensor.
+        InputError: a generator that cannot complete scans, images or states that do not fit it, or values outside its
+            sensor's range.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    how = sampler or completing(generator, several=num > 1, **changes)
-    plain = generator.sampler if how.completes else how  # of a scan without a known ray
+    chosen = sampler or completing(generator, several=num > 1, **changes)
+    plain = generator.sampler if chosen.completes else chosen  # for a scan without a known ray
     images = torch.as_tensor(images).detach().float().cpu()
     if state is None:
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
@@ -112,14 +109,14 @@ def complete(
     for i, (image, measured) in enumerate(zip(images, state != Ray.UNKNOWN, strict=True)):
         condition = {name: value[i : i + 1] for name, value in conditions.items()}
         known = condition["known"] > 0
-        some = bool(known.any())
+        any_known = bool(known.any())
         parts = []
         for start in range(0, 0 if bool(known.all()) else num, batch_size):
             numbers = [first + i + answer * ANSWER for answer in range(start, min(start + batch_size, num))]
             given = {name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()}
             parts.append(
-                draw(generator, numbers, seed, how if some else plain, given if some else None, precision=precision,
-                    progress=progress)
+                draw(generator, numbers, seed, chosen if any_known else plain, given if any_known else None,
+                    precision=precision, progress=progress)
             )  # fmt: skip
         if not parts:
             answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
@@ -148,5 +145,5 @@ def _check_values(sensor: Sensor, images: Tensor) -> None:
     if not bool(((strength >= -LIMIT_TOLERANCE) & (strength <= 1 + LIMIT_TOLERANCE)).all()):
         raise InputError(
             f"reflectance must lie in [0, 1], found {float(strength.min()):g} to {float(strength.max()):g}; divide it "
-            "by what means full reflectance."
+            "by the value of full reflectance."
         )

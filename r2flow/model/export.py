@@ -1,7 +1,7 @@
-"""A trained flow as one file that runs without r2flow: its network, or noise in and scan out; `.pt2` or `.onnx`.
+"""Export of a flow to a `.pt2` or `.onnx` that runs without r2flow: the network, or the sampler (noise in, scan out).
 
-A sampler of fixed steps is linear in the noise and in what the network answers. Its coefficients are found once, by
-running the generator with another network, and the exported graph is those coefficients, the network and the decoding.
+A fixed-step sampler is linear in the noise and in the network's outputs. Its coefficients are computed once, by running
+the generator with a recording network. The exported graph consists of the coefficients, the network and the decoding.
 """
 
 import io
@@ -27,8 +27,8 @@ from r2flow.model.checkpoint import Checkpoint, weights_hash
 from r2flow.noise import Draws
 from r2flow.registry import Registry
 
-NOTES = "r2flow.json"  # of a .pt2: its metadata; an .onnx has them under `r2flow`
-LARGEST = 2**31 - 2**25  # bytes of weights in an .onnx, which is one protocol buffer
+NOTES = "r2flow.json"  # metadata file in a .pt2; an .onnx has the key `r2flow`
+LARGEST = 2**31 - 2**25  # bytes of weights in an .onnx, a single protocol buffer
 
 
 class Tableau(NamedTuple):
@@ -40,7 +40,7 @@ class Tableau(NamedTuple):
 
 
 class _Recorder(nn.Module):
-    """In the place of a network: answers the j-th call with the j-th unit vector and keeps what it was asked."""
+    """Replaces a network: records the inputs of each call and returns the j-th unit vector for the j-th call."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -55,11 +55,11 @@ class _Recorder(nn.Module):
 
 
 def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
-    """The coefficients of a sampler."""
+    """Coefficients of a sampler."""
     sampler.check(flow)
     count = sampler.evaluations(flow)
     if count is None or sampler.draws or sampler.completes:
-        what = "a condition" if sampler.completes else "noise on the way" if sampler.draws else "steps that it chooses"
+        what = "a condition" if sampler.completes else "fresh noise" if sampler.draws else "adaptive steps"
         raise InputError(
             f"sampler {sampler.name} needs {what} and cannot be exported: give --sampler {USUAL.name} --steps "
             f"{USUAL.steps}."
@@ -71,15 +71,15 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
         x_1 = shadow(basis, sampler=sampler).x
     except InputError as error:  # it needs more than the noise
         problem = str(error).rstrip(".")
-        raise InputError(f"sampler {sampler.name} cannot be exported, {problem!r}: give another one.") from None
+        raise InputError(f"sampler {sampler.name} cannot be exported ({problem}): give another one.") from None
     times, states, second = zip(*recorder.calls, strict=True)
-    rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # a `finish` takes fewer than count
+    rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # with `finish`, fewer than count
     others = [float(s) for s in second] if flow.second_time else None
     return Tableau([float(t) for t in times], others, rows)
 
 
 class Decoded(nn.Module):
-    """x_1 in model space to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B, 3, H, W)."""
+    """Decode x_1 to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B, 3, H, W)."""
 
     rays: Tensor
 
@@ -94,7 +94,7 @@ class Decoded(nn.Module):
 
 
 class Scans(nn.Module):
-    """x_0 to `Decoded`, every evaluation of the network written out."""
+    """x_0 to decoded scans, with all network evaluations unrolled."""
 
     def __init__(self, flow: RectifiedFlow, how: Tableau) -> None:
         super().__init__()
@@ -102,43 +102,43 @@ class Scans(nn.Module):
 
     def forward(self, noise: Tensor) -> tuple[Tensor, Tensor]:
         *states, last = self.how.states.tolist()
-        known = [noise]
+        vectors = [noise]
         for j, row in enumerate(states):
-            times = [noise.new_tensor(of[j]) for of in (self.how.times, self.how.second) if of]
-            known.append(self.network(times[0], _sum(row, known), *times[1:]))
-        return self.decoded(_sum(last, known))
+            times = [noise.new_tensor(values[j]) for values in (self.how.times, self.how.second) if values]
+            vectors.append(self.network(times[0], _sum(row, vectors), *times[1:]))
+        return self.decoded(_sum(last, vectors))
 
 
-def _sum(row: list[float], known: list[Tensor]) -> Tensor:
-    x = row[0] * known[0]
-    for a, v in zip(row[1:], known[1:], strict=False):
+def _sum(row: list[float], vectors: list[Tensor]) -> Tensor:
+    x = row[0] * vectors[0]
+    for a, v in zip(row[1:], vectors[1:], strict=False):
         x = x + a * v if a else x
     return x
 
 
 class Exported(NamedTuple):
-    """A file that was written."""
+    """An exported file."""
 
     path: Path
-    any_batch: bool  # whether it takes any number of scans at once; else one
-    notes: dict[str, Any]  # its metadata
+    any_batch: bool  # whether the batch size is free; else 1
+    notes: dict[str, Any]  # metadata
 
 
 def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = None, network: bool = False) -> Exported:
     """Write a flow as a `.pt2` (torch.export) or an `.onnx`.
 
-    It takes `noise` (B, C, H, W) and gives `scan`, range in metres and reflectance, (B, 2 or 1, H, W), 0 without a
-    return, and `points` in metres, (B, 3, H, W), the origin without one; float32. A `.pt2` holds every evaluation one
-    after the other, an `.onnx` the network once, in a loop.
+    The input is `noise` (B, C, H, W). The outputs are `scan`, range in metres and reflectance, (B, 2 or 1, H, W), 0
+    without a return, and `points` in metres, (B, 3, H, W), the origin without a return; float32. A `.pt2` unrolls all
+    evaluations; an `.onnx` has the network once, in a loop.
 
     Args:
-        path: Its ending says the format.
-        sampler: How the flow is run; its own if left out.
-        network: Write v(t, x) alone: `t` (B,) and `x` (B, C, H, W) to `v`; a flow map takes `s` (B,) too.
+        path: Output file; its suffix sets the format.
+        sampler: Sampler; None: the flow's default.
+        network: Export v(t, x) alone: `t` (B,) and `x` (B, C, H, W) to `v`; for a flow map also `s` (B,).
 
     Raises:
-        InputError: another ending, no flow, a sampler without a fixed number of steps, a package that is missing, or
-            a network that torch cannot export.
+        InputError: an unknown suffix, a generator that is not a flow, a sampler that cannot be exported, a missing
+            package, or a network that torch cannot export.
     """
     path, flow = Path(path), checkpoint.generator
     if not isinstance(flow, RectifiedFlow):
@@ -155,7 +155,7 @@ def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = N
 
 
 def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[str, Any]:
-    """What the file says of itself."""
+    """Metadata of the file."""
     flow = checkpoint.generator
     channels = ["range in metres", "reflectance of [0, 1]"][: 1 + flow.space.encoding.reflectance]
     scan = {
@@ -213,36 +213,34 @@ def _noise(flow: RectifiedFlow) -> dict[str, Tensor]:
     return {"noise": torch.zeros(2, *flow.noise_shape)}
 
 
-def _network_inputs(flow: RectifiedFlow, of_times: tuple[int, ...]) -> dict[str, Tensor]:
-    """Examples for v(t, x), t of shape () or (2,)."""
+def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> dict[str, Tensor]:
+    """Example inputs of v(t, x), t of shape () or (2,)."""
     network = flow.backbone
     x = torch.zeros(2, network.in_channels, *network.coords.shape[2:])
-    inputs = {"t": torch.full(of_times, 0.25), "x": x}
-    return (
-        {**inputs, "s": torch.full(of_times, 0.5)} if network.second_time else inputs
-    )  # one tensor would be one input
+    inputs = {"t": torch.full(shape, 0.25), "x": x}
+    return {**inputs, "s": torch.full(shape, 0.5)} if network.second_time else inputs  # t, s: distinct tensors
 
 
 def _traced(module: nn.Module, inputs: dict[str, Tensor]) -> tuple[torch.export.ExportedProgram, bool]:
-    """The module's graph for a batch of any size; else for one scan."""
+    """Export the module for a free batch size; if torch cannot, for one scan."""
     batch = torch.export.Dim("batch")
     module = module.cpu().eval()
     problem = ""
     for any_batch in (True, False):
-        given = tuple(value if any_batch else value[:1] for value in inputs.values())
-        free = tuple({0: batch} if value.ndim and any_batch else {} for value in given)
+        examples = tuple(value if any_batch else value[:1] for value in inputs.values())
+        dynamic_shapes = tuple({0: batch} if value.ndim and any_batch else {} for value in examples)
         try:
             with torch.no_grad():
-                # not strict: what Python decides, as the backend of attention, is decided now
-                return torch.export.export(module, given, dynamic_shapes=free, strict=False), any_batch
-        except Exception as error:  # torch raises nearly anything here
+                # not strict: decisions in Python, such as the attention backend, are made now
+                return torch.export.export(module, examples, dynamic_shapes=dynamic_shapes, strict=False), any_batch
+        except Exception as error:  # torch raises nearly any exception here
             problem = problem or str(error).strip().split("\n")[0]
     raise InputError(f"torch cannot export this {type(module).__name__}: {problem}")
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Plain operations, which every runtime has, and no words of the exporters."""
+    """Disable fused operations, which runtimes may lack, and messages of the exporters."""
     fast, log = torch.backends.mha.get_fastpath_enabled(), logging.getLogger("torch.onnx")
     level = log.level
     torch.backends.mha.set_fastpath_enabled(False)
@@ -256,28 +254,28 @@ def _quiet() -> Iterator[None]:
 
 
 class Difference(NamedTuple):
-    """Of the scans of an exported file to those of the flow."""
+    """Difference between the scans of an exported file and those of the flow."""
 
-    metres: float  # largest difference of range over the rays that both return
-    reflectance: float  # the same of reflectance; 0 where there is none
-    rays: int  # that one returns and the other does not
+    metres: float  # largest difference of range over rays with a return in both
+    reflectance: float  # largest difference of reflectance over these rays; 0 without reflectance
+    rays: int  # number of rays with a return in only one of them
 
 
 def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None = None, num: int = 2) -> Difference:
-    """Draw the first scans of seed 0 by the file and by the flow."""
+    """Compare the first scans of seed 0 by the file and by the flow."""
     flow = checkpoint.generator
     noise = Draws(0, range(num if exported.any_batch else 1)).start(flow.noise_shape)
     x_1 = flow(noise, sampler=sampler).x
-    mine, _ = Decoded(flow.space)(x_1)
-    theirs = run(exported.path, noise)["scan"]
-    one, other = mine[:, 0] > 0, theirs[:, 0] > 0
-    both = one & other
-    apart = (mine - theirs).abs().movedim(1, 0)[:, both].amax(1).tolist() if both.any() else [0.0]
-    return Difference(apart[0], sum(apart[1:]), int((one != other).sum()))
+    expected, _ = Decoded(flow.space)(x_1)
+    exported_scans = run(exported.path, noise)["scan"]
+    returned, returned_exported = expected[:, 0] > 0, exported_scans[:, 0] > 0
+    both = returned & returned_exported
+    largest = (expected - exported_scans).abs().movedim(1, 0)[:, both].amax(1).tolist() if both.any() else [0.0]
+    return Difference(largest[0], sum(largest[1:]), int((returned != returned_exported).sum()))
 
 
 def run(path: Path, noise: Tensor) -> dict[str, Tensor]:
-    """`scan` and `points` of an exported sampler."""
+    """Run an exported sampler: `scan` and `points`."""
     if path.suffix == ".pt2":
         with torch.no_grad(), warnings.catch_warnings(action="ignore"):
             scan, points = torch.export.load(path).module()(noise)

@@ -1,4 +1,4 @@
-"""Flows on the Hugging Face Hub, as `.safetensors` alone; needs the extra `hub`.
+"""Generators on the Hugging Face Hub, as `.safetensors`; needs the extra `hub`.
 
 HubFlow("runs/NAME").push_to_hub("me/my-flow")
 scans = HubFlow.from_pretrained("me/my-flow").sample(4)
@@ -32,7 +32,7 @@ scans = HubFlow.from_pretrained("{{ repo_id | default('FOLDER', true) }}").sampl
 """
 
 
-class HubFlow(  # type: ignore[call-arg, unused-ignore]  # where the extra is not installed
+class HubFlow(  # type: ignore[call-arg, unused-ignore]  # if the extra is not installed
     ModelHubMixin, library_name="r2flow", tags=["lidar", "rectified-flow"], model_card_template=CARD
 ):
     """A trained generator with `save_pretrained(folder)`, `from_pretrained(folder or name)`, `push_to_hub(name)`.
@@ -41,12 +41,12 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # where the extra is no
         name, device: As for `r2flow.load`.
 
     Attributes:
-        checkpoint: What `r2flow.load` gives.
+        checkpoint: The checkpoint that `r2flow.load` returns.
     """
 
     def __init__(self, name: str | Path, device: str = "cpu") -> None:
         self.checkpoint = load(name, device)
-        self._hub_mixin_config = None  # it would be `name`; the config is in the weights' file
+        self._hub_mixin_config = None  # it would be `name`; the weights' file has the config
 
     def sample(self, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
         """As `Checkpoint.sample`."""
@@ -58,11 +58,11 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # where the extra is no
     @classmethod
     def _from_pretrained(cls, *, model_id: str, device: str = "cpu", **where: Any) -> "HubFlow":
         known = ("revision", "cache_dir", "force_download", "local_files_only", "token")
-        older = "proxies", "resume_download"  # what the mixin of older versions gives
-        odd = [key for key in where if key not in (*known, *older)]
-        if odd:
+        older = "proxies", "resume_download"  # passed by the mixin of older versions
+        unknown = [key for key in where if key not in (*known, *older)]
+        if unknown:
             raise InputError(
-                f"HubFlow.from_pretrained does not know {', '.join(odd)}; it takes device, {', '.join(known)}."
+                f"HubFlow.from_pretrained does not know {', '.join(unknown)}; it takes device, {', '.join(known)}."
             )
         if Path(model_id).is_dir():
             return cls(Path(model_id, FILE), device)

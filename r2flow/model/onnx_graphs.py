@@ -10,12 +10,12 @@ from onnx import TensorProto, compose, helper, numpy_helper
 
 
 def to_onnx(program: torch.export.ExportedProgram, inputs: Sequence[str], outputs: Sequence[str]) -> onnx.ModelProto:
-    """A traced module in ONNX, with these names and the first dimension called `batch`."""
-    made = torch.onnx.export(
+    """Convert a traced module to ONNX with these names; the first dimension is called `batch`."""
+    converted = torch.onnx.export(
         program, (), dynamo=True, verbose=False, optimize=True, input_names=inputs, output_names=outputs
     )
-    assert made is not None
-    model: onnx.ModelProto = made.model_proto
+    assert converted is not None
+    model: onnx.ModelProto = converted.model_proto
     graph = model.graph
     del graph.value_info[:]
     for value in (*graph.input, *graph.output):
@@ -24,7 +24,7 @@ def to_onnx(program: torch.export.ExportedProgram, inputs: Sequence[str], output
         if len(sizes) and sizes[0].dim_param:
             sizes[0].dim_param = "batch"
     for node in graph.node:
-        del node.metadata_props[:]  # where in torch and in our files each came from
+        del node.metadata_props[:]  # source locations in torch and r2flow
     return model
 
 
@@ -35,14 +35,14 @@ def sampler_graph(
     second: Sequence[float] | None,
     states: np.ndarray,
 ) -> onnx.ModelProto:
-    """noise to scan and points: a loop over the sampler's evaluations, and the decoding.
+    """Graph from noise to scan and points: a loop over the sampler's evaluations, then the decoding.
 
-    What is known in the loop are the noise and the answers of the network, zeros for those that are still to come.
+    The loop state `known` stacks the noise and the network's outputs, with zeros for evaluations not yet made.
 
     Args:
-        network: `t` () and `x`, perhaps `s` (), to `v`.
+        network: `t` (), `x` and, for a flow map, `s` () to `v`.
         decoded: `x_1` to `scan` and `points`.
-        times, second, states: As of `r2flow.model.export.Tableau`.
+        times, second, states: As in `r2flow.model.export.Tableau`.
     """
     network = compose.add_prefix(network, "network.", rename_inputs=False, rename_outputs=False)
     decoded = compose.add_prefix(decoded, "decoded.", rename_inputs=False, rename_outputs=False)
@@ -66,7 +66,7 @@ def sampler_graph(
     }
 
     def state(row: str, known: str, name: str) -> list[onnx.NodeProto]:
-        """The sum of what is known, each times its coefficient in a row of `states`."""
+        """Nodes of the weighted sum of `known` with the coefficients in a row of `states`."""
         return [
             helper.make_node("Gather", ["states", row], [f"{name}.row"]),
             helper.make_node("Reshape", [known, "flat"], [f"{name}.flat"]),
@@ -107,7 +107,7 @@ def sampler_graph(
         nodes, "sampler", [noise], list(decoded.graph.output),
         [*initializers, *network.graph.initializer, *decoded.graph.initializer],
     )  # fmt: skip
-    versions = {one.domain: one for model in (decoded, network) for one in model.opset_import}
+    versions = {opset.domain: opset for model in (decoded, network) for opset in model.opset_import}
     model = helper.make_model(graph, opset_imports=list(versions.values()), functions=[*network.functions])
     model.ir_version = network.ir_version
     return model

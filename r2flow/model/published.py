@@ -1,6 +1,6 @@
-"""Published checkpoints, read as ours are: a reader for each system, found in `FORMATS`, and that of R2Flow itself.
+"""Published checkpoints: the registry `FORMATS` of readers, and the reader of R2Flow's files.
 
-R2Flow's files are a dict of cfg, weights, optimizer, lr_scheduler and num_images.
+An R2Flow file is a dict of cfg, weights, optimizer, lr_scheduler and num_images.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,31 +17,31 @@ from r2flow.generators import Generator
 from r2flow.registry import Registry, did_you_mean, lazy
 
 ARCHITECTURES = {"nat_hdit": "hdit"} | {name: name for name in ("hdit", "adm_unet", "efficient_unet")}
-BACKBONE = "backbone."  # of a flow's network in the generator
+BACKBONE = "backbone."  # prefix of a flow's network in the generator
 
 
 @dataclass(frozen=True)
 class Published:
-    """A generator of a published file in our terms."""
+    """A generator of a published file, converted to r2flow's names."""
 
-    config: dict[str, Any]  # `r2flow.generators.build_generator` makes it; the file's own config is under `published`
-    weights: dict[str, Tensor]  # of that generator, by our names
+    config: dict[str, Any]  # config for `r2flow.generators.build_generator`; the file's config is under `published`
+    weights: dict[str, Tensor]  # the generator's weights by r2flow's names
     step: int = 0  # optimiser steps taken
-    sampler: Mapping[str, Any] | None = None  # name and fields, as published; None for the generator's own
-    finish: Callable[[Generator, Mapping[str, Any]], None] | None = None  # called with generator, weights in it, config
+    sampler: Mapping[str, Any] | None = None  # published sampler, name and fields; None: the generator's default
+    finish: Callable[[Generator, Mapping[str, Any]], None] | None = None  # called with loaded generator and config
 
 
 class Format(NamedTuple):
     """A published layout of checkpoint files."""
 
-    system: str  # whose it is
-    holds: Callable[[Any], bool]  # whether the content of a torch file is of this format
-    read: Callable[[Any, Path, bool], Published]  # the generator in it, with averaged or raw weights
+    system: str  # name of the system
+    holds: Callable[[Any], bool]  # whether the content of a torch file has this format
+    read: Callable[[Any, Path, bool], Published]  # convert the content, with averaged or raw weights
 
 
 @contextmanager
 def garbled(path: Path) -> Iterator[None]:
-    """Raises `InputError` where the content of a published file lacks a part or has one of another form."""
+    """Raise `InputError` if the content of a published file lacks a part or has one of the wrong form."""
     try:
         yield
     except InputError:
@@ -55,7 +55,7 @@ def holds(content: Any) -> bool:
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
-    """A published flow; the file holds its averaged weights alone."""
+    """Read a published R2Flow checkpoint, which has averaged weights only."""
     weights = {BACKBONE + name: value for name, value in content["weights"].items()}
     batch = content["cfg"].get("training", {}).get("batch_size", 1)
     step = int(content.get("num_images", 0)) // max(int(batch), 1)
@@ -63,14 +63,14 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 
 def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -> dict[str, Any]:
-    """The config of a sensor by the published names of its image's size and of its range limits in metres."""
+    """Sensor config from the published image size and range limits in metres."""
     rows, columns = (int(n) for n in resolution)
     near, far = (float(limits[name]) for name in ("min_depth", "max_depth"))
     return {"name": name, "rows": rows, "columns": columns, "min_range": near, "max_range": far}
 
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Our config of a published checkpoint's `cfg`, which holds data, model, flow, training and finetuning."""
+    """Convert a published checkpoint's `cfg` (data, model, flow, training, finetuning) to an r2flow config."""
     data, model = cfg["data"], cfg["model"]
     return {
         "sensor": {**sensor_of("hdl64e", data["resolution"], data), "rays": "reference"},
@@ -85,7 +85,7 @@ def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Our backbone's options of a published config's `model`."""
+    """Backbone options from a published config's `model`."""
     architecture = str(model["architecture"])
     if architecture not in ARCHITECTURES:
         raise InputError(
@@ -102,7 +102,7 @@ def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
     }
     if common["name"] == "hdit":
         return {**common, "depths": list(blocks), "num_heads": list(heads)}
-    # One config class serves all three in the reference: a U-Net has one number of heads.
+    # The reference has one config class for all three architectures: a U-Net has a single number of heads.
     return {
         **common,
         "num_residual_blocks": blocks if isinstance(blocks, int) else list(blocks),
@@ -114,7 +114,7 @@ def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def follow_rings(generator: Generator, config: Mapping[str, Any]) -> None:
-    """Let the sensor of unfolded scans look along the rings that the weights carry in `coords`, (1, 2, H, W)."""
+    """For unfolded scans, take the sensor's elevations from the weights' `coords`, (1, 2, H, W)."""
     if config["data"]["reading"]["projection"] == "unfolding":
         rings = torch.rad2deg(generator.state_dict()[BACKBONE + "coords"][0, 0, :, 0].double())
         sensor = replace(generator.space.sensor, elevations=tuple(rings.tolist()))
@@ -122,14 +122,13 @@ def follow_rings(generator: Generator, config: Mapping[str, Any]) -> None:
 
 
 class Inert:
-    """What stands for an object of a class that is only looked at: it keeps what the pickle says of it."""
+    """Placeholder for unpickled objects: keeps the pickled state without running code."""
 
     def __init__(self, *arguments: Any) -> None:
-        """Nothing is done with the arguments."""
+        """Ignore the arguments."""
 
 
-# The classes that a pickled DictConfig names, and the keys of Lightning 1.4's callback states. `weights_only` refuses
-# every other.
+# Classes in a pickled DictConfig and in Lightning 1.4's callback states. `weights_only` refuses all others.
 NAMES = (
     "omegaconf.dictconfig.DictConfig",
     "omegaconf.listconfig.ListConfig",
@@ -144,21 +143,21 @@ CONTENT, VALUE = "_content", "_val"
 
 
 def inert() -> Any:
-    """While it is entered, `torch.load(weights_only=True)` takes the classes in `NAMES`, each as `Inert`."""
+    """Context in which `torch.load(weights_only=True)` reads the classes in `NAMES` as `Inert`."""
     return torch.serialization.safe_globals([(Inert, name) for name in NAMES])
 
 
 def plain(value: Any) -> Any:
-    """The plain value of an `Inert` config or of one of its nodes; anything else as it is."""
+    """Convert an `Inert` config or node to a plain value; other values are returned unchanged."""
     if not isinstance(value, Inert):
         return value
-    kept = vars(value)
-    if VALUE in kept:
-        return kept[VALUE]
-    content = kept.get(CONTENT)
+    state = vars(value)
+    if VALUE in state:
+        return state[VALUE]
+    content = state.get(CONTENT)
     if isinstance(content, dict):
-        return {key: plain(one) for key, one in content.items()}
-    return [plain(one) for one in content] if isinstance(content, list) else content
+        return {key: plain(node) for key, node in content.items()}
+    return [plain(node) for node in content] if isinstance(content, list) else content
 
 
 FORMAT = Format("R2Flow", holds, read)
@@ -175,5 +174,5 @@ FORMATS: Registry[Format] = Registry(
 
 
 def format_of(content: Any) -> Format | None:
-    """The published format of a torch file's content; None for another one."""
-    return next((one for _, one in FORMATS.items() if one.holds(content)), None)
+    """The published format of a torch file's content, or None."""
+    return next((known for _, known in FORMATS.items() if known.holds(content)), None)

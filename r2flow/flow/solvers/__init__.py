@@ -149,7 +149,7 @@ def _at_rest(x: Tensor, global_error: bool, knots: int) -> Solution:
 
 def _check_numbers(t_0: float, t_1: float, steps: int, tolerance: float, max_evaluations: int, max_step: float) -> None:
     for good, message in (
-        (math.isfinite(t_0) and math.isfinite(t_1), f"a solution needs two finite times, found {t_0} and {t_1}."),
+        (math.isfinite(t_0) and math.isfinite(t_1), f"a solution needs two times, found {t_0} and {t_1}."),
         (steps >= 1, f"a solver needs at least 1 step, found {steps}."),
         (0 < tolerance < math.inf, f"a solver's tolerance must be positive and finite, found {tolerance:g}."),
         (max_evaluations >= 1, f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}."),
