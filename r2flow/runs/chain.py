@@ -1,4 +1,4 @@
-"""1-RF -> pairs -> 2-RF -> pairs -> k-TD -> report: each link its own process, finished ones skipped."""
+"""Chains of runs, such as 1-RF -> 2-RF -> k-TD -> report: one process per link; finished links are skipped."""
 
 import ctypes
 import json
@@ -28,10 +28,10 @@ class Link:
     """One run of a chain.
 
     Attributes:
-        name: Its name in the chain, and of its folder.
-        run_dir: Where it lives.
-        overrides: Its command line.
-        parent: The link that it starts from, if any.
+        name: Name in the chain, and of the folder.
+        run_dir: Run folder.
+        overrides: Command line of the run.
+        parent: Name of the link that it starts from, if any.
     """
 
     name: str
@@ -44,15 +44,15 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
     """The runs of a chain in the order of their parents.
 
     Args:
-        chain: Config differences by name; `init` names the link that one starts from.
-        folder: The chain's folder; each link gets one of its name below it.
-        given: What the user gave on the command line. It goes to every link that it concerns, after the link's own.
+        chain: Config differences by name; `init` names the link that a link starts from.
+        folder: The chain's folder; each link has a subfolder of its name.
+        given: The user's command line. Its overrides follow the link's own, for every link that they concern.
 
     Raises:
-        InputError: a link starts from one that does not come before it, the command line says where all do, or a link
-            names plug-ins, which would be imported because a file says so.
+        InputError: a link starts from one that does not come before it, `stage.init` is given for all links, or a link
+            names plug-ins, which only the command line may do.
     """
-    if any(key_of(one) == "stage.init" for one in given):
+    if any(key_of(text) == "stage.init" for text in given):
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
     links: list[Link] = []
     for name, difference in chain.items():
@@ -60,38 +60,38 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
             raise InputError(f"chain.{name} and its stage must be groups of keys; found {difference!r}.")
         if not re.fullmatch(r"[\w-][\w.-]*", str(name)):
             raise InputError(f"chain: a link is a folder, which cannot be called {name!r}.")
-        own = dict(difference)
-        parent = own.pop("init", None)
-        overrides = [override(key, value) for key, value in flatten(own) if (key, value) != ("experiment", None)]
-        if any(key_of(one) == "plugins" for one in overrides):
+        settings = dict(difference)
+        parent = settings.pop("init", None)
+        overrides = [override(key, value) for key, value in flatten(settings) if (key, value) != ("experiment", None)]
+        if any(key_of(text) == "plugins" for text in overrides):
             raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")
         if parent is not None:
             if parent not in [link.name for link in links]:
                 raise InputError(f"chain.{name}.init={parent}: no link of that name comes before it.")
             overrides.append(override("stage.init", str(Path(folder, parent))))
-        reads_scans = parent is None and (own.get("stage") or {}).get("init") is None
+        reads_scans = parent is None and (settings.get("stage") or {}).get("init") is None
         concerning = ("all", "scans" if reads_scans else "pairs")
-        overrides += [one for one in given if rule(key_of(one)).links in concerning]
-        # What the user gave to this link alone comes last: it replaces the link's own keys.
-        alone = [one.lstrip("+") for one in given if one.lstrip("+").startswith(f"chain.{name}.")]
-        overrides += [key for one in alone if not (key := one.removeprefix(f"chain.{name}.")).startswith("init=")]
+        overrides += [text for text in given if rule(key_of(text)).links in concerning]
+        # Overrides given for this link alone come last: they replace the link's own keys.
+        alone = [text.lstrip("+") for text in given if text.lstrip("+").startswith(f"chain.{name}.")]
+        overrides += [key for text in alone if not (key := text.removeprefix(f"chain.{name}.")).startswith("init=")]
         run_dir = Path(folder, name)
         links.append(Link(name, run_dir, (*overrides, override("run_dir", str(run_dir))), parent))
     return links
 
 
 def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]:
-    """Run what is not finished yet, each link as its own process.
+    """Run the links that are not finished, each in its own process.
 
     Args:
-        command: How a run is started; a link's overrides follow.
+        command: Command that starts a run; a link's overrides are appended.
 
     Returns:
-        The exit code of the first that does not come to its end, or 0, and whether any was run.
+        The exit code of the first link that does not finish, or 0, and whether any link was run.
     """
     skipping = True
     for number, link in enumerate(links, 1):
-        # After a link that had to run, the later ones look for themselves whether they still fit to it.
+        # After a link that had to run, later links check by themselves whether they still match it.
         if skipping and is_finished(link):
             print(f"[{number}/{len(links)}] {link.name}: finished before, {link.run_dir}", flush=True)
             continue
@@ -99,7 +99,7 @@ def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]
         print(f"[{number}/{len(links)}] {link.name}: {link.run_dir}", flush=True)
         code = run_process([*command, *link.overrides]) or (0 if has_ended(link.run_dir) else LATER)
         if code:
-            if code != 2:  # which is the user's to mend, and has been said
+            if code != 2:  # a user error, already printed
                 print(f"the chain stopped in {link.name}; the same command resumes there", file=sys.stderr, flush=True)
             return code, True
         _note(link.run_dir, _record(link))
@@ -107,28 +107,28 @@ def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]
 
 
 def has_ended(run: Path) -> bool:
-    """Whether a run's last checkpoint is that of the last step of its config."""
+    """Whether a run's last checkpoint has reached its config's last step."""
     config, last = read_config(run), next(iter(checkpoints_of(run)), None)
     return config is not None and last is not None and step_of(last) >= config["trainer"]["max_steps"]
 
 
 def is_finished(link: Link) -> bool:
-    """Whether a link came to its end under the same command, and has not lost its checkpoint since."""
+    """Whether a link was finished by the same command and still has its checkpoint."""
     return _is_noted(link.run_dir, _record(link)) and has_ended(link.run_dir)
 
 
 def record_report(links: Sequence[Link], out: Path) -> None:
-    """Note next to the report which links it is of."""
+    """Record the links of a report next to it."""
     _note(out, [_record(link) for link in links])
 
 
 def is_reported(links: Sequence[Link], out: Path) -> bool:
-    """Whether the report on just these links is there."""
+    """Whether the report on exactly these links exists."""
     return _is_noted(out, [_record(link) for link in links])
 
 
 def _record(link: Link) -> dict[str, Any]:
-    """What a finished link leaves: its command line, and its last checkpoint's name and size."""
+    """Record of a finished link: its command line, and its last checkpoint's name and size."""
     last = next(iter(checkpoints_of(link.run_dir)), None)
     return {"overrides": list(link.overrides), "checkpoint": last and [last.name, last.stat().st_size]}
 
@@ -146,30 +146,30 @@ def _is_noted(folder: Path, record: Any) -> bool:
 
 
 def run_process(command: Sequence[str]) -> int:
-    """Run a command that hears the signals to stop which this process gets, and ends with it.
+    """Run a command; forwards stop signals to it, and ends it with this process.
 
     Returns:
-        Its exit code, as a shell would give it: 143 where SIGTERM ended it.
+        The exit code as in a shell: 143 after SIGTERM.
     """
-    told: list[int] = []
+    received: list[int] = []
 
     def pass_on(number: int, frame: FrameType | None) -> None:
-        told.append(number)
+        received.append(number)
         if process is not None and process.poll() is None:
             process.send_signal(number)
 
     process: subprocess.Popen[bytes] | None = None
     with listening(pass_on):
         process = subprocess.Popen(command, preexec_fn=_die_with_parent if sys.platform == "linux" else None)
-        if told:
-            process.send_signal(told[0])
+        if received:
+            process.send_signal(received[0])
         code = process.wait()
     if code < 0:
         return code_of(-code)
-    return code or (code_of(told[0]) if told else 0)
+    return code or (code_of(received[0]) if received else 0)
 
 
 def _die_with_parent() -> None:
-    """A run that outlives its killed chain or sweep would be in the way of the same command given again."""
+    """End a run with its chain or sweep: otherwise it would block the same command when given again."""
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

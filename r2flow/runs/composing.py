@@ -1,4 +1,4 @@
-"""From a command line to a config: `conf/` composed by Hydra, choices for what plug-ins add, mistakes in one line."""
+"""Composition of configs: Hydra on `conf/`, choices of registries and plug-ins, one-line error messages."""
 
 import json
 import re
@@ -25,7 +25,7 @@ from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
-# What has a Hydra group: its registry, and what a config does not say because the run does.
+# Hydra groups: the registry of each, and the options that the run sets instead of the config.
 REGISTRIES = {
     "stage": ("r2flow.stages", "STAGES", ("batch_size", "seed")),
     "backbone": ("r2flow.backbones", "BACKBONES", ("in_channels", "out_channels", "second_time")),
@@ -34,13 +34,13 @@ REGISTRIES = {
 
 
 def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -> dict[str, Any]:
-    """The config of a command line, as plain dicts: `compose(["data=kitti_raw", "data.root=FOLDER"])`.
+    """Compose the config of a command line, as plain dicts: `compose(["data=kitti_raw", "data.root=FOLDER"])`.
 
     Args:
-        folders: Further config folders, as `--config-dir` names one.
+        folders: Additional config folders, as in `--config-dir`.
 
     Raises:
-        HydraException: an unknown key or choice; `explain` has it in a line.
+        HydraException: an unknown key or choice; `explain` shortens it to one line.
     """
     overrides = as_hydra_takes(overrides)
     search = (
@@ -58,13 +58,13 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
 
 
 def names_folder(text: str) -> bool:
-    """Whether a text names a folder below another one."""
+    """Whether a text is the name of a subfolder."""
     return bool(text.strip("./")) and ".." not in Path(text).parts
 
 
 @dataclass(frozen=True)
 class Keys:
-    """The keys at the top of a run's config."""
+    """Top-level keys of a run's config."""
 
     stage: Mapping[str, Any]
     backbone: Mapping[str, Any]
@@ -83,24 +83,24 @@ class Keys:
     few: Mapping[str, Any] | None = None
     chain: Mapping[str, Any] | None = None
     preview: str | None = None
-    loggers: Sequence[str] | str | None = None  # a word is answered by `build_loggers`
+    loggers: Sequence[str] | str | None = None  # `build_loggers` refuses a str
     plugins: Sequence[str] = ()
     parent: Mapping[str, Any] | None = None
     scans: Any = None
 
 
 def check_keys(config: Mapping[str, Any]) -> None:
-    """Check what stands at the top of a config.
+    """Check the top-level keys of a config.
 
     Raises:
-        InputError: a key that nothing reads, one that is missing, or a value of another type.
+        InputError: an unknown key, a missing key, or a value of the wrong type.
     """
     check_options("the config", Keys, config)
 
 
 @contextmanager
 def _hydra() -> Iterator[None]:
-    """Hydra on `conf/` for the length of a block; the process's own, if it has one, is untouched."""
+    """Context with Hydra initialised on `conf/`; restores a Hydra that the process has already initialised."""
     before, config = GlobalHydra.instance().hydra, HydraConfig.instance().cfg
     GlobalHydra.instance().clear()
     try:
@@ -111,16 +111,16 @@ def _hydra() -> Iterator[None]:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """A composed config as plain dicts, all of it resolved but what is Hydra's own."""
-    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    own._set_parent(config._get_parent())
-    found = OmegaConf.to_container(own, resolve=True, throw_on_missing=True)
-    assert isinstance(found, dict)
-    return {str(key): value for key, value in found.items()}
+    """Convert a composed config to plain dicts, resolved and without Hydra's own keys."""
+    settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    settings._set_parent(config._get_parent())
+    resolved = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
+    assert isinstance(resolved, dict)
+    return {str(key): value for key, value in resolved.items()}
 
 
 def add_choices(group: str) -> None:
-    """Make a Hydra choice of each entry of a group's registry that has no YAML file: its constructor's options."""
+    """Add a Hydra choice for each registry entry of a group without a YAML file, from its constructor's options."""
     module, table, given_by_run = REGISTRIES[group]
     store = ConfigStore.instance()
     for name, entry in getattr(import_module(module), table).items():
@@ -137,10 +137,10 @@ def add_choices(group: str) -> None:
 
 
 def add_choice(error: MissingConfigException) -> bool:
-    """Whether a choice that Hydra did not find is one of a registry, as a plug-in may have entered it.
+    """Whether a choice that Hydra did not find is in a registry, such as a plug-in's; adds all registries' choices.
 
-    A name that looks like a misspelt file's is not looked for there where that would take the time to load torch.
-    All groups get their choices: the same command may name several.
+    A name that resembles a file's is not looked up if that would import torch. All groups get their choices, since the
+    same command may name several.
     """
     group, _, name = str(error.missing_cfg_file or "").rpartition("/")
     if group not in REGISTRIES:
@@ -150,30 +150,30 @@ def add_choice(error: MissingConfigException) -> bool:
         return False
     if name not in getattr(import_module(module), table):
         return False
-    for one in REGISTRIES:
-        add_choices(one)
+    for registered in REGISTRIES:
+        add_choices(registered)
     return True
 
 
 def choices(group: str) -> list[str]:
-    """The names of a group's configs."""
-    known = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
+    """Names of a group's configs."""
+    files = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
     stored = ConfigStore.instance().repo.get(group, {})
-    return sorted(known | {name.removesuffix(".yaml") for name in stored})
+    return sorted(files | {name.removesuffix(".yaml") for name in stored})
 
 
-CHOICE = str | dict | Sweep  # what a group of configs can be given
-MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # from which ~KEY may take something
+CHOICE = str | dict | Sweep  # valid values of a config group
+MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~KEY may delete from
 
 
 def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
-    """Overrides, of which `KEY={name: NAME, ...}` takes the whole place of what was there: it has options of its own.
+    """Convert overrides for Hydra: `KEY={name: NAME, ...}` replaces the whole value, since NAME has its own options.
 
     Raises:
-        InputError: a group of configs without a choice from it, or what is not Hydra's grammar.
+        InputError: a config group without a choice, or an override outside Hydra's grammar.
     """
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
-    found: list[str] = []
+    converted: list[str] = []
     parser = OverridesParser.create()
     for text in overrides:
         try:
@@ -189,28 +189,28 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
         if key == "hydra":
             raise InputError(f"{text}: hydra has keys of its own, as hydra.sweep.dir=FOLDER.")
         names = value if isinstance(value, list) else [value]
-        if key in groups and (parsed.is_delete() or "" in names or not all(isinstance(one, CHOICE) for one in names)):
-            if key == "experiment" and (parsed.is_delete() or value is None):  # as it is by itself
+        if key in groups and (parsed.is_delete() or "" in names or not all(isinstance(name, CHOICE) for name in names)):
+            if key == "experiment" and (parsed.is_delete() or value is None):  # the default
                 continue
             raise InputError(f"{text} leaves the run without its {key}: give one of {', '.join(choices(key))}.")
         if parsed.is_delete() and key.partition(".")[0] not in MAY_GO:
             raise InputError(f"{text}: every run has its {key}; give {key}=VALUE.")
         named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
-        found += [f"{key}=null", f"++{text}"] if named and parsed.type == OverrideType.CHANGE else [text]
-    if "size=small" in found and not any(re.match(r"\+?experiment=[^\[]", text) for text in found):
+        converted += [f"{key}=null", f"++{text}"] if named and parsed.type == OverrideType.CHANGE else [text]
+    if "size=small" in converted and not any(re.match(r"\+?experiment=[^\[]", text) for text in converted):
         raise InputError("size=small is a form of one experiment: give experiment=NAME, such as r2dm.")
-    return found
+    return converted
 
 
 def explain(error: Exception) -> str:
-    """Hydra's complaint in one line, with the nearest key that exists."""
+    """Shorten an error of Hydra to one line, with the nearest existing key."""
     text = str(error)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     unknown = re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text)
     if unknown:
-        within = re.search(r"full_key: (\S+)", str(error.__cause__))  # of a group's value, the key in it
+        within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)
-        others = [known for known in known_keys() if not key.startswith(f"{known}.")]  # its own group says nothing new
+        others = [known for known in known_keys() if not key.startswith(f"{known}.")]  # not its own group
         return f"the config has no key '{key}'.{did_you_mean(key, others)} See --cfg job for all of them."
     missing = re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL)
     if missing:
@@ -221,8 +221,8 @@ def explain(error: Exception) -> str:
     if choice:
         group, name = choice.groups()
         known = choices(group)
-        own = f" One of yours is found by --config-dir FOLDER, in FOLDER/{group}/NAME.yaml."
-        return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known) or own}"
+        hint = f" For your own configs give --config-dir FOLDER, with FOLDER/{group}/NAME.yaml."
+        return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known) or hint}"
     several = re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
     if several:
         key, values = several.groups()
@@ -231,9 +231,9 @@ def explain(error: Exception) -> str:
 
 
 def override(key: str, value: Any) -> str:
-    """One key in Hydra's grammar."""
+    """An override KEY=VALUE in Hydra's grammar."""
     if isinstance(value, list | tuple):
-        return f"{key}=[{','.join(override('', one)[1:] for one in value)}]"
+        return f"{key}=[{','.join(override('', item)[1:] for item in value)}]"
     if value is None or isinstance(value, bool):
         return f"{key}={json.dumps(value)}"
     if isinstance(value, str) and not value.replace("_", "").replace("-", "").isalnum():
@@ -243,7 +243,7 @@ def override(key: str, value: Any) -> str:
 
 
 def known_keys() -> list[str]:
-    """Every key of the default config, and its groups."""
+    """All keys and groups of the default config."""
     with _hydra():
         composed = hydra.compose("train")
     keys: list[str] = []

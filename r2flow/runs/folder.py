@@ -1,4 +1,4 @@
-"""A run's folder: what it holds, and whether a command may resume in it."""
+"""Run folders: config, lock, and whether a command may resume the run."""
 
 import logging
 import os
@@ -23,14 +23,14 @@ CONFIG = "config.yaml"
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
-    """The keys that two configs have other values of, with both values."""
+    """Keys whose values differ between two configs, with a text of both values."""
     before, now = dict(flatten(old)), dict(flatten(new))
     keys = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     return {key: f"{key}={before.get(key)} there, {now.get(key)} here" for key in keys}
 
 
 def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """The differences by which a command cannot resume a run."""
+    """Differences that prevent a command from resuming a run."""
     on_pairs = any((config.get("data") or {}).get("name") == "pairs" for config in (old, new))
     return [
         text
@@ -41,35 +41,35 @@ def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 @contextmanager
 def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
-    """Let one process at a time work in a run's folder. The lock ends with its holder, also when that is killed.
+    """Lock a run's folder for one process. The lock is released when its process ends, even if killed.
 
     Raises:
-        InputError: another process still trains there after `patience` seconds.
+        InputError: another process holds the lock for more than `patience` seconds.
     """
     path, holder = Path(run, ".lock"), Path(run, ".lock.holder")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = FileLock(path, timeout=patience).acquire(poll_interval=0.2)
     except Timeout:
-        found = holder.read_text(encoding="utf-8") if holder.is_file() else "unknown"
+        owner = holder.read_text(encoding="utf-8") if holder.is_file() else "unknown"
         raise InputError(
-            f"{run} is being trained by another process ({found}). Wait for it, or give name=OTHER."
+            f"{run} is being trained by another process ({owner}). Wait for it, or give name=OTHER."
         ) from None
     with lock:
-        # Not in the lock's own file: who tries to take that may empty it.
+        # Not in the lock file itself, which other processes may truncate when they try to lock it.
         holder.write_text(f"pid {os.getpid()} on {platform.node()}", encoding="utf-8")
         yield
 
 
 def read_config(run: str | Path) -> dict[str, Any] | None:
-    """The config that a run folder was begun with, or None. Where its file is lost, that in its newest checkpoint.
+    """The config of a run folder, or None. If the file is missing, the config of the newest checkpoint.
 
     Raises:
         InputError: the file is damaged.
     """
     path = Path(run, CONFIG)
-    kept = (content.get("config") for _, content in _whole(run))
-    config = _read_yaml(path) if path.is_file() else next((one for one in kept if isinstance(one, dict)), None)
+    stored = (content.get("config") for _, content in _whole(run))
+    config = _read_yaml(path) if path.is_file() else next((kept for kept in stored if isinstance(kept, dict)), None)
     return config or None
 
 
@@ -79,11 +79,11 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         check_tree(config)
         groups = [key for key in ("stage", "data", "trainer") if not isinstance(config.get(key, {}), Mapping)]
         if groups:
-            raise ValueError(f"its {groups[0]} is no group of keys")
+            raise ValueError(f"its {groups[0]} is not a group of keys")
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
-        said = str(error).splitlines()[0] if isinstance(error, ValueError) else "it is no config"
+        reason = str(error).splitlines()[0] if isinstance(error, ValueError) else "it is not a config"
         raise InputError(
-            f"{path} is damaged ({said}); remove it, and the config in the run's newest checkpoint takes its place."
+            f"{path} is damaged ({reason}); remove it, and r2flow takes the config of the run's newest checkpoint."
         ) from None
     return dict(config)
 
@@ -94,15 +94,15 @@ def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
 
 
 def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor] | None = None) -> Path | None:
-    """Enter a run folder: the newest checkpoint to resume from, or None where a run begins.
+    """Open a run folder: returns the newest checkpoint to resume from, or None for a new run.
 
     Args:
-        state: The state_dict of what is trained; a checkpoint with other names or shapes is passed over.
+        state: The stage's state_dict; checkpoints with other names or shapes are skipped.
 
     Raises:
-        InputError: the folder holds a run of another config, or checkpoints of which none fits its config.
+        InputError: the folder holds a run of another config, or no checkpoint fits its config.
     """
-    for leftover in Path(run, FOLDER).glob(".*.part"):  # of a writer that was killed
+    for leftover in Path(run, FOLDER).glob(".*.part"):  # of killed writers
         leftover.unlink(missing_ok=True)
     old = read_config(run)
     if old is None:
@@ -112,7 +112,7 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
     newest = next(resumable, None)
     if differing and newest is not None:
         raise InputError(_another_config(run, differing))
-    if newest is None:  # nothing has been learned there yet
+    if newest is None:  # not trained yet
         last = None
     else:
         last = _fitting(run, [newest, *resumable] if state else [newest], state)
@@ -122,13 +122,13 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
                 f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Leave it as it was, and draw by "
                 f"another with r2flow sample {run} --sampler NAME --steps N."
             )
-    if old != dict(config) or not Path(run, CONFIG).is_file():  # free keys may have moved
+    if old != dict(config) or not Path(run, CONFIG).is_file():  # free keys may have changed
         write_config(run, config)
     return last
 
 
 def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
-    """Refuse a run folder of another config; what only the data and a trained parent tell is left out.
+    """Refuse a run folder of another config, ignoring keys that depend on the data or a trained parent.
 
     Raises:
         InputError: the folder holds a run of another config.
@@ -137,8 +137,8 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     if old is None or not checkpoints_of(run):
         return
     later = ("scans", "parent", "encoding.reflectance", "encoding.levels", "data.pairs.parent")
-    known = [{k: v for k, v in flatten(one) if not f"{k}.".startswith(tuple(f"{group}." for group in later))}
-             for one in (old, config)]  # fmt: skip
+    known = [{k: v for k, v in flatten(side) if not f"{k}.".startswith(tuple(f"{group}." for group in later))}
+             for side in (old, config)]  # fmt: skip
     differing = contradictions(*known)
     if differing:
         raise InputError(_another_config(run, differing))
@@ -146,7 +146,7 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
 
 def _another_config(run: str | Path, differing: list[str]) -> str:
     more = f" (and {len(differing) - 3} more)" if len(differing) > 3 else ""
-    length = all(one.startswith("trainer.max_steps=") for one in differing)
+    length = all(text.startswith("trainer.max_steps=") for text in differing)
     more_steps = f", stage.init={run} name=OTHER to learn on from its weights" if length else ""
     return (
         f"{run} holds a run of another config: {'; '.join(differing[:3])}{more}. "
@@ -158,7 +158,7 @@ RESUMED = ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops",
 
 
 def _whole(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The checkpoints that can be read, the newest first."""
+    """The readable checkpoints, newest first."""
     for path in checkpoints_of(run):
         try:
             yield path, read_checkpoint(path)
@@ -167,7 +167,7 @@ def _whole(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
 
 
 def _resumable(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The checkpoints that a run can resume from; one of weights alone cannot be resumed."""
+    """The checkpoints that a run can resume from: those with more than weights."""
     for path, content in _whole(run):
         lacking = [key for key in RESUMED if key not in content]
         if not lacking:
@@ -176,13 +176,15 @@ def _resumable(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
             log.warning("%s cannot be resumed: it has no %s. Passing it over.", path, lacking[0])
 
 
-def _fitting(run: str | Path, found: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None) -> Path:
+def _fitting(
+    run: str | Path, candidates: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None
+) -> Path:
     """The first checkpoint whose weights have the names and shapes of `state`."""
-    for path, content in found:
+    for path, content in candidates:
         if state is None:
             return path
-        held = {name: getattr(value, "shape", None) for name, value in content["state_dict"].items()}
-        if held == {name: value.shape for name, value in state.items()}:
+        shapes = {name: getattr(value, "shape", None) for name, value in content["state_dict"].items()}
+        if shapes == {name: value.shape for name, value in state.items()}:
             return path
         log.warning("%s does not have the weights of this run's config. Passing it over.", path)
     raise InputError(f"no checkpoint in {run} has the weights of its config; give name=OTHER for a new run.")

@@ -1,7 +1,7 @@
-"""What `train.py` and `r2flow train` do: Hydra, sweeps, chains, exit codes, and mistakes in one line.
+"""Entry point of `train.py` and `r2flow train`: Hydra, sweeps, chains, exit codes, one-line error messages.
 
-Exit codes: 0 at the run's end, 2 for what the user can mend, 75 where the same command resumes (`trainer.max_time`,
-SLURM's time limit), 130 after Ctrl-C, 143 after SIGTERM.
+Exit codes: 0 for a finished run, 2 for a user error, 75 if the same command resumes (`trainer.max_time`, SLURM's time
+limit), 130 after Ctrl-C, 143 after SIGTERM.
 """
 
 import functools
@@ -47,24 +47,24 @@ Task = Callable[[DictConfig], None]
 
 
 class JobEnded(RuntimeError):
-    """A job of a sweep ended before its run did: its exit code and its folder."""
+    """A job of a sweep ended before its run was finished; arguments: exit code and folder."""
 
 
 def main(arguments: Sequence[str], command: Sequence[str]) -> int:
-    """Compose a command line's config and do what it says: a run, a chain of runs or a sweep.
+    """Compose a command line's config and execute it: a run, a chain of runs or a sweep.
 
     Args:
         arguments: Hydra's overrides and flags, and any number of `--plugin NAME`.
-        command: How this very program is started, for the processes of sweeps and chains.
+        command: Command that starts this program, for the processes of sweeps and chains.
 
     Returns:
-        The exit code; what went wrong has been said in one line.
+        The exit code; errors are printed in one line.
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints mistakes itself, over many lines, and exits with 1
-    ended: list[tuple[int, str]] = []  # jobs of a sweep
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself, over many lines, and exits with 1
+    ended: list[tuple[int, str]] = []  # unfinished jobs of a sweep
     open_streams()
     try:
-        # SLURM signals every process of a job: a run answers, a chain waits for it.
+        # SLURM signals every process of a job: a run handles the signal, a chain waits for the run.
         ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
         with listening(stop_at_once), listening(signal.SIG_IGN, ignored):
             if "--version" in arguments:
@@ -81,14 +81,14 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except Stopped as stop:
-        if str(stop):  # of several devices one speaks
+        if str(stop):  # empty but on the first device
             print(stop, flush=True)
         return stop.code
-    except KeyboardInterrupt:  # Ctrl-C where nobody listens: in a library's thread
+    except KeyboardInterrupt:  # Ctrl-C without a handler: in a library's thread
         print("stopped", flush=True)
         return 130
     except JobEnded as error:
-        jobs = ended or [error.args]  # a launcher elsewhere raises the first alone
+        jobs = ended or [error.args]  # a remote launcher raises the first only
         failed = [folder for code, folder in jobs if code != LATER]
         number, names = (len(failed or jobs) if ended else "some"), "; ".join(failed or [folder for _, folder in jobs])
         if failed:
@@ -111,19 +111,19 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
 
 
 def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """The command line with its plug-ins as one `plugins=[...]`, and these, however they were given."""
+    """Collect the plug-ins of a command line, in any form, into one `plugins=[...]`; returns the new line and them."""
     others, names = take_plugins(arguments)
-    given = [one for one in others if one.lstrip("+").startswith("plugins=")]
-    for one in given:
-        names += [name.strip(" '\"") for name in one.partition("=")[2].strip("[]").split(",")]
+    given = [text for text in others if text.lstrip("+").startswith("plugins=")]
+    for text in given:
+        names += [name.strip(" '\"") for name in text.partition("=")[2].strip("[]").split(",")]
     names = list(dict.fromkeys(name for name in names if name))
-    rest = [one for one in others if one not in given]
+    rest = [text for text in others if text not in given]
     return [*rest, *([override("plugins", names)] if names else [])], names
 
 
 def _forgotten_plugins(arguments: Sequence[str]) -> str:
-    """The plug-ins of the run that a command names, where it gives none: its config may name what they hold."""
-    given = dict(one.partition("=")[::2] for one in arguments)
+    """Hint at the plug-ins of an existing run if the command gives none."""
+    given = dict(text.partition("=")[::2] for text in arguments)
     run = given.get("run_dir") or f"runs/{given.get('name')}"
     if "plugins" in given or not Path(run, "config.yaml").is_file():
         return ""
@@ -134,34 +134,34 @@ def _forgotten_plugins(arguments: Sequence[str]) -> str:
 
 
 def _checked_arguments(arguments: list[str]) -> list[str]:
-    """Hydra's flags, then its overrides.
+    """Order the command line: Hydra's flags, then its overrides.
 
     Raises:
-        InputError: a flag that it does not have, or one folder for all runs of a sweep.
+        InputError: an unknown flag, or one folder for all runs of a sweep.
     """
     parser = get_args_parser()
 
     def refuse(message: str) -> NoReturn:
         raise InputError(f"{message}; see --help. Keys have no dashes, as trainer.max_steps=100.")
 
-    parser.error = refuse  # type: ignore[method-assign]  # its own prints all of the flags
+    parser.error = refuse  # type: ignore[method-assign]  # the default prints all flags
     parsed = parser.parse_intermixed_args(arguments)  # flags may stand between them
     overrides = parsed.overrides
-    for one in overrides if parsed.multirun or "hydra.mode=MULTIRUN" in overrides else ():
-        # Several names are a sweep like any other.
-        if key_of(one) == "run_dir" or (key_of(one) == "name" and "," not in one):
+    for text in overrides if parsed.multirun or "hydra.mode=MULTIRUN" in overrides else ():
+        # A sweep over several names is valid.
+        if key_of(text) == "run_dir" or (key_of(text) == "name" and "," not in text):
             raise InputError(
-                f"a sweep gives each run a folder of its own: leave {one} out, or give hydra.sweep.dir=FOLDER."
+                f"a sweep gives each run a folder of its own: leave {text} out, or give hydra.sweep.dir=FOLDER."
             )
-    return [*(one for one in arguments if one not in overrides), *as_hydra_takes(overrides)]
+    return [*(text for text in arguments if text not in overrides), *as_hydra_takes(overrides)]
 
 
 def _run_hydra(arguments: Sequence[str], job: Task) -> None:
-    """Hydra's own main, on these arguments; a job sees the process's."""
+    """Run Hydra's main with these arguments; jobs see the process's original `sys.argv`."""
     original = sys.argv
 
     def task(config: DictConfig) -> None:
-        sys.argv = original  # Lightning starts a run's other devices by it
+        sys.argv = original  # Lightning starts the processes of other devices by it
         job(config)
 
     decorated = hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(task)
@@ -181,7 +181,7 @@ def _run_hydra(arguments: Sequence[str], job: Task) -> None:
 
 
 def job_folder(arguments: Sequence[str], overrides: str) -> str:
-    """A folder name for a job of a sweep: the values that are swept, and a hash of all overrides."""
+    """Folder name of a sweep's job: the swept values, and a hash of all overrides."""
     given = [argument.partition("=") for argument in arguments]
     swept = {key.lstrip("+~") for key, _, value in given if "," in value}
     parts = [part for part in overrides.split(",") if part.partition("=")[0].lstrip("+~") in swept]
@@ -192,36 +192,36 @@ def job_folder(arguments: Sequence[str], overrides: str) -> str:
 def _job(
     arguments: Sequence[str], command: Sequence[str], ended: list[tuple[int, str]], launcher: int, config: DictConfig
 ) -> None:
-    """What Hydra runs. Of the exceptions only `Exception` is caught by it: SystemExit says the code.
+    """The task that Hydra runs. Hydra catches only `Exception`: SystemExit carries the exit code.
 
     Args:
-        ended: Where the jobs of a sweep are noted that ended before their runs.
-        launcher: The process in which this list is read.
+        ended: Collects the unfinished jobs of a sweep.
+        launcher: Process that reads `ended`.
     """
     try:
         given = list(HydraConfig.get().overrides.task)
-        # Of the command line, not of the overrides: a file can have a sweeper add some of these.
-        if config["plugins"] and not any(one.startswith("plugins=") for one in arguments):
+        # Check the command line, not the overrides: a config file can make a sweeper add overrides.
+        if config["plugins"] and not any(text.startswith("plugins=") for text in arguments):
             named = " ".join(f"--plugin {name}" for name in config["plugins"])
             raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             _sweep_job(command, given, ended)
-            if ended and os.getpid() != launcher:  # a launcher elsewhere hears exceptions alone, after all jobs
+            if ended and os.getpid() != launcher:  # a remote launcher sees only exceptions, after all jobs
                 raise JobEnded(*ended[-1])
             return
         settings = plain(config)
         check_keys(settings)
         code = _chain(settings, given, command) if settings["chain"] else _fit(settings, given)
-    except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print its own lines around it
-        said = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
-        print(f"error: {said}", file=sys.stderr)
+    except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would add lines of its own
+        message = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
+        print(f"error: {message}", file=sys.stderr)
         raise SystemExit(2) from None
     if code:
         raise SystemExit(code)
 
 
 def _config_folders() -> list[str]:
-    """Where `--config-dir` points, for processes of our own."""
+    """Folders given by `--config-dir`, for child processes."""
     sources = HydraConfig.get().runtime.config_sources
     return [source.path for source in sources if source.provider == "command-line"]
 
@@ -231,7 +231,7 @@ def _restart(command: Sequence[str]) -> list[str]:
 
 
 def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[int, str]]) -> None:
-    """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
+    """Run a job of a sweep in its own process, so that its failure or DDP relaunch does not affect other jobs."""
     from r2flow.runs.chain import run_process
 
     run_dir = HydraConfig.get().runtime.output_dir
@@ -244,18 +244,18 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
 
 
 def _fit(settings: dict[str, Any], given: Sequence[str]) -> int:
-    # Imported here: a misspelt config answers at once, not after torch has loaded.
+    # Imported here, so that errors in the config are reported before torch is loaded.
     from r2flow.training import build, fit
 
     return 0 if fit(build(settings, given)).finished else LATER
 
 
 def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str]) -> int:
-    """The runs that a config's `chain` names, and the report on them."""
+    """Run the links of a config's `chain`, then the report on them."""
     from r2flow.runs.chain import is_finished, is_reported, links_of, record_report, run_chain
 
     if settings["trainer"]["fast_dev_run"]:
-        raise InputError("a chain's links start from the runs before them, and trainer.fast_dev_run leaves none.")
+        raise InputError("a chain's links start from earlier runs, which trainer.fast_dev_run does not write.")
     folder = Path(settings["run_dir"])
     links = links_of(settings["chain"], folder, given)
     if not all(map(is_finished, links)):
@@ -282,7 +282,7 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
 
 
 def _preview(model: str, out: Path) -> None:
-    """Draw scans of a trained model, to look at while a chain trains."""
+    """Draw scans of a trained model, as a preview while a chain trains."""
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.models import find_model
     from r2flow.reports.outputs import write_samples
@@ -293,7 +293,7 @@ def _preview(model: str, out: Path) -> None:
 
 
 def _check_links(links: Sequence[Any]) -> None:
-    """Compose and build every link before the first one runs: what is refused is refused now.
+    """Compose and build every link before the first one runs, so that errors are reported early.
 
     Raises:
         InputError: a link that cannot be composed or built.

@@ -1,4 +1,4 @@
-"""Flows that come from flows: what a run takes over from the one that it starts from."""
+"""Lineage: what a run inherits from the run that it starts from."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ from r2flow.stages import STAGES
 
 @dataclass(frozen=True)
 class Parent:
-    """What a run needs to know of the one that it starts from.
+    """The run that another run starts from.
 
     Attributes:
-        config: Its config.
-        path: Its checkpoint or, while it has none, its folder.
+        config: Config of the parent.
+        path: Checkpoint of the parent, or its folder if it has none yet.
         step: Optimiser steps taken.
-        weights: `weights_hash` of its averaged weights; None while it is to be trained.
+        weights: `weights_hash` of the averaged weights; None if the parent is not trained yet.
     """
 
     config: Mapping[str, Any]
@@ -36,35 +36,35 @@ class Parent:
 
 
 def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
-    """The trained flow that a config's `stage.init` names, if it names one.
+    """The parent named by a config's `stage.init`, if any.
 
     Raises:
-        InputError: it is not there, not finished, or cannot be started from.
+        InputError: it is missing, not finished, or not usable as a parent.
     """
     init = config["stage"].get("init")
     if init is None:
         return None
-    found = load_checkpoint(str(init))
-    check_finished(Path(str(init)), found)
-    if "published" in found.config and found.config["data"]["reading"]["projection"] == "unfolding":
+    checkpoint = load_checkpoint(str(init))
+    check_finished(Path(str(init)), checkpoint)
+    if "published" in checkpoint.config and checkpoint.config["data"]["reading"]["projection"] == "unfolding":
         raise InputError(
-            f"{init} was trained on unfolded scans, whose rings a new run's sensor does not carry; "
+            f"{init} was trained on unfolded scans, whose rings a new run's sensor does not have; "
             "start from a flow trained on spherical images."
         )
-    return Parent(found.config, found.path, found.step, weights_hash(found)), found
+    return Parent(checkpoint.config, checkpoint.path, checkpoint.step, weights_hash(checkpoint)), checkpoint
 
 
 def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
-    """The config of a run, completed by what its parent says.
+    """Complete a run's config with values of its parent.
 
-    Encoding and backbone are the parent's; sensor, projection and convention too, unless the command line gives them.
-    Pairs are drawn by the parent's averaged weights, or by another flow (`data.pairs.of`), at its sensor.
+    Encoding and backbone come from the parent; also sensor, projection and convention unless the command line gives
+    them. Pairs are drawn by the parent's averaged weights or by another flow (`data.pairs.of`), with its sensor.
 
     Args:
-        asked: What the command line gave, as `backbone=hdit` or `backbone.depths=[1]`.
+        asked: Overrides of the command line, as `backbone=hdit` or `backbone.depths=[1]`.
 
     Raises:
-        InputError: the command line asks for what the parent is not, or a stage that needs a parent has none.
+        InputError: the command line contradicts the parent, or a stage that needs a parent has none.
     """
     config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     if parent is None:
@@ -76,7 +76,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
             raise InputError(f"stage={config['stage']['name']} starts from another run: give stage.init=RUN.")
         config["generator"] = generator_of(config, parent)
         return _with_data(config)
-    keys = [key_of(one) for one in asked]
+    keys = [key_of(text) for text in asked]
     for group in (*groups_of(inherited="always"), *groups_of(inherited="with_pairs")):
         config[group] = _chosen(group, parent.config.get(group), config.get(group), keys, config, parent)
     config["generator"] = generator_of(config, parent)
@@ -86,18 +86,18 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         drawer = _drawer(config, parent)
         data["root"] = data["root"] or str(default_folder(drawer.path))
         data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
-        theirs = drawer.config.get("data", {}).get("reading") or {}
+        reading = drawer.config.get("data", {}).get("reading") or {}
         for key, value in (data.get("reading") or {}).items():
-            if value not in (None, theirs.get(key)) and f"data.reading.{key}" in keys:
+            if value not in (None, reading.get(key)) and f"data.reading.{key}" in keys:
                 raise InputError(f"data.reading.{key} is that of the flow that draws the pairs: leave it out.")
-        data["reading"] = theirs
+        data["reading"] = reading
     elif data["name"] != MIXED:
         return _with_data(config, parent.config.get("data", {}).get("reading"))
     return _with_data(config)
 
 
 def _with_data(config: Mapping[str, Any], reading: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The config with `data` resolved; `reading` is the parent's."""
+    """Resolve `data` in a config; `reading` is the parent's."""
     return {**config, "data": resolve(config["data"], config["sensor"].get("reflectance_scale"), reading)}
 
 
@@ -105,10 +105,10 @@ ABSENT = object()
 
 
 def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapping[str, Any], parent: Parent) -> Any:
-    """The parent's value of a key, or ours where the command line asked for it and it may differ.
+    """The parent's value of a key, or ours if the command line gives it and it may differ.
 
     Raises:
-        InputError: the command line asks for a value that the parent's weights do not fit.
+        InputError: the command line gives a value that does not fit the parent's weights.
     """
     group, may_differ = key.partition(".")[0], inherited(key, config) == "unless_given"
     if key == group and (ours is None or not isinstance(theirs, Mapping) or (may_differ and key in asked)):
@@ -117,7 +117,7 @@ def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapp
         values = {name: _chosen(f"{key}.{name}", theirs.get(name, ABSENT), value, asked, config, parent)
                   for name, value in ours.items()}  # fmt: skip
         return {**theirs, **{name: value for name, value in values.items() if value is not ABSENT}}
-    named = any(one != group and f"{key}.".startswith(f"{one}.") for one in asked)
+    named = any(given != group and f"{key}.".startswith(f"{given}.") for given in asked)
     if may_differ:
         return ours if named else theirs
     differs = key in asked if theirs is ABSENT else ours != theirs
@@ -130,29 +130,29 @@ def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapp
 
 
 def drawn_by(config: Mapping[str, Any]) -> str | None:
-    """The flow that draws a run's pairs: `data.pairs.of`, else the one that it starts from."""
+    """The flow that draws a run's pairs: `data.pairs.of`, else `stage.init`."""
     return (config["data"].get("pairs") or {}).get("of") or config["stage"].get("init")
 
 
 def _drawer(config: Mapping[str, Any], parent: Parent) -> Parent:
     of = (config["data"].get("pairs") or {}).get("of")
-    found = find_parent({"stage": {"init": of}})
-    if found is None:
+    drawer = find_parent({"stage": {"init": of}})
+    if drawer is None:
         return parent
     for group in ("sensor", "encoding"):
-        if found[0].config.get(group) != config[group]:
+        if drawer[0].config.get(group) != config[group]:
             raise InputError(
-                f"data.pairs.of={of} has another {group} than {parent.path}, which this run starts from; its pairs are "
-                "other images. Leave it out, or start from a flow of the same."
+                f"data.pairs.of={of} has another {group} than {parent.path}, which this run starts from. Leave it out, "
+                f"or start from a flow with the same {group}."
             )
-    return found[0]
+    return drawer[0]
 
 
 def inherited(key: str, config: Mapping[str, Any]) -> str:
-    """Whether a run of this config has its parent's value of a key: no, always or unless_given."""
-    found = rule(key).inherited
-    if found != "with_pairs":
-        return found
+    """Whether a run of this config inherits a key from its parent: no, always or unless_given."""
+    mode = rule(key).inherited
+    if mode != "with_pairs":
+        return mode
     return "always" if _on_pairs(config) else "unless_given"
 
 
@@ -161,21 +161,21 @@ def _on_pairs(config: Mapping[str, Any]) -> bool:
 
 
 def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:
-    """What a run trains: the config's `generator`, else its stage's, else its parent's, of a flow map its velocity; the
-    last three with the parent's options, as far as they have them."""
-    own = config.get("generator")
-    if own:
-        return {"name": own} if isinstance(own, str) else dict(own)
-    theirs = (parent and parent.config.get("generator")) or {"name": "rectified_flow"}
-    own = STAGES[config["stage"]["name"]].generator_name or getattr(GENERATORS[theirs["name"]], "goes_on_as", None)
-    if own in (None, theirs["name"]):
-        return dict(theirs)
-    shared = options_of(GENERATORS[own], given=2)
-    return {"name": own, **{key: value for key, value in theirs.items() if key in shared}}
+    """The generator of a run: the config's `generator`, else the stage's, else the parent's (its `goes_on_as`); without
+    a config's `generator`, with the parent's options as far as they apply."""
+    chosen = config.get("generator")
+    if chosen:
+        return {"name": chosen} if isinstance(chosen, str) else dict(chosen)
+    parental = (parent and parent.config.get("generator")) or {"name": "rectified_flow"}
+    chosen = STAGES[config["stage"]["name"]].generator_name or getattr(GENERATORS[parental["name"]], "goes_on_as", None)
+    if chosen in (None, parental["name"]):
+        return dict(parental)
+    shared = options_of(GENERATORS[chosen], given=2)
+    return {"name": chosen, **{key: value for key, value in parental.items() if key in shared}}
 
 
 def pairs_of(parent: Checkpoint | Parent, options: Mapping[str, Any], weights: str | None) -> dict[str, Any]:
-    """`data.pairs` for a parent of this `weights_hash`, and noise that it has not been trained on itself."""
+    """`data.pairs` for a parent of this `weights_hash`, with noise numbers that the parent was not trained on."""
     check_options("data.pairs", PairOptions, options)
     first = options.get("first")
     if first is None:
@@ -185,10 +185,10 @@ def pairs_of(parent: Checkpoint | Parent, options: Mapping[str, Any], weights: s
 
 
 def check_finished(init: Path, parent: Checkpoint) -> None:
-    """A run folder means its end; a checkpoint in the middle is taken when it is named.
+    """Require that a run folder given as `init` is finished; a checkpoint file may be of any step.
 
     Raises:
-        InputError: the run in a folder has not come to its end.
+        InputError: the run in the folder is not finished.
     """
     wanted = parent.config.get("trainer", {}).get("max_steps", 0)
     if init.expanduser().is_dir() and name_of(parent.path) is None and parent.step < wanted:
