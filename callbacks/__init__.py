@@ -1,4 +1,4 @@
-"""What happens during a run, and when; what it does is r2flow's."""
+"""Callbacks and loggers of a run, as part of the package r2flow."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,14 +22,14 @@ from .stopping import Stopping
 
 
 class Entry(NamedTuple):
-    """A callback, or several that belong together, and what it takes by position beside its options."""
+    """Constructor of a callback, or of a list of callbacks, and its positional arguments from a config."""
 
     constructor: Callable[..., Any]
     given: Callable[[Mapping[str, Any]], tuple[Any, ...]] = lambda config: ()
 
 
 def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
-    """The callbacks that a config's `callbacks` names; null leaves one out."""
+    """Build the callbacks of a config's `callbacks`; null disables one."""
     if config["trainer"]["fast_dev_run"]:
         return [Progress()] if config["trainer"]["enable_progress_bar"] else []
     for name in config["callbacks"]:
@@ -43,13 +43,13 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
         if not config["trainer"][key]:
             wanted.pop(name, None)
     built: list[Callback] = []
-    for name, known in CALLBACKS.items():
+    for name, registered in CALLBACKS.items():
         if name in wanted:
-            entry = known if isinstance(known, Entry) else Entry(known)  # a class alone, as of a plug-in
+            entry = registered if isinstance(registered, Entry) else Entry(registered)  # a class, as from a plug-in
             given = entry.given(config)
             check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
-            made = entry.constructor(*given, **wanted[name])
-            built += made if isinstance(made, list) else [made]
+            callback = entry.constructor(*given, **wanted[name])
+            built += callback if isinstance(callback, list) else [callback]
     if config["loggers"]:
         built.append(LearningRateMonitor("step"))
     return built
@@ -62,17 +62,17 @@ def keep_checkpoints(folder: Path, every: Count = 100) -> list[Callback]:
         "filename": "step-{step:08d}",
         "auto_insert_metric_name": False,
         "enable_version_counter": False,
-        "monitor": "step",  # the largest step is the best: keeps the newest
+        "monitor": "step",  # the largest step counts as the best: keeps the newest
         "mode": "max",
     }
-    # Without the last argument it would leave the run's last step to a validation that may not come, and a third
-    # checkpoint would stay.
+    # Without save_on_train_epoch_end, the checkpoint of the last step would wait for a validation that may not happen,
+    # and a third checkpoint would remain.
     regular = ModelCheckpoint(every_n_train_steps=every, save_top_k=2, save_on_train_epoch_end=True, **common)
     final = ModelCheckpoint(every_n_epochs=1, save_on_train_epoch_end=True, save_top_k=1, **common)
     return [regular, final]
 
 
-# In the order in which they act.
+# In the order of execution.
 CALLBACKS = Registry(
     "callback",
     reflow_pairs=Entry(ReflowPairs, lambda config: (drawn_by(config),)),
@@ -107,5 +107,5 @@ __all__ = [
     "log_figures",
 ]
 
-if __name__ != "r2flow.callbacks":  # a run's callbacks look for each other by class, and a second copy has other ones
+if __name__ != "r2flow.callbacks":  # callbacks look up each other by class, and a second copy has other classes
     raise ImportError("import r2flow.callbacks, not callbacks: the folder is part of the package r2flow.")

@@ -1,4 +1,4 @@
-"""How straight the paths are while a flow is trained."""
+"""Straightness of a flow's paths during training."""
 
 import lightning as L
 
@@ -11,16 +11,16 @@ from .periodic import Periodic
 
 
 class Curvature(Periodic):
-    """Logs int s(t) dt (paper, eq. 5) of a few scans from fixed noise; of generators that are flows.
+    """Logs int s(t) dt (paper, eq. 5) of a few scans from fixed noise, if the generator is a flow.
 
-    As `curvature/s` and, over the squared length of the path, as `curvature/s_normalised`: an untrained flow is
-    straight because it goes nowhere. It takes one pass of `steps` Euler steps; s(t) itself, which takes two, is in
-    `r2flow report curvature`.
+    The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/s_normalised`: an untrained
+    flow is straight because its paths have almost no length. One measurement is one pass of `steps` Euler steps;
+    `r2flow report curvature` computes s(t) itself, in two passes.
 
     Args:
         every: Steps between two measurements; 0 for none.
-        num: Scans a measurement.
-        steps: Euler steps a scan.
+        num: Scans per measurement.
+        steps: Euler steps per scan.
     """
 
     def __init__(self, seed: int, every: Natural = 500, num: Count = 2, steps: Count = 16) -> None:
@@ -32,8 +32,8 @@ class Curvature(Periodic):
         if not isinstance(flow, Flow) or not flow.draws:
             return
         x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
-        found = curvature(flow.velocity, x_0, self.steps)
-        values = {"s": found.total.mean().item(), "s_normalised": found.normalised.mean().item()}
+        result = curvature(flow.velocity, x_0, self.steps)
+        values = {"s": result.total.mean().item(), "s_normalised": result.normalised.mean().item()}
         for logger in trainer.loggers:
-            # Lightning counts the step that was being taken
+            # Lightning logs with the step before the one just finished
             logger.log_metrics({f"curvature/{name}": value for name, value in values.items()}, trainer.global_step - 1)

@@ -1,4 +1,4 @@
-"""The averaged weights, which are the model."""
+"""Exponential moving averages of the weights."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,21 +14,18 @@ from r2flow.systems.gan.losses import half_life_decay
 
 
 def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
-    """min(highest, 1 - (1 + n)^(-power)) with n the steps since the warm-up ended, and 0 during it.
-
-    A decay of 0 copies the weights.
-    """
+    """min(highest, 1 - (1 + n)^(-power)) with n the steps after the warm-up; 0, a copy, during the warm-up."""
     n = step - warmup
     return 0.0 if n <= 0 else min(highest, 1 - (1 + n) ** -power)
 
 
 def constant_decay(step: int, warmup: int, highest: float) -> float:
-    """highest, and 0 during the warm-up: LiDARGen's."""
+    """highest, and 0 during the warm-up (LiDARGen)."""
     return 0.0 if step < warmup else highest
 
 
 def ratio_decay(step: int, warmup: int, highest: float) -> float:
-    """min(highest, (1 + n) / (10 + n)) with n the steps since the warm-up, this one too, and 0 during it: LiDM's."""
+    """min(highest, (1 + n) / (10 + n)) with n the steps after the warm-up, from 1; 0 during the warm-up (LiDM)."""
     n = step + 1 - warmup
     return 0.0 if n <= 0 else min(highest, (1 + n) / (10 + n))
 
@@ -39,23 +36,22 @@ DECAYS: Registry[Callable[[int, int, float], float]] = Registry(
 
 
 class EMA(WeightAveraging):
-    """Exponential moving average of the weights, in float32, for validation, pictures and the checkpoint.
+    """Exponential moving average of the weights, in float32, for validation, pictures and checkpoints.
 
-    Every `every` steps: average <- decay average + (1 - decay) weights. A run that ends before the first update behind
-    the warm-up ends with the weights that it learned.
+    Every `every` steps: average <- decay average + (1 - decay) weights. A run that ends before the first update after
+    the warm-up keeps its raw weights as the average.
 
     Args:
         decay: Highest decay.
-        rule: How it is reached, a name in `DECAYS`; `ratio` and `constant` are meant for every=1.
+        rule: Decay schedule, a name in `DECAYS`; `ratio` and `constant` are meant for every=1.
         every: Steps between two updates.
-        warmup_steps: Steps during which the average copies the weights; None takes the stage's
-            learning-rate warm-up.
+        warmup_steps: Steps during which the average copies the weights; None: the stage's learning-rate warm-up.
     """
 
     def __init__(
         self, decay: Portion = 0.995, every: Count = 10, warmup_steps: Natural | None = None, rule: str = "power"
     ) -> None:
-        # Most buffers are constants (ray angles, frequencies); those that count go on counting, and are no average.
+        # Buffers are not averaged: most are constants (ray angles, frequencies), the others counters.
         super().__init__(use_buffers=False, avg_fn=self._average)
         self.decay, self.every, self.warmup_steps = decay, every, warmup_steps
         self._decay_at = DECAYS[rule]
@@ -63,7 +59,7 @@ class EMA(WeightAveraging):
         self._raw: list[Tensor] = []
 
     def _decay(self) -> float:
-        """After step `_step`, counted from 0."""
+        """Decay after step `_step`, counted from 0."""
         return 0.0 if self._copies else self._decay_at(self._step, self.warmup_steps or 0, self.decay)
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
@@ -82,19 +78,19 @@ class EMA(WeightAveraging):
         if self.warmup_steps is None:
             self.warmup_steps = int(getattr(pl_module, "warmup_steps", 0))
         if self._average_model is not None:
-            # A half-precision average stalls: its steps are smaller than its spacing.
+            # A half-precision average stalls: its updates are smaller than the float spacing.
             self._average_model.float().requires_grad_(False)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._end = trainer.max_steps - 1
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        # Built before the module moved to its device; left behind, every update would cross the bus.
+        # Built before the module moved to its device; otherwise every update would copy the weights to the CPU.
         if self._average_model is not None and self._device is None:
             self._average_model.to(pl_module.device)
 
-    # The base class swaps weights and average in place, which rounds a float32 average to the weights'
-    # precision; here the weights step aside and come back, and the average is never written.
+    # The base class swaps weights and average in place, which rounds a float32 average to the weights' precision; here
+    # the raw weights are saved and restored, and the average is never overwritten.
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if self._average_model is not None:
             self._raw = [p.detach().clone() for p in pl_module.parameters()]
@@ -112,13 +108,13 @@ class EMA(WeightAveraging):
 
 
 class HalfLifeEMA(EMA):
-    """The average of a GAN's generator: half of it is from the last `half_life` images, or from a share `rampup` of
-    those seen, where these are fewer (`r2flow.systems.gan.losses.half_life_decay`); every step, buffers copied.
+    """EMA of a GAN's generator, updated every step: its half-life is `half_life` images, or a share `rampup` of the
+    images seen so far if that is less (`r2flow.systems.gan.losses.half_life_decay`).
 
     Args:
-        batch_size: Images a step.
-        half_life: Images.
-        rampup: Share of the images seen.
+        batch_size: Images per step.
+        half_life: Half-life in images.
+        rampup: Upper limit of the half-life, as a share of the images seen.
     """
 
     def __init__(self, batch_size: int, half_life: Positive = 10_000.0, rampup: Positive = 0.05) -> None:
@@ -131,7 +127,7 @@ class HalfLifeEMA(EMA):
 
 @contextmanager
 def averaged_weights(trainer: L.Trainer, pl_module: L.LightningModule) -> Iterator[None]:
-    """The averaged weights in the module where the run keeps an average, else the weights as they are."""
+    """Context with the averaged weights in the module, if the run has an `EMA`; else with the raw weights."""
     averages = [c for c in trainer.callbacks if isinstance(c, EMA)]  # type: ignore[attr-defined]
     for average in averages:
         average.on_validation_epoch_start(trainer, pl_module)

@@ -1,4 +1,4 @@
-"""Guard against NaN: steps with a loss or gradient that is not finite are skipped, or end the run."""
+"""Guard against NaN: skips steps with a non-finite loss or gradient, and stops the run after too many."""
 
 import copy
 import logging
@@ -21,48 +21,48 @@ log = logging.getLogger(__name__)
 
 
 class Guard(L.Callback):
-    """A step whose loss or gradients are not finite changes nothing; too many of them end the run.
+    """Skips steps with a non-finite loss or gradient, and stops the run after too many of them.
 
-    The weights and AdamW's averages stay as they were, the learning rate and the data move on. The decision is made
-    on the gradients that all devices share, so all of them make the same one. Under 16-mixed, gradients beyond
-    half precision are how the loss scale finds its place: such a step is skipped too, but it is no defect unless
-    the scale falls below `lowest_scale` or it goes on for `skips` steps.
+    A skipped step changes neither weights nor AdamW's averages; learning rate and data advance. The decision uses the
+    gradients shared by all devices, so that all devices decide alike. With 16-mixed, overflowing gradients adjust the
+    loss scale: such steps are skipped too, but only count as an error if the scale falls below `lowest_scale` or
+    `skips` steps are skipped in a row.
 
-    A stage with several optimisers loses the step of the one whose gradients are not finite.
+    In a stage with several optimisers, only the optimiser with non-finite gradients skips its step.
 
-    A checkpoint with weights that are not finite is not written: the run ends there.
+    Checkpoints with non-finite weights are not written; the run stops instead.
 
     Args:
-        run_dir: The run's folder, where the last good checkpoint is looked for.
-        skips: Steps skipped in a row after which the run ends.
-        lowest_scale: Smallest loss scale of 16-mixed that is still a scale.
+        run_dir: The run's folder, with the last good checkpoint.
+        skips: Number of steps skipped in a row after which the run stops.
+        lowest_scale: Smallest valid loss scale of 16-mixed.
 
     Attributes:
-        in_a_row: Steps skipped since the last that was taken.
-        total: Steps skipped in the run, those left out that only moved the loss scale.
+        in_a_row: Steps skipped since the last step taken.
+        total: Steps skipped in the run, except those that only adjusted the loss scale.
     """
 
     def __init__(self, run_dir: str | Path, skips: Count = 10, lowest_scale: NonNegative = 1.0) -> None:
         self.run_dir, self.skips, self.lowest_scale = Path(run_dir), skips, lowest_scale
         self.in_a_row = self.total = 0
         self._losses: list[Tensor] = []
-        self._found: list[bool] = []  # of each optimiser in this step, whether its gradients are finite
+        self._found: list[bool] = []  # whether the gradients are finite, per optimiser in this step
 
     def on_before_backward(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: Tensor) -> None:
         value = loss.detach()
         self._losses.append(value)
-        # A loss can overflow where its gradient does not, and on one device only. x - x is 0 or NaN: this adds
-        # nothing, or makes every gradient NaN, which the devices' shared sum then tells all of them.
+        # A loss can overflow while its gradient is finite, and on one device only. x - x is 0 or NaN: adding it makes
+        # every gradient NaN in that case, and the sum over devices distributes it to all of them.
         loss.register_hook(lambda gradient: gradient + (value - value))
 
     def on_before_optimizer_step(self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Any) -> None:
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         gradients = [p.grad for p in parameters if p.grad is not None]
-        finite = bool(torch.isfinite(get_total_norm(gradients)))  # the one wait for the device
+        finite = bool(torch.isfinite(get_total_norm(gradients)))  # the only device synchronisation
         if not finite:
             self._skip(trainer, pl_module, first=all(self._found))
             for parameter in parameters:
-                parameter.grad = None  # which AdamW passes over, its averages untouched
+                parameter.grad = None  # AdamW skips it and keeps its averages
         self._found.append(finite)
 
     def on_train_batch_end(
@@ -74,7 +74,7 @@ class Guard(L.Callback):
             self._found.clear()
 
     def _skip(self, trainer: L.Trainer, pl_module: L.LightningModule, first: bool) -> None:
-        """Count a step, once for all of its optimisers, and end the run where there were too many."""
+        """Count a skipped step, once for all optimisers, and stop the run after too many."""
         scaler = getattr(trainer.precision_plugin, "scaler", None)
         scale = None if scaler is None else float(scaler.get_scale())
         loss = float(trainer.strategy.reduce(torch.stack(self._losses).sum(), reduce_op="mean")) / (scale or 1.0)
@@ -93,12 +93,12 @@ class Guard(L.Callback):
     def _stop(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: float, scale: float | None) -> None:
         what = f"{self.in_a_row} steps in a row were" if self.in_a_row > 1 else "the step was"
         scaled = f"loss scale {scale:g}" if scale is not None else f"no loss scale in {trainer.precision}"
-        full = "" if trainer.precision == "32-true" else "try trainer.precision=32-true; "
+        hint = "" if trainer.precision == "32-true" else "try trainer.precision=32-true; "
         self._end(
             trainer,
             f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss or gradient, "
             f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; {scaled}; "
-            f"{describe_batch(trainer)}. {self._last_good()} Look at these scans; {full}try, in a run of another name, "
+            f"{describe_batch(trainer)}. {self._last_good()} Look at these scans; {hint}try, in a run of another name, "
             "a lower stage.learning_rate.",
         )
 
@@ -135,7 +135,7 @@ class Guard(L.Callback):
 
 
 def describe_gradients(module: torch.nn.Module) -> str:
-    """The first parameter, in the module's order, with a non-finite gradient."""
+    """Describe the first parameter, in the module's order, with a non-finite gradient."""
     gradients = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
     broken = _not_finite(gradients)
     return (
@@ -144,23 +144,23 @@ def describe_gradients(module: torch.nn.Module) -> str:
 
 
 def describe_batch(trainer: L.Trainer) -> str:
-    """The images of the step being taken, on all devices and in all accumulated batches, and their scans."""
+    """Describe the images and scans of the current step, on all devices and in all accumulated batches."""
     loader = trainer.train_dataloader
     if not isinstance(loader, RunLoader):
         return "images unknown to the loader"
-    whole: Any = copy.copy(loader.batch_sampler)
-    whole.rank, whole.ranks = 0, 1
-    whole.first_batch = trainer.global_step * trainer.accumulate_grad_batches
-    batches = iter(whole)
+    sampler: Any = copy.copy(loader.batch_sampler)
+    sampler.rank, sampler.ranks = 0, 1
+    sampler.first_batch = trainer.global_step * trainer.accumulate_grad_batches
+    batches = iter(sampler)
     keys = [key for _ in range(trainer.accumulate_grad_batches) for key in next(batches, [])]
     scans = ", ".join(str(scan) for _, scan in keys[:16]) + (", ..." if len(keys) > 16 else "")
     return f"images k = {keys[0][0]} to {keys[-1][0]}, scans {scans}" if keys else "no images"
 
 
 def _not_finite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
-    """The names of the tensors with a NaN or an infinity, with one wait for the device."""
+    """Names of the tensors with a NaN or an infinity, with one device synchronisation."""
     named = list(tensors)
     if not named:
         return []
     finite = torch.stack([torch.isfinite(value).all() for _, value in named]).tolist()
-    return [name for (name, _), whole in zip(named, finite, strict=True) if not whole]
+    return [name for (name, _), is_finite in zip(named, finite, strict=True) if not is_finite]

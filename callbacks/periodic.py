@@ -1,4 +1,4 @@
-"""What is looked at from time to time while a generator is trained."""
+"""Base class of periodic callbacks."""
 
 import lightning as L
 import torch
@@ -7,7 +7,7 @@ from .ema import averaged_weights
 
 
 class Periodic(L.Callback):
-    """Calls `act` every `every` steps and at the end, on the first process, with averaged weights in eval mode.
+    """Calls `act` every `every` steps and at the end, in the first process, with averaged weights in eval mode.
 
     Args:
         every: Steps between two calls; 0 for none.
@@ -17,18 +17,18 @@ class Periodic(L.Callback):
         self.every, self._last = every, 0
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """What a subclass does."""
+        """Action of a subclass."""
         raise NotImplementedError
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._last = trainer.global_step  # which a resumed run has looked at
+        self._last = trainer.global_step  # a resumed run has already acted at this step
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
         due = self.every > 0 and step > 0 and (step % self.every == 0 or step == trainer.max_steps)
-        # Under accumulation a step lasts several batches: the first one that ends it acts.
+        # With gradient accumulation a step spans several batches: act once per step.
         if due and trainer.is_global_zero and step != self._last:
             self._last, training = step, pl_module.training
             with averaged_weights(trainer, pl_module), torch.no_grad():

@@ -1,4 +1,4 @@
-"""Pictures of samples while a generator is trained."""
+"""Pictures of samples during training."""
 
 from pathlib import Path
 
@@ -13,13 +13,13 @@ from .periodic import Periodic
 
 
 class SamplePictures(Periodic):
-    """Draws a few scans from the same noise every time, into the run's folder and its loggers.
+    """Draws a few scans, always from the same noise, into the run's folder and its loggers.
 
     Args:
-        folder: Where `step-XXXXXXXX.png` goes.
+        folder: Folder of `step-XXXXXXXX.png`.
         every: Steps between two pictures; 0 for none.
-        num: Scans a picture.
-        steps: Steps a scan; None for the generator's own sampler.
+        num: Scans per picture.
+        steps: Steps per scan; None: the generator's default sampler.
     """
 
     def __init__(

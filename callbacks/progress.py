@@ -1,4 +1,4 @@
-"""Progress of a training, with its rate and the time left."""
+"""Training progress, with rate and remaining time."""
 
 import sys
 import time
@@ -12,7 +12,7 @@ from r2flow.registry import NonNegative
 
 
 class Progress(RichProgressBar):
-    """Lightning's rich bar with scans a second; a line every `seconds` where standard output is no terminal."""
+    """Lightning's rich bar with scans per second; a line every `seconds` if standard output is not a terminal."""
 
     def __init__(self, seconds: NonNegative = 15.0) -> None:
         super().__init__(leave=True)
@@ -24,17 +24,17 @@ class Progress(RichProgressBar):
             self.disable()
 
     def _get_train_description(self, current_epoch: int) -> str:
-        return "training"  # the base class counts epochs, and a run is one
+        return "training"  # the base class counts epochs, but a run is one epoch
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         super().on_train_start(trainer, pl_module)
         self._begin = (time.monotonic(), trainer.global_step)
         self._last_line = time.monotonic()
-        if not self._watched and trainer.is_global_zero:  # of a large network the first step takes minutes on a CPU
+        if not self._watched and trainer.is_global_zero:  # the first step of a large network can take minutes
             print(f"step {trainer.global_step}/{trainer.max_steps}  begins", flush=True)
 
     def _rate(self, trainer: L.Trainer) -> float:
-        """Optimiser steps a second since the run (re)started."""
+        """Optimiser steps per second since the run (re)started."""
         if self._begin is None:
             return 0.0
         seconds, step = time.monotonic() - self._begin[0], trainer.global_step - self._begin[1]

@@ -1,4 +1,4 @@
-"""Pairs for a run that learns from pairs, before its first step."""
+"""Generation of missing pairs before training."""
 
 import lightning as L
 
@@ -8,10 +8,10 @@ from r2flow.reports.pairs import make_and_tell
 
 
 class ReflowPairs(L.Callback):
-    """When a run begins, makes the pairs that its data name and that are missing or damaged, over all its devices.
+    """Draws missing or damaged pairs of the run's data at its start, on all devices.
 
     Args:
-        of: The flow that draws them (`data.pairs.of`, else `stage.init`); None where the run starts from no other.
+        of: The flow that draws the pairs (`data.pairs.of`, else `stage.init`); None if the run has no parent.
     """
 
     def __init__(self, of: str | None) -> None:
@@ -22,5 +22,5 @@ class ReflowPairs(L.Callback):
         if not isinstance(data, ScanDataModule) or data.pairs is None or self.of is None:
             return
         store, device, flow = data.pair_store, trainer.strategy.root_device, load_checkpoint(self.of)
-        # Locks of files, not a barrier: a collective call gives up after half an hour, and a slow rank may take longer.
+        # File locks, not a barrier: collective calls time out after half an hour, and a slow rank may take longer.
         make_and_tell(store, flow, trainer.global_rank, trainer.world_size, device)

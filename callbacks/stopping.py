@@ -1,4 +1,4 @@
-"""A run that is told to stop: a checkpoint, one line, the end; under SLURM the job goes back into the queue first."""
+"""Stopping a run by a signal: writes a checkpoint and exits; under SLURM, requeues the job first."""
 
 import logging
 import os
@@ -23,19 +23,18 @@ log = logging.getLogger(__name__)
 
 
 class Stopping(L.Callback):
-    """On SIGTERM, Ctrl-C and, in a SLURM job, SIGUSR1: a checkpoint at the end of the step, and `Stopped`.
+    """On SIGTERM, Ctrl-C and, in a SLURM job, SIGUSR1: writes a checkpoint after the step and raises `Stopped`.
 
-    SIGUSR1 is SLURM's word before a time limit: the job is queued again by `scontrol requeue`. While scans are read or
-    pairs drawn there is nothing to save, and the end is at once.
+    SLURM sends SIGUSR1 before a time limit: the job is requeued by `scontrol requeue`. While scans are read or pairs
+    drawn, the run stops at once without a checkpoint.
 
-    Lightning's own ways end a run with exit code 0, or save from within the signal handler, in the middle of a step, to
-    a file that a resumption passes over; so its handlers are replaced when training starts. A validation
-    that is due at the step at which a run is stopped is left out: its curves lack a point, its weights are the same.
+    Lightning's handlers exit with code 0, or save from within the signal handler, in the middle of a step, to a file
+    that a resumed run ignores; they are therefore replaced when training starts. A validation due at the step of the
+    stop is skipped: the curves lack a point, the weights are the same.
 
     Args:
         run_dir: The run's folder.
-        every: Steps between two questions to all devices whether one of them was told to stop; a single device
-            asks itself at every step.
+        every: Steps between two checks whether any device received a signal; a single device checks every step.
     """
 
     def __init__(self, run_dir: str | Path, every: Count = 10) -> None:
@@ -51,10 +50,10 @@ class Stopping(L.Callback):
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Hear the signals for the length of a block, and leave their handlers afterwards as they were.
+        """Context that handles the signals and restores the previous handlers.
 
         Raises:
-            Stopped: one came.
+            Stopped: a signal was received.
         """
         with listening(self.hear, self.signals):
             try:
@@ -62,12 +61,12 @@ class Stopping(L.Callback):
             except Exception:
                 if self.told is None:
                     raise
-                self._leave("stopped")  # what else went wrong then, as a killed worker, is the signal's doing
+                self._leave("stopped")  # other errors, as of a killed worker, follow from the signal
             if self.told is not None:
                 self._leave("stopped")
 
     def hear(self, number: int, frame: FrameType | None = None) -> None:
-        if os.getpid() != self._process:  # a loader's worker, which has inherited the handler
+        if os.getpid() != self._process:  # a loader's worker with an inherited handler
             return
         again = self.told is not None
         self.told = self.told or number
@@ -80,7 +79,7 @@ class Stopping(L.Callback):
             if signal.getsignal(number) is not signal.SIG_IGN:
                 try:
                     signal.signal(number, self.hear)
-                except ValueError:  # not the main thread, which alone hears signals
+                except ValueError:  # only the main thread can set handlers
                     return
 
     def on_train_batch_end(
@@ -88,15 +87,15 @@ class Stopping(L.Callback):
     ) -> None:
         if (batch_idx + 1) % trainer.accumulate_grad_batches:
             return
-        told = self.told is not None
+        received = self.told is not None
         if trainer.world_size > 1:
             if trainer.global_step % self.every:
                 return
-            told = trainer.strategy.reduce_boolean_decision(told, all=False)
-            for number in self.signals if told else ():  # all leave for the same reason
+            received = trainer.strategy.reduce_boolean_decision(received, all=False)
+            for number in self.signals if received else ():  # all devices stop for the same signal
                 if trainer.strategy.reduce_boolean_decision(self.told == number, all=False):
                     self.told = number
-        if told and trainer.global_step < trainer.max_steps:
+        if received and trainer.global_step < trainer.max_steps:
             if trainer.checkpoint_callbacks:
                 trainer.save_checkpoint(
                     self.run_dir / FOLDER / f"step-{trainer.global_step:08d}.ckpt", weights_only=False
@@ -116,7 +115,7 @@ class Stopping(L.Callback):
         self._training = False
 
     def _keep_two(self, trainer: L.Trainer) -> None:
-        """What is saved here, the callback that saves regularly does not know of and would leave behind."""
+        """Delete old checkpoints: ModelCheckpoint does not know of those saved here and would keep them."""
         if trainer.is_global_zero:
             for old in checkpoints_of(self.run_dir)[2:]:
                 old.unlink(missing_ok=True)
@@ -128,9 +127,9 @@ class Stopping(L.Callback):
             code = LATER
             if first:
                 self._requeue(where)
-        begun = bool(checkpoints_of(self.run_dir))
-        kept = "resumes from the last checkpoint" if begun else "starts it again: no checkpoint yet"
-        raise Stopped(code, f"{where}; the same command {kept}" if first else "") from None
+        has_checkpoint = bool(checkpoints_of(self.run_dir))
+        consequence = "resumes from the last checkpoint" if has_checkpoint else "starts it again: no checkpoint yet"
+        raise Stopped(code, f"{where}; the same command {consequence}" if first else "") from None
 
     def _requeue(self, where: str) -> None:
         assert self.job is not None
@@ -144,9 +143,9 @@ class Stopping(L.Callback):
 
 
 def slurm_job() -> str | None:
-    """The batch job that this process is part of, as `scontrol` calls it, or None.
+    """ID of this process's batch job, as used by `scontrol`, or None.
 
-    A run inside somebody's interactive shell on a node is not a job to be queued again.
+    A run in an interactive shell on a node does not count, since it must not be requeued.
     """
     job = os.environ.get("SLURM_JOB_ID")
     if job is None or os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive"):

@@ -59,7 +59,7 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     sampler.check(flow)
     count = sampler.evaluations(flow)
     if count is None or sampler.draws or sampler.completes:
-        what = "a condition" if sampler.completes else "noise on the way" if sampler.draws else "steps that it chooses"
+        what = "a condition" if sampler.completes else "noise at every step" if sampler.draws else "adaptive steps"
         raise InputError(
             f"sampler {sampler.name} needs {what} and cannot be exported: give --sampler {USUAL.name} --steps "
             f"{USUAL.steps}."
