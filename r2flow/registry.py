@@ -1,4 +1,4 @@
-"""Tables of named constructors, whose errors say which names and options exist."""
+"""Registries of named constructors, with errors that list the known names and options."""
 
 import dataclasses
 import difflib
@@ -13,11 +13,11 @@ from r2flow.errors import InputError
 
 T = TypeVar("T")
 
-MISSING = "???"  # what OmegaConf writes where a value must be given
+MISSING = "???"  # OmegaConf's mandatory value
 
 
 class Bound(NamedTuple):
-    """The range of an option's value, in its annotation: `width: Annotated[int, Bound("below 9", lambda n: n < 9)]`."""
+    """Range of an option's value, in its annotation: `width: Annotated[int, Bound("below 9", lambda n: n < 9)]`."""
 
     words: str
     holds: Callable[[Any], bool]
@@ -33,14 +33,14 @@ Share = Annotated[float, Bound("in [0, 1]", lambda x: 0 <= x <= 1)]
 
 
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
-    """' Did you mean ...?' for the closest known name, or nothing when none is close."""
+    """' Did you mean ...?' with the closest known name, or an empty string if there is none."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     close = close or [other for other in known if other.startswith(name)]
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
 class UnknownName(InputError):
-    """A registry has no entry of this name."""
+    """A registry has no entry with this name."""
 
 
 class _Lazy(NamedTuple):
@@ -49,7 +49,7 @@ class _Lazy(NamedTuple):
 
 
 def lazy(place: str) -> Any:
-    """An entry `module:name` that a registry imports when it is asked for it."""
+    """A registry entry `module:name` that is imported at its first use."""
     return _Lazy(*place.split(":"))
 
 
@@ -61,8 +61,8 @@ class Registry(Generic[T]):
     # no backbone named 'hditt'; known: adm_unet, hdit. Did you mean 'hdit'?
 
     Attributes:
-        on_missing: Functions that may add entries, as those of installed plug-ins. Each is called once in a process,
-            when a name is not found in a table for the first time; the name is then looked up again.
+        on_missing: Functions that may add entries, such as loaders of installed plug-ins. Each is called once per
+            process, when a registry first lacks a name; then the name is looked up again.
     """
 
     on_missing: ClassVar[list[Callable[[], None]]] = []
@@ -116,14 +116,13 @@ class Registry(Generic[T]):
 
 
 def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> None:
-    """Check options against the signature of the constructor that they are for.
+    """Check options against the signature of their constructor.
 
     Args:
-        given: How many parameters are passed by position beside the options.
+        given: Number of positional arguments passed in addition to the options.
 
     Raises:
-        InputError: an option that `constructor` does not take by keyword, one that it cannot do without, or a value
-            that its annotation does not allow.
+        InputError: an unknown option, a missing option, or a value that the annotation does not allow.
     """
     if not isinstance(options, Mapping):
         raise InputError(f"{what} must be a group of keys, found {options!r}.")
@@ -144,10 +143,10 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
 
 
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
-    """The options that a constructor takes by keyword, with their defaults; `MISSING` for one without a default.
+    """Keyword options of a constructor with their defaults; `MISSING` for an option without a default.
 
     Args:
-        given: How many parameters are passed by position beside the options.
+        given: Number of positional arguments passed in addition to the options.
     """
     options = _by_keyword(_parameters(constructor)[given:])
     defaults = {name: MISSING if p.default is p.empty else p.default for name, p in options.items()}
@@ -163,7 +162,7 @@ def _by_keyword(parameters: Sequence[inspect.Parameter]) -> dict[str, inspect.Pa
 
 
 def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
-    """A constructor's parameters; where a class takes `**options` for its base class, those of the base too."""
+    """Parameters of a constructor; if a class passes `**options` to its base class, also those of the base."""
     parameters = list(inspect.signature(constructor).parameters.values())
     if parameters and parameters[0].name == "self":  # a decorated __init__
         parameters = parameters[1:]
@@ -192,7 +191,7 @@ PLAIN: dict[Any, Check] = {
 
 
 def _wanted(annotation: Any) -> list[Check]:
-    """The checks of an annotation, any of which may hold; none where it cannot be checked."""
+    """Alternative checks of an annotation; empty if it cannot be checked."""
     origin = get_origin(annotation)
     if origin is Annotated:
         checks = _wanted(get_args(annotation)[0])
@@ -200,10 +199,10 @@ def _wanted(annotation: Any) -> list[Check]:
             checks = [_bounded(check, bound) for check in checks] if isinstance(bound, Bound) else checks
         return checks
     if origin is Literal:
-        known = get_args(annotation)
-        return [(" or ".join(map(repr, known)), lambda v: any(type(v) is type(one) and v == one for one in known))]
+        values = get_args(annotation)
+        return [(" or ".join(map(repr, values)), lambda v: any(type(v) is type(x) and v == x for x in values))]
     if origin in (Union, UnionType):
-        alternatives = [_wanted(one) for one in get_args(annotation)]
+        alternatives = [_wanted(alternative) for alternative in get_args(annotation)]
         return [check for checks in alternatives for check in checks] if all(alternatives) else []
     check = PLAIN.get(origin or annotation)
     if check is LIST and get_args(annotation):
@@ -216,7 +215,7 @@ def _bounded(check: Check, bound: Bound) -> Check:
 
 
 def _list_of(element: Any, *others: Any, counted: bool) -> Check:
-    """A list of one kind of element; a tuple has as many as its annotation, if that does not end in `...`."""
+    """Check of a list with one type of element; a tuple without `...` also has a fixed length."""
     checks = _wanted(element)
     size = 1 + len(others) if counted and Ellipsis not in others else None
     words = "a list" if size is None else f"a list of {size}"
@@ -224,7 +223,7 @@ def _list_of(element: Any, *others: Any, counted: bool) -> Check:
         words += f", each {' or '.join(word for word, _ in checks)}"
 
     def fits(value: Any) -> bool:
-        whole = LIST[1](value) and size in (None, len(value))
-        return whole and all(not checks or any(fit(one) for _, fit in checks) for one in value)
+        right_size = LIST[1](value) and size in (None, len(value))
+        return right_size and all(not checks or any(fit(item) for _, fit in checks) for item in value)
 
     return words, fits

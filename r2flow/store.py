@@ -1,13 +1,13 @@
-"""Folders of numbered items, made once by any number of processes and attempts.
+"""Stores: folders of numbered items, written by any number of processes and resumable.
 
     store = Store(folder, "scans", recipe)
-    store.begin()                                    # takes the folder, or refuses one of another recipe
+    store.begin()                                    # claims the folder, or refuses one with another recipe
     store.make(store.missing(range(9)), work, 4)     # work(i) calls store.write(i, tensors, notes)
     tensors, notes = store.read(3)
 
-What an item is depends on the recipe and on its number alone: two processes that make the same item write the same
-bytes. `manifest.json` holds the recipe; an item is a safetensors file with the digest of the recipe and a checksum.
-Every file is written under a temporary name and renamed when it is whole, so that a killed command resumes.
+An item depends only on the recipe and on its number: two processes that make the same item write the same bytes.
+`manifest.json` stores the recipe; an item is a safetensors file with the digest of the recipe and a checksum. Files are
+written under a temporary name and renamed when complete, so that a killed command can resume.
 """
 
 import hashlib
@@ -38,24 +38,24 @@ from r2flow.signals import end_with_parent, out_of_reach
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
-STALE = 3600  # seconds after which a temporary file has no writer any more
-PATIENCE = 0.2  # seconds between two looks at what other processes make
-QUIET = 20.0  # seconds of waiting after which a line says for whom
+STALE = 3600  # seconds after which a temporary file counts as abandoned
+PATIENCE = 0.2  # seconds between polls of items that other processes make
+QUIET = 20.0  # seconds of waiting before a log message
 
-Advance = Callable[[int], None]  # called with the number of each item that is done
+Advance = Callable[[int], None]  # called with the number of each finished item
 
 
 class Damaged(Exception):
-    """A file that is not what was written."""
+    """A file differs from what was written."""
 
 
 class Store:
     """A folder of items of one kind and one recipe.
 
     Args:
-        kind: Names the files, `KIND-000003.safetensors`, and the manifest's format, `r2flow KIND`.
-        recipe: All that the items depend on, as plain values.
-        option: How a user names another folder.
+        kind: Prefix of the files, `KIND-000003.safetensors`, and format in the manifest, `r2flow KIND`.
+        recipe: Everything that the items depend on, as plain values.
+        option: Option by which a user gives another folder, for messages.
     """
 
     def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any], option: str = "--out FOLDER") -> None:
@@ -68,10 +68,10 @@ class Store:
         return [self.folder / f"{self.kind}-{item:06d}.safetensors"]
 
     def check(self) -> bool:
-        """Whether the folder has been begun."""
+        """Whether the folder has a manifest; refuses a folder with another recipe or with scans."""
         if (self.folder / MANIFEST).is_file():
-            found = read_manifest(self.folder, self.kind)["recipe"]
-            if other := difference(found, self.described):
+            recipe = read_manifest(self.folder, self.kind)["recipe"]
+            if other := difference(recipe, self.described):
                 raise InputError(
                     f"{self.folder} holds other {self.kind}: {other}. Give the same settings, or another folder by "
                     f"{self.option}."
@@ -90,21 +90,21 @@ class Store:
             if not self.check():
                 self.write_manifest(**notes)
                 self.check()  # another process may have taken the folder in between
-            for left in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):  # of killed writers
+            for leftover in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):  # of killed writers
                 with suppress(FileNotFoundError):
-                    if time.time() - left.stat().st_mtime > STALE:
-                        left.unlink()
+                    if time.time() - leftover.stat().st_mtime > STALE:
+                        leftover.unlink()
         except PermissionError:
             raise InputError(f"{self.folder} cannot be written to; give another by {self.option}.") from None
 
     def write_manifest(self, **notes: Any) -> None:
-        """Write the manifest, over an earlier one: the recipe, and `notes`."""
+        """Write or overwrite the manifest: the recipe and `notes`."""
         content = {"format": f"r2flow {self.kind}", "recipe": self.described, **notes}
         with atomic_write(self.folder / MANIFEST, "w") as file:
             json.dump({**content, "checksum": checksum(content)}, file, indent=1)
 
     def has(self, item: int) -> bool:
-        """Whether an item is there; of its file only the head is read."""
+        """Whether an item exists; reads only the header of its file."""
         try:
             self.head(item)
         except (FileNotFoundError, Damaged):
@@ -112,11 +112,11 @@ class Store:
         return True
 
     def missing(self, items: Iterable[int]) -> list[int]:
-        """The items that have yet to be made."""
+        """The items that do not exist yet."""
         return [item for item in items if not self.has(item)]
 
     def write(self, item: int, tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> None:
-        """Keep an item: from here on it is not made again."""
+        """Write an item; it then counts as made."""
         note = {"recipe": self.digest, "item": item, "sha256": _digest(tensors, notes or {}), "notes": notes or {}}
         (path,) = self.files(item)
         if path.is_symlink() and not path.exists():
@@ -125,12 +125,12 @@ class Store:
             file.write(save(dict(tensors), metadata={"r2flow": json.dumps(note)}))
 
     def read(self, item: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The tensors and the notes of an item, every byte checked.
+        """Read tensors and notes of an item and verify its checksum.
 
         Raises:
             FileNotFoundError: the item is missing.
-            Damaged: it is not what was written.
-            InputError: it is of another recipe.
+            Damaged: the file is damaged.
+            InputError: the item has another recipe.
         """
         with self._opened(item) as (file, note):
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  not a mapping
@@ -139,7 +139,7 @@ class Store:
             return tensors, note["notes"]
 
     def head(self, item: int) -> dict[str, Any]:
-        """The notes of an item; raises as `read`."""
+        """Read the notes of an item; raises the exceptions of `read`."""
         with self._opened(item) as (_, note):
             notes: dict[str, Any] = note["notes"]
             return notes
@@ -166,7 +166,7 @@ class Store:
             raise Damaged(str(error)) from None
 
     def mend(self, items: Iterable[int], advance: Advance = lambda item: None) -> None:
-        """Read every byte of some items, and remove the damaged ones with a warning."""
+        """Verify some items, and delete the damaged ones with a warning."""
         for item in items:
             try:
                 self.read(item)
@@ -189,12 +189,12 @@ class Store:
         advance: Advance = lambda item: None,
         wait: bool = True,
     ) -> None:
-        """Make items, and wait for those that other commands make at the same time.
+        """Make items, and wait for items that other commands are making.
 
         Args:
-            work: Makes an item and writes it, in any process: it can be pickled.
-            workers: Number of processes; 1 makes the items in this one.
-            wait: Whether to wait; else those that other commands are making are left to them.
+            work: Makes and writes an item, in any process; must be picklable.
+            workers: Number of processes; 1: this process.
+            wait: Whether to wait for items that other commands are making; else skip them.
         """
         left, since = list(items), time.monotonic()
         while left:
@@ -211,7 +211,7 @@ class Store:
             else:
                 time.sleep(PATIENCE)
             if waiting and time.monotonic() - since > QUIET:
-                lock, since = self._lock(waiting[0]), math.inf  # said once
+                lock, since = self._lock(waiting[0]), math.inf  # log once
                 log.warning("%s: waiting for %s, which makes it", self.files(waiting[0])[0], _holder(lock))
             left = waiting
 
@@ -220,7 +220,7 @@ class Store:
             for item in items:
                 yield item, self.attempt(item, work)
             return
-        # Spawned, not forked: torch's threads do not survive a fork.
+        # Spawn, since torch's threads do not survive a fork.
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(min(workers, len(items)), context, _begin_worker, (self, work))
         try:
@@ -237,9 +237,9 @@ class Store:
             pool.shutdown(cancel_futures=True)
 
     def attempt(self, item: int, work: Callable[[int], None]) -> bool:
-        """Make an item unless it is there; False where another process is making it.
+        """Make an item unless it exists; False if another process is making it.
 
-        The lock ends with its process. It saves work alone: what two processes write for one item are the same bytes.
+        The lock ends with its process. It only saves work, since two processes write the same bytes for an item.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(self._lock(item), timeout=0)
@@ -257,7 +257,7 @@ class Store:
 
 
 class FileStore(Store):
-    """A store whose items are files of other formats, `000003.ENDING`: an item is there when all its files are."""
+    """A store whose items are files of other formats, `000003.ENDING`; an item exists if all of its files exist."""
 
     def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any], endings: Sequence[str]) -> None:
         super().__init__(folder, kind, recipe)
@@ -270,11 +270,11 @@ class FileStore(Store):
         return all(file.is_file() for file in self.files(item))
 
 
-_job: tuple[Store, Callable[[int], None]]  # of a worker process
+_job: tuple[Store, Callable[[int], None]]  # store and work of a worker process
 
 
 def _begin_worker(store: Store, work: Callable[[int], None]) -> None:
-    """Leave Ctrl-C to the parent process and end when it ends."""
+    """Ignore Ctrl-C in a worker, and end it with the parent process."""
     global _job
     _job = (store, work)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -287,20 +287,20 @@ def _attempt(item: int) -> bool:
 
 
 def _holder(lock: Path) -> str:
-    """Who holds a lock, by its number where Linux tells."""
+    """Name the process that holds a lock, by its PID on Linux."""
     with suppress(OSError):
         locks, inode = Path("/proc/locks").read_text(), lock.stat().st_ino
-        if found := re.search(rf" (\d+) \S+:{inode} ", locks):
-            return f"process {found[1]}"
+        if match := re.search(rf" (\d+) \S+:{inode} ", locks):
+            return f"process {match[1]}"
     return f"the process that holds {lock}"
 
 
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
-    """The manifest of a folder, checked."""
+    """Read and verify the manifest of a folder."""
     path = folder / MANIFEST
     try:
         content: dict[str, Any] = read_json(path)
-        found, _ = content["format"], content["recipe"]
+        format_name, _ = content["format"], content["recipe"]
         damaged = content.pop("checksum", None) != checksum(content)
     except FileNotFoundError:
         raise
@@ -308,18 +308,18 @@ def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
         damaged = True
     if damaged:
         raise InputError(f"{path} is damaged. Delete {folder} and make it again.")
-    if kind is not None and found != f"r2flow {kind}":
-        raise InputError(f"{folder} holds {found.removeprefix('r2flow ')}, not {kind}; give another folder.")
+    if kind is not None and format_name != f"r2flow {kind}":
+        raise InputError(f"{folder} holds {format_name.removeprefix('r2flow ')}, not {kind}; give another folder.")
     return content
 
 
 def checksum(content: Any) -> str:
-    """SHA-256 of what can be written as JSON."""
+    """SHA-256 of a JSON-serialisable value."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str | None:
-    """The first setting that differs, in words; None where all are equal."""
+    """Describe the first setting that differs; None if all are equal."""
     for key in {**there, **here}:
         old, new = there.get(key), here.get(key)
         if old == new:

@@ -1,11 +1,11 @@
-"""The front door: what a config describes is built, and fitted.
+"""Training API: build and fit what a config describes.
 
     from r2flow.training import build, compose, fit
 
     result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
     result.metrics["val/loss"], result.checkpoint
 
-The same command again, and the same config, resume from the last checkpoint.
+The same command, or the same config, resumes from the last checkpoint.
 """
 
 import logging
@@ -47,7 +47,7 @@ __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
 
 log = logging.getLogger("r2flow")
 
-# Of Lightning, and about what is meant here.
+# Warnings of Lightning about intended choices.
 EXPECTED_WARNINGS = (
     ".*does not have many workers.*",
     "Total length of .list. across ranks is zero.*",
@@ -60,20 +60,20 @@ EXPECTED_WARNINGS = (
 )
 
 
-# What gloo and NCCL say when the process at the other end has ended.
+# Errors of gloo and NCCL after a peer process has ended.
 PEER_LOST = r"(?i)connection (closed|reset)|remote process exited|gloo.*(timed out|read error|write error)|NCCL"
 
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """What is drawn when a run is done."""
+    """Samples drawn at the end of a run."""
 
     num: Natural = 4
 
 
 @dataclass(frozen=True)
 class TrainerRanges:
-    """Values of Lightning's Trainer with which a run can come to its end, where Lightning itself takes others."""
+    """Ranges of options of Lightning's Trainer that r2flow's runs support; Lightning itself accepts more."""
 
     max_steps: Annotated[int, Bound("of 1 to 10^15", lambda n: 1 <= n <= 10**15)]
     min_steps: Natural | None
@@ -94,13 +94,13 @@ class TrainerRanges:
 
 @dataclass
 class Run:
-    """What a config describes, ready to be fitted.
+    """A run, ready to be fitted.
 
     Attributes:
-        config: The whole of it, completed by what the parent and the data say.
-        stage: The LightningModule, with its first weights.
-        data: The DataModule; nothing has been read yet.
-        trainer: Lightning's, with callbacks and loggers.
+        config: The complete config, including values from the parent and the data.
+        stage: The LightningModule, with initial weights.
+        data: The DataModule; no scans have been read yet.
+        trainer: Lightning's Trainer, with callbacks and loggers.
     """
 
     config: dict[str, Any]
@@ -110,20 +110,20 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """Where config, checkpoints, logs and samples go."""
+        """Folder of config, checkpoints, logs and samples."""
         return Path(self.config["run_dir"])
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a run has come to.
+    """Result of a run.
 
     Attributes:
         metrics: The last logged value of each metric, as `train/loss`.
-        checkpoint: The last one, or None where none is kept.
-        folder: The run's.
-        step: Optimiser steps taken in all.
-        finished: Whether these are all that were asked for; `trainer.max_time` can end a run before.
+        checkpoint: The last checkpoint, or None.
+        folder: The run's folder.
+        step: Total number of optimiser steps.
+        finished: Whether `trainer.max_steps` was reached; `trainer.max_time` can stop a run earlier.
     """
 
     metrics: dict[str, float]
@@ -134,15 +134,15 @@ class Result:
 
 
 def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
-    """Build what a config describes. What can be refused without reading scans is refused here.
+    """Build the run of a config, and refuse all errors that can be detected without reading scans.
 
     Args:
-        config: As of `compose`.
-        asked: What the command line gave: a run that starts from another refuses what contradicts its parent only where
-            it was asked for, and else takes the parent's.
+        config: As returned by `compose`.
+        asked: Overrides of the command line: only these are refused if they contradict the parent; other keys take the
+            parent's values.
 
     Raises:
-        InputError: a value that cannot be used, an unknown name or option, a parent that is not there or not finished.
+        InputError: an invalid value, an unknown name or option, a parent that is missing or not finished.
     """
     check_keys(config)
     with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
@@ -161,21 +161,21 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
 
 
 def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
-    """Build a run of which nothing is kept: weights on the meta device, no scan read, nothing written.
+    """Check a config by building its run with weights on the meta device; no scans are read, no files written.
 
     Args:
-        parent: The run that it is to start from, where that has not been trained yet.
+        parent: The parent, if it has not been trained yet.
 
     Returns:
-        The config, completed by what its parent says.
+        The config, completed with values of its parent.
     """
     check_keys(config)
     if parent is None:
-        found = find_parent(config)
-        parent = found and found[0]
+        parent_checkpoint = find_parent(config)
+        parent = parent_checkpoint and parent_checkpoint[0]
     config = _checked(config, asked, parent)
     if config["encoding"].get("reflectance", AUTO) == AUTO:
-        config["encoding"]["reflectance"] = True  # the scans will tell
+        config["encoding"]["reflectance"] = True  # decided when the scans are read
     with torch.device("meta"):
         generator = build_generator(config)
     run = _assembled(config, generator)
@@ -184,7 +184,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
 
 
 def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
-    """The config, completed by what its parent says, after what can be told of it alone."""
+    """Check a config and complete it with values of its parent."""
     check_trainer(config["trainer"])
     check_options("samples", SampleOptions, config["samples"])
     with made_with(parent.config if parent else {}, "the run that it starts from"):
@@ -199,31 +199,31 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
 
 
 def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
-    """Refuse what the set of scans under this key would pass over in silence."""
-    name, usual = data.get("name"), {**asdict(SourceOptions()), **resolve({})}
-    every = usual.keys() - {"name"}
+    """Refuse options that the set of scans under this key would ignore."""
+    name, defaults = data.get("name"), {**asdict(SourceOptions()), **resolve({})}
+    options = defaults.keys() - {"name"}
     if name == SIMULATED:
-        what, unread = "simulated scans are not files (data=folder for yours)", every - {"scenes"}
+        what, unread = "simulated scans are not files (data=folder for yours)", options - {"scenes"}
     elif name == PAIRS:
-        what, unread = "pairs are drawn, not read", every - {"root", "reading"}
+        what, unread = "pairs are drawn, not read", options - {"root", "reading"}
     elif name == MIXED:
         what, unread = "each of data.parts has its own", {"split", "drives"}
     elif name is not None and isinstance(SOURCES[name], Layout | Prepared):
         what, unread = "scans in files are no simulated scenes", {"scenes"}
     else:
         return
-    wrong = sorted(f"{key}.{one}" for one in unread if data.get(one, usual[one]) != usual[one])
+    wrong = sorted(f"{key}.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option])
     if wrong:
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 
 
 def _assembled(config: dict[str, Any], generator: Generator) -> Run:
     space = generator.space
-    if not hasattr(generator, "backbone"):  # its network is of its own kind
+    if not hasattr(generator, "backbone"):  # the system has its own network
         config["backbone"] = None
     data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
     if data.pairs is not None:
-        data.pairs.recipe(data.encoding.shape, data.noise_shape)  # refuses what is out of its range
+        data.pairs.recipe(data.encoding.shape, data.noise_shape)  # refuses values out of range
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
     data.further = stage.further
@@ -236,7 +236,7 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     options = dict(config["trainer"])
     check_options("trainer", L.Trainer, options)
     if options["accelerator"] == "auto" and not torch.cuda.is_available():
-        options["accelerator"] = "cpu"  # Lightning would take Apple's GPU, which has no float64
+        options["accelerator"] = "cpu"  # Lightning would choose Apple's GPU, which lacks float64
     if not stage.automatic_optimization:  # Lightning leaves these two to the stage
         if options["accumulate_grad_batches"] != 1:
             name = config["stage"]["name"]
@@ -252,7 +252,7 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
 
 
 def check_trainer(options: Mapping[str, Any]) -> None:
-    """Refuse what Lightning would change in silence or end in a traceback."""
+    """Refuse options that Lightning would change silently or answer with a traceback."""
     check_options("trainer", TrainerRanges, {f.name: options.get(f.name) for f in fields(TrainerRanges)})
     if str(options["precision"]) in ("16-true", "bf16-true"):
         raise InputError(
@@ -265,22 +265,22 @@ def check_trainer(options: Mapping[str, Any]) -> None:
     on_cpu = options["accelerator"] == "cpu" or (options["accelerator"] == "auto" and not gpu)
     if on_cpu and str(options["precision"]) in ("16-mixed", "16", "16-true"):
         raise InputError(
-            f"trainer.precision={options['precision']} does not exist on a CPU (Lightning would turn it into "
-            "bfloat16 in silence); use bf16-mixed or 32-true."
+            f"trainer.precision={options['precision']} is not available on a CPU (Lightning would silently use "
+            "bfloat16); use bf16-mixed or 32-true."
         )
 
 
 def fit(run: Run) -> Result:
-    """Train a run in its folder, from where it stopped, and draw its samples.
+    """Train a run in its folder, resuming from its last checkpoint, and draw its samples.
 
-    SIGTERM and Ctrl-C end it after the step that it is in, with a checkpoint; before the first step, at once.
+    SIGTERM and Ctrl-C stop it after the current step, with a checkpoint; before the first step, at once.
 
     Raises:
-        InputError: scans that cannot be read, another run in its folder, weights no longer finite, a full disk.
-        r2flow.signals.Stopped: it was told to stop.
+        InputError: unreadable scans, another run in its folder, non-finite weights, a full disk.
+        r2flow.signals.Stopped: a stop signal was received.
     """
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
-    stopping = next((one for one in callbacks if isinstance(one, Stopping)), Stopping(run.folder))
+    stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping(run.folder))
     with stopping.listening(), _quiet():
         run.data.setup()
         run.config["scans"] = run.data.fingerprint()
@@ -292,21 +292,21 @@ def fit(run: Run) -> Result:
             step = _fit_in_folder(run)
             if run.trainer.is_global_zero:
                 device = run.trainer.strategy.root_device
-                drawn_on = str(device) if device.type == "cuda" else "cpu"
-                finish(run.folder, run.config["samples"], run.config["seed"], drawn_on, run.trainer.max_steps,
+                sampling_device = str(device) if device.type == "cuda" else "cpu"
+                finish(run.folder, run.config["samples"], run.config["seed"], sampling_device, run.trainer.max_steps,
                        kept=bool(run.trainer.checkpoint_callbacks))  # fmt: skip
                 log_figures(run.trainer.loggers, run.folder, step)
     return _result(run, step, finished=step >= run.trainer.max_steps)
 
 
 def _fit_in_folder(run: Run) -> int:
-    """The step that the run has reached."""
+    """Fit a run in its folder; returns the step reached."""
     last = open_run(run.folder, run.config, run.stage.state_dict())
     if last is not None and step_of(last) >= run.trainer.max_steps:
         if run.trainer.is_global_zero:
-            further = as_override("stage.init", run.folder)
-            print(f"finished before, at step {step_of(last)}; to learn more: {further} name=OTHER")
-        return step_of(last)  # nothing is left to do, nor pairs to make
+            init = as_override("stage.init", run.folder)
+            print(f"finished before, at step {step_of(last)}; to learn more: {init} name=OTHER")
+        return step_of(last)  # no training, no pairs
     if last is not None:
         log.info("resuming from %s", last)
     if run.trainer.is_global_zero:
@@ -328,14 +328,14 @@ def _result(run: Run, step: int, finished: bool) -> Result:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Leave out what Lightning says of choices that are meant."""
-    talk = logging.getLogger("lightning.pytorch.utilities.rank_zero")
-    level = talk.level
-    talk.setLevel(logging.WARNING)
+    """Suppress Lightning's messages and warnings about intended choices."""
+    logger = logging.getLogger("lightning.pytorch.utilities.rank_zero")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
     try:
         with warnings.catch_warnings():
             for message in EXPECTED_WARNINGS:
                 warnings.filterwarnings("ignore", message=message)
             yield
     finally:
-        talk.setLevel(level)
+        logger.setLevel(level)
