@@ -255,7 +255,7 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     from r2flow.runs.chain import is_finished, is_reported, links_of, record_report, run_chain
 
     if settings["trainer"]["fast_dev_run"]:
-        raise InputError("a chain's links start from earlier runs, which trainer.fast_dev_run does not write.")
+        raise InputError("a chain's links start from earlier runs, and trainer.fast_dev_run leaves none.")
     folder = Path(settings["run_dir"])
     links = links_of(settings["chain"], folder, given)
     if not all(map(is_finished, links)):
