@@ -176,11 +176,9 @@ def _resumable(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
             log.warning("%s cannot be resumed: it has no %s. Passing it over.", path, lacking[0])
 
 
-def _fitting(
-    run: str | Path, candidates: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None
-) -> Path:
+def _fitting(run: str | Path, saved: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None) -> Path:
     """The first checkpoint whose weights have the names and shapes of `state`."""
-    for path, content in candidates:
+    for path, content in saved:
         if state is None:
             return path
         shapes = {name: getattr(value, "shape", None) for name, value in content["state_dict"].items()}

@@ -76,9 +76,8 @@ class LearnFlowMap(Reflow):
         diagonal = t == s
         paths, u_ts = paths_of(batch), self.generator.map(self.condition(batch))
         if self.training:
-            exact = diagonal | (
-                self.on_pairs & (s - t == 1)
-            )  # with independent noise, x_1 is not the end of x_0's path
+            # With independent noise, x_1 is not the end of x_0's path.
+            exact = diagonal | (self.on_pairs & (s - t == 1))
             rho = torch.where(exact, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
             aim = self.objective(u_ts, paths, t, torch.where(diagonal, t, s), rho)
         else:  # the same validation loss for all objectives

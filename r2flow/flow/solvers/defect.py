@@ -57,10 +57,8 @@ class Tried(NamedTuple):
     def at(self, theta: np.ndarray) -> tuple[Tensor, Tensor]:
         """State and slope of the interpolant at theta in [0, 1] of the step, for every scene."""
         state, slope = (torch.from_numpy(w).to(self.x.device, self.x.dtype) for w in self.method.interpolant(theta))
-        displacement, slope = (
-            weighted([expand_time(w, self.x) for w in weights], self.k) for weights in (state, slope)
-        )
-        return torch.addcmul(self.x, displacement, expand_time(self.h, self.x)), slope
+        shift, slope = (weighted([expand_time(w, self.x) for w in weights], self.k) for weights in (state, slope))
+        return torch.addcmul(self.x, shift, expand_time(self.h, self.x)), slope
 
     def changes(self, *differences: Tensor) -> np.ndarray:
         """Norms of h times differences of velocities, in tolerances, (N, B)."""

@@ -53,11 +53,9 @@ class Solution:
         converged: PerScene,
     ) -> "Solution":
         """A solution from values per scene, or single values for all scenes."""
-        batch = len(x)
-        counts = [
-            torch.from_numpy(np.broadcast_to(n, batch).astype(np.int64)) for n in (evaluations, accepted, rejected)
-        ]
-        flags = [torch.from_numpy(np.broadcast_to(flag, batch).astype(bool)) for flag in (stiff, converged)]
+        B = len(x)
+        counts = [torch.from_numpy(np.broadcast_to(n, B).astype(np.int64)) for n in (evaluations, accepted, rejected)]
+        flags = [torch.from_numpy(np.broadcast_to(flag, B).astype(bool)) for flag in (stiff, converged)]
         return cls(x, *counts, *flags)
 
 

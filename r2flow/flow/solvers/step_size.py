@@ -36,24 +36,21 @@ class StepController:
         self.longest = limits.max_step * self.length
         self.eps = eps
         self.scenes, self.places = scenes, np.arange(len(scenes))
-        count = len(scenes)
-        self.reached, self.h, self.grow = np.zeros(count), np.full(count, self.length), np.full(count, method.grow)
-        self.last_error = np.full(count, 1e-4)  # dopri5.f
-        self.stiff_run, self.smooth_run = np.zeros(count, int), np.zeros(count, int)
-        self.oscillating_run, self.calm_run = np.zeros(count, int), np.zeros(count, int)
-        self.arrived, self.leaving = np.zeros(count, bool), np.zeros(count, bool)
-        self.accepted, self.rejected = np.zeros(count, int), np.zeros(count, int)
-        self.stiff, self.converged, self.times = np.zeros(count, bool), np.zeros(count, bool), np.full(count, t_0)
+        n = len(scenes)
+        self.reached, self.h, self.grow = np.zeros(n), np.full(n, self.length), np.full(n, method.grow)
+        self.last_error = np.full(n, 1e-4)  # dopri5.f
+        self.stiff_run, self.smooth_run = np.zeros(n, int), np.zeros(n, int)
+        self.oscillating_run, self.calm_run = np.zeros(n, int), np.zeros(n, int)
+        self.arrived, self.leaving = np.zeros(n, bool), np.zeros(n, bool)
+        self.accepted, self.rejected = np.zeros(n, int), np.zeros(n, int)
+        self.stiff, self.converged, self.times = np.zeros(n, bool), np.zeros(n, bool), np.full(n, t_0)
         # A jump of the velocity: its bracket, as lengths from t_0, and the step size after it.
-        self.begin, self.end, self.resume = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
-        self.crossing = np.zeros(count, bool)
-        self.roughness, self.rough = (
-            np.zeros(count),
-            np.full(count, np.nan),
-        )  # third difference; of the last step, over h^4
-        self.troubled = np.zeros(count, int)  # steps for which a rejection is remembered
-        self.decades = np.zeros(count, int)  # of the length of short steps that moved x far: one bit per power of ten
-        self.factor = np.full(count, np.inf)  # from a rejected step to the next one
+        self.begin, self.end, self.resume = np.full(n, np.inf), np.full(n, np.inf), np.zeros(n)
+        self.crossing = np.zeros(n, bool)
+        self.roughness, self.rough = np.zeros(n), np.full(n, np.nan)  # third difference; of the last step, over h^4
+        self.troubled = np.zeros(n, int)  # steps for which a rejection is remembered
+        self.decades = np.zeros(n, int)  # of the length of short steps that moved x far: one bit per power of ten
+        self.factor = np.full(n, np.inf)  # from a rejected step to the next one
 
     def time(self, reached: np.ndarray) -> np.ndarray:
         """t at a length from t_0, clipped to the interval."""
