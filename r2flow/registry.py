@@ -73,9 +73,9 @@ class Registry(Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         if name not in self:
-            known = ", ".join(sorted(self))
+            names = ", ".join(sorted(self))
             hint = did_you_mean(str(name), list(self))
-            raise UnknownName(f"no {self.kind} named {name!r}; known: {known}.{hint}")
+            raise UnknownName(f"no {self.kind} named {name!r}; known: {names}.{hint}")
         entry = self._entries[name]
         if isinstance(entry, _Lazy):
             entry = self._entries[name] = getattr(importlib.import_module(entry.module), entry.name)
@@ -104,8 +104,8 @@ class Registry(Generic[T]):
     def build(self, options: Mapping[str, Any], *args: Any) -> Any:
         """Call the entry `options["name"]` with `args` and the remaining options as keywords."""
         if not isinstance(options, Mapping) or "name" not in options:
-            known = ", ".join(sorted(self._entries))
-            raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {known}.")
+            names = ", ".join(sorted(self._entries))
+            raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {names}.")
         chosen = dict(options)
         name = chosen.pop("name")
         constructor = self[name]
@@ -129,15 +129,15 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
     parameters = _parameters(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
-    known = _by_keyword(parameters[given:])
+    keywords = _by_keyword(parameters[given:])
     for key, value in options.items():
-        if key not in known:
-            hint = did_you_mean(key, known)
-            raise InputError(f"{what} has no option {key!r}; it knows: {', '.join(known) or 'none'}.{hint}")
-        wanted = _wanted(known[key].annotation)
+        if key not in keywords:
+            hint = did_you_mean(key, keywords)
+            raise InputError(f"{what} has no option {key!r}; it knows: {', '.join(keywords) or 'none'}.{hint}")
+        wanted = _wanted(keywords[key].annotation)
         if wanted and not any(fits(value) for _, fits in wanted):
             raise InputError(f"{what}: {key} must be {' or '.join(word for word, _ in wanted)}, found {value!r}.")
-    for key, parameter in known.items():
+    for key, parameter in keywords.items():
         if parameter.default is parameter.empty and key not in options:
             raise InputError(f"{what} needs the option {key!r}.")
 
@@ -168,9 +168,9 @@ def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
         parameters = parameters[1:]
     passes_on = any(p.kind is p.VAR_KEYWORD for p in parameters)
     if passes_on and inspect.isclass(constructor) and constructor.__bases__[0] is not object:
-        own = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
-        names = {p.name for p in own}
-        return own + [p for p in _parameters(constructor.__bases__[0]) if p.name not in names]
+        direct = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
+        names = {p.name for p in direct}
+        return direct + [p for p in _parameters(constructor.__bases__[0]) if p.name not in names]
     return parameters
 
 

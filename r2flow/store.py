@@ -46,7 +46,7 @@ Advance = Callable[[int], None]  # called with the number of each finished item
 
 
 class Damaged(Exception):
-    """A file differs from what was written."""
+    """A file does not have the content that was written."""
 
 
 class Store:

@@ -62,9 +62,9 @@ class Paths:
     def mean_velocity(self, t: Tensor, s: Tensor) -> Tensor:
         """(x_s - x_t) / (s - t), (B, ...); the velocity where s = t."""
         between = self.at(s) - self.at(t)
-        apart = s != t
-        mean = between / expand_time(torch.where(apart, s - t, 1), between)
-        return mean if bool(apart.all()) else torch.where(expand_time(apart, mean), mean, self.velocity(t))
+        differ = s != t
+        mean = between / expand_time(torch.where(differ, s - t, 1), between)
+        return mean if bool(differ.all()) else torch.where(expand_time(differ, mean), mean, self.velocity(t))
 
     def _weights(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Index of the first of n nearest knots, (B,), and the knots' weights in x_t and in dx_t / dt, (B, n) each."""

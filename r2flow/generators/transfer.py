@@ -215,10 +215,10 @@ class TransferFlow(Flow):
         about = Surroundings.of(self.space, condition, True, steps)
         rows = self.rows(elevations, steps, steps.new_full((len(image),), self.numbered).bool())
         start = about.start + self.sigma * (known < 1) * noise.to(weight)
-        made = super().forward(start, {**condition, **about._asdict(), "rows": rows}, **how)
+        generated = super().forward(start, {**condition, **about._asdict(), "rows": rows}, **how)
         nothing = encoded(self.space, torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1]))
-        x = torch.where(_within_reach(known[:, :1]), made.x.to(image), nothing)
-        return replace(made, x=torch.where(known > 0, image, x))
+        x = torch.where(_within_reach(known[:, :1]), generated.x.to(image), nothing)
+        return replace(generated, x=torch.where(known > 0, image, x))
 
     def loss(
         self, x_1: Tensor, condition: Condition, t: Tensor, noise: Tensor, steps: Tensor, rows: Tensor

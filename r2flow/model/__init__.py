@@ -1,1 +1,1 @@
-"""Trained models: checkpoints, and what is done with them."""
+"""Trained models: checkpoints, sampling, completion, export and the Hub."""

@@ -225,7 +225,7 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         reason = (str(error).splitlines() or [""])[0][:160]
         raise InputError(
             f"{path} cannot be used: its content is not what r2flow writes ({type(error).__name__}: "
-            f"{reason}). Is it of another program, or damaged?"
+            f"{reason}). Is it from another program, or damaged?"
         ) from error
     return replace(checkpoint, generator=checkpoint.generator.to(device))
 
@@ -235,9 +235,9 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     published = format_of(content)
     if published is not None:
         with garbled(path):
-            made = published.read(content, path, averaged)
-        config, weights, step, kind = made.config, made.weights, made.step, "published"
-        drawing: Mapping[str, Any] = {"sampler": made.sampler}
+            converted = published.read(content, path, averaged)
+        config, weights, step, kind = converted.config, converted.weights, converted.step, "published"
+        drawing: Mapping[str, Any] = {"sampler": converted.sampler}
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:
         state: Any = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
@@ -250,7 +250,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         systems = ", ".join(known.system for _, known in FORMATS.items())
         raise InputError(
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
-            f"(ours) nor the layout of a published one ({systems}); found {', '.join(map(repr, list(content)[:6]))}."
+            f"(ours) nor a published layout ({systems}); found {', '.join(map(repr, list(content)[:6]))}."
         )
     else:
         raise InputError(_not_a_checkpoint(path, Path(path).stat().st_size))
@@ -262,8 +262,8 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         few = drawing.get("few")
         with made_with(config, str(path)):
             generator.run_by(build_sampler(drawing["sampler"]), few and build_sampler(few), bool(drawing.get("fixed")))
-    if published is not None and made.finish is not None:
-        made.finish(generator, config)
+    if published is not None and converted.finish is not None:
+        converted.finish(generator, config)
     return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind)
 
 

@@ -57,13 +57,13 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # if the extra is not i
 
     @classmethod
     def _from_pretrained(cls, *, model_id: str, device: str = "cpu", **where: Any) -> "HubFlow":
-        known = ("revision", "cache_dir", "force_download", "local_files_only", "token")
+        options = ("revision", "cache_dir", "force_download", "local_files_only", "token")
         older = "proxies", "resume_download"  # passed by the mixin of older versions
-        unknown = [key for key in where if key not in (*known, *older)]
+        unknown = [key for key in where if key not in (*options, *older)]
         if unknown:
             raise InputError(
-                f"HubFlow.from_pretrained does not know {', '.join(unknown)}; it takes device, {', '.join(known)}."
+                f"HubFlow.from_pretrained does not know {', '.join(unknown)}; it takes device, {', '.join(options)}."
             )
         if Path(model_id).is_dir():
             return cls(Path(model_id, FILE), device)
-        return cls(hf_hub_download(model_id, FILE, **{key: where[key] for key in known if key in where}), device)
+        return cls(hf_hub_download(model_id, FILE, **{key: where[key] for key in options if key in where}), device)

@@ -220,9 +220,9 @@ def explain(error: Exception) -> str:
     choice = re.search(r"Could not find '([^/']+)/([^']+)'", text)
     if choice:
         group, name = choice.groups()
-        known = choices(group)
+        names = choices(group)
         hint = f" For your own configs give --config-dir FOLDER, with FOLDER/{group}/NAME.yaml."
-        return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known) or hint}"
+        return f"no {group} config named '{name}'; known: {', '.join(names)}.{did_you_mean(name, names) or hint}"
     several = re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
     if several:
         key, values = several.groups()

@@ -119,8 +119,8 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
         samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]
         if samplers and step_of(last) >= config["trainer"]["max_steps"]:
             raise InputError(
-                f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Leave it as it was, and draw by "
-                f"another with r2flow sample {run} --sampler NAME --steps N."
+                f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the setting, and draw with "
+                f"another sampler by r2flow sample {run} --sampler NAME --steps N."
             )
     if old != dict(config) or not Path(run, CONFIG).is_file():  # free keys may have changed
         write_config(run, config)
@@ -137,9 +137,9 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     if old is None or not checkpoints_of(run):
         return
     later = ("scans", "parent", "encoding.reflectance", "encoding.levels", "data.pairs.parent")
-    known = [{k: v for k, v in flatten(side) if not f"{k}.".startswith(tuple(f"{group}." for group in later))}
-             for side in (old, config)]  # fmt: skip
-    differing = contradictions(*known)
+    compared = [{k: v for k, v in flatten(side) if not f"{k}.".startswith(tuple(f"{group}." for group in later))}
+                for side in (old, config)]  # fmt: skip
+    differing = contradictions(*compared)
     if differing:
         raise InputError(_another_config(run, differing))
 

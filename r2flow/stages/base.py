@@ -67,8 +67,8 @@ class Stage(L.LightningModule):
         seed: int = 0,
     ) -> None:
         if not isinstance(generator, self.learns):
-            wanted, found = self.learns.__name__, type(generator).__name__
-            raise InputError(f"{type(self).__name__} learns a {wanted}, found a {found}: give another stage.")
+            expected, actual = self.learns.__name__, type(generator).__name__
+            raise InputError(f"{type(self).__name__} learns a {expected}, found a {actual}: give another stage.")
         super().__init__()
         self.generator = generator
         self.learning_rate, self.betas, self.weight_decay = learning_rate, betas, weight_decay

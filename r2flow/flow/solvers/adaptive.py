@@ -79,9 +79,9 @@ def _step(
     with torch.no_grad():
         scale = torch.maximum(x.abs(), y.abs()).mul_(tolerance).add_(tolerance)
         error = weighted(method.error, k).mul_(expand_time(h, x)).div_(scale)
-        powers, dk, dy, whole = norms(powered(error), k[-1] - k[-2], y - previous_y, scale)
+        powers, dk, dy, distance = norms(powered(error), k[-1] - k[-2], y - previous_y, scale)
     size = unpowered(powers)
-    good = control.within(size, dk, dy, whole / tolerance)
+    good = control.within(size, dk, dy, distance / tolerance)
     good = inspect(v, control, Tried(method, x, y, k, h, scale), good)
     short = (good & (control.h < SHORT * control.length)).nonzero()[0]
     control.judge(good, size, dk, dy, v.counts[control.scenes])

@@ -163,9 +163,9 @@ class _Scene:
         combinations = [krylov.combination(1, share * signed) for share in (0.5, 1.0)]
         remainders = []
         for share, y in zip((0.5, 1.0), combinations, strict=True):
-            moved, linear = krylov.vector(y)[:-1], krylov.image(y)[:-1]
-            found = self.velocity(self.t + share * signed, self.u + share * signed * moved)
-            remainders.append(found - f - share * signed * linear)
+            offset, linear = krylov.vector(y)[:-1], krylov.image(y)[:-1]
+            v_moved = self.velocity(self.t + share * signed, self.u + share * signed * offset)
+            remainders.append(v_moved - f - share * signed * linear)
         end = self.u + signed * krylov.vector(combinations[1])[:-1]
         parts = ((3, 16 * remainders[0] - 2 * remainders[1]), (4, 12 * remainders[1] - 48 * remainders[0]))
         for order, start in parts:
