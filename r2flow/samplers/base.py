@@ -65,7 +65,7 @@ class Sampler(ABC):
 
     Attributes:
         draws: Whether the sampler is stochastic: it draws noise after x_0.
-        paired: Whether x_1 is a deterministic function of x_0, so that both can be a reflow pair.
+        paired: Whether x_1 depends on x_0 closely enough for a reflow pair (x_0, x_1).
         completes: Whether a condition is required.
         needs: Attribute that a generator must have.
     """

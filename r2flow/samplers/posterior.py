@@ -44,7 +44,7 @@ class Posterior(OnGrid):
         super().check(generator)
         if generator.told:
             kind = type(generator).__name__
-            raise InputError(f"sampler {self.name} needs an unconditional flow; complete with a {kind} by jump.")
+            raise InputError(f"sampler {self.name} needs an unconditional flow; for a {kind} give jump.")
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if condition is None:
