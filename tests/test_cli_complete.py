@@ -364,6 +364,17 @@ def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path
     assert "1 scans completed" in said
 
 
+def test_a_wrong_sensor_of_the_scans_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    sensor = SENSORS["os1_64"].resized(columns=128)
+    image = np.stack([np.full(sensor.shape, 9.0), np.full(sensor.shape, 0.5)]).astype(np.float32)
+    write_points(tmp_path / "points" / "0.ply", *image_to_points(image, sensor.rays()))
+    open_partial([str(tmp_path / "points")], Reading(sensor), sensor)
+    assert not caplog.text
+    open_partial([str(tmp_path / "points")], Reading(sensor), SENSORS["vlp16"])
+    assert "--from vlp16 does not fit" in caplog.text
+    assert "--from os1_64" in caplog.text
+
+
 def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
     sensor = SENSORS["vlp16"].resized(columns=64)
     image = np.stack([np.full(sensor.shape, 9.0), np.full(sensor.shape, 0.5)]).astype(np.float32)

@@ -5,6 +5,7 @@ scans[0].read()         image, state, xyz
 """
 
 import hashlib
+import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +31,8 @@ from r2flow.lidar.transfer import (
     rows_of,
     sensor_of,
 )
+
+log = logging.getLogger(__name__)
 
 FEWER = 0.9  # of the columns: a turn of fewer rays leaves pixels between them
 FEW = 4  # simulated scans, where nobody says how many
@@ -106,7 +109,10 @@ def _files(
     by_points = read_image
     if points := [path for path in paths if path not in images]:
         some = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
-        doubt = None if source else other_sensor(some, target)
+        doubt = other_sensor(some, source or target)
+        if source and doubt and not noted:
+            fits = f"; they fit --from {doubt.name}" if doubt.name else ""
+            log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         if not source and not doubt and target.name in SENSORS and SENSORS[target.name].shape[0] < target.shape[0]:
             source = SENSORS[target.name]  # its beams are fewer than the rows of the answers
         same = _same_view(source, target) if source else doubt is None
