@@ -1,4 +1,4 @@
-"""Networks v(t, x) and u(x, t, s), by name, and the configurations of them in conf/backbone."""
+"""Networks v(t, x) and u(x, t, s) by name, and their configurations in conf/backbone."""
 
 from collections.abc import Mapping
 from importlib.resources import files
@@ -27,35 +27,35 @@ def build_backbone(
     out_channels: int | None = None,
     second_time: bool = False,
 ) -> Backbone:
-    """The backbone `options["name"]` for images of `in_channels` channels seen along `rays` (2, H, W).
+    """Build the backbone `options["name"]` for images of `in_channels` channels along `rays`, (2, H, W).
 
     Args:
         options: `name` and keyword options of the constructor, as in conf/backbone/*.yaml.
         rays: Elevation and azimuth of every pixel in radians.
-        in_channels: Channels of the image, and of the condition that is concatenated to it.
-        out_channels: Channels of the answer; None for as many as come in.
+        in_channels: Channels of the image plus those of the condition concatenated to it.
+        out_channels: Channels of the output; None: `in_channels`.
         second_time: Whether the network takes a second time s.
 
     Raises:
-        InputError: an unknown name or option, or something that the backbone cannot take.
+        InputError: an unknown name or option, or a value that the backbone does not support.
     """
-    asked: dict[str, Any] = {"in_channels": in_channels}
+    arguments: dict[str, Any] = {"in_channels": in_channels}
     if out_channels is not None:
-        asked["out_channels"] = out_channels
+        arguments["out_channels"] = out_channels
     if second_time:
-        asked["second_time"] = True
-    return BACKBONES.build({**options, **asked}, rays)
+        arguments["second_time"] = True
+    return BACKBONES.build({**options, **arguments}, rays)
 
 
 def configurations() -> Registry[dict[str, Any]]:
-    """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of each backbone without such a file."""
+    """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of backbones without a file."""
     folder = files("r2flow") / "conf" / "backbone"
     written = sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
 
     def read(name: str) -> dict[str, Any]:
-        own = yaml.safe_load((folder / f"{name}.yaml").read_text())
-        bases = [read(base) for base in own.pop("defaults", []) if base != "_self_"]
-        return {key: value for part in (*bases, own) for key, value in part.items()}
+        options = yaml.safe_load((folder / f"{name}.yaml").read_text())
+        bases = [read(base) for base in options.pop("defaults", []) if base != "_self_"]
+        return {key: value for part in (*bases, options) for key, value in part.items()}
 
     defaults = {name: {"name": name} for name in BACKBONES}
     return Registry("backbone configuration", **{**defaults, **{name: read(name) for name in written}})

@@ -1,4 +1,4 @@
-"""ADM U-Net: residual blocks that resample, and a skip from each of them (Dhariwal and Nichol 2021)."""
+"""ADM U-Net: resampling residual blocks with a skip from each block (Dhariwal and Nichol 2021)."""
 
 from collections.abc import Iterable, Sequence
 from typing import cast
@@ -21,16 +21,16 @@ FILTER = (1, 1)
 
 
 class ADMUNet(UNet):
-    """A field by an ADM U-Net: each level has one more residual block on the way up than on the way down.
+    """ADM U-Net: each level has one more residual block in the decoder than in the encoder.
 
-    Every output on the way down, of the first convolution and of the resampling blocks too, is a skip; each block
-    on the way up takes one. The middle has attention too. For its options see `UNet`.
+    Every output of the encoder, including the first convolution and resampling blocks, is a skip of a decoder block.
+    The bottleneck also has attention. For the options see `UNet`.
     """
 
     def build_levels(
         self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
     ) -> None:
-        """`down_blocks`, `mid_blocks`, `up_blocks` and the last norm and convolution."""
+        """Build `down_blocks`, `mid_blocks`, `up_blocks` and the last norm and convolution."""
         deepest = self.levels - 1
         width, skips = base_channels, [base_channels]
         self.down_blocks = nn.ModuleList()
@@ -74,7 +74,7 @@ class ADMUNet(UNet):
 
 
 class ADMBlock(ResidualBlock):
-    """A residual block that may resample, the normed input and the skip alike, and attend last."""
+    """A residual block with optional resampling of the normalised input and the skip, and optional attention."""
 
     def __init__(
         self,

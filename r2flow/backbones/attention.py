@@ -1,14 +1,14 @@
-"""Neighbourhood attention on an azimuth ring: each token attends to the window around it.
+"""Neighbourhood attention on an azimuth ring: each token attends to a window around it.
 
-Azimuth wraps, so every window is centred. Elevation ends: at the top and bottom the window is moved inside,
-start = clamp(i - half, 0, H - rows), and always holds the same number of rows. On a ring narrower than the window
-a token appears more than once in it and counts as often, as in the published models.
+Azimuth is periodic, so every window is centred. At the top and bottom the window is shifted inside,
+start = clamp(i - half, 0, H - rows), and keeps its number of rows. On a ring narrower than the window, a token appears
+in it repeatedly, as in the published models.
 
-Backends, both of the same values and gradients:
-    tiles    blocks of queries against the keys around them: plain matrix products, on every device
+Backends, with equal values and gradients:
+    tiles    blocks of queries and the keys around them: plain matrix products, on all devices
     flex     flex_attention: CUDA
 
-"auto" takes flex for CUDA tensors that its kernels can take, outside torch.compile; else tiles.
+"auto" is flex for CUDA tensors that its kernels support, outside torch.compile; else tiles.
 """
 
 import functools
@@ -30,12 +30,12 @@ def neighbourhood_attention(
 ) -> Tensor:
     """softmax_{j in window(i)}(q_i . k_j) v_j.
 
-    The logits are not scaled: q and k come scaled.
+    The logits are not scaled: q and k must be scaled.
 
     Args:
         q, k, v: (B, H, W, N, D), N heads of D channels.
-        window: Rows and columns, both odd; clamped to the rows (and without wrap the columns) there are.
-        wrap: Whether the columns are a ring; if not, windows are moved inside as the rows' are.
+        window: Rows and columns, both odd; at most the rows (and without wrap the columns) of the map.
+        wrap: Whether the columns are a ring; if not, windows are shifted inside in both directions.
         backend: A name in `BACKENDS`, or "auto" (above).
 
     Returns:
@@ -49,13 +49,13 @@ def neighbourhood_attention(
 
 
 def check_window(window: Sequence[int]) -> None:
-    """Refuse a window without a middle."""
+    """Refuse windows of even size."""
     if any(size < 1 or size % 2 == 0 for size in window):
         raise InputError(f"the attention window must have odd sizes of at least 1, found {tuple(window)}.")
 
 
 class _Axis(NamedTuple):
-    """One axis of the map: `size` tokens, each of which sees `asked` of them, or all where there are fewer."""
+    """An axis of the map: `size` tokens, each of which attends to `asked` tokens, or to all if there are fewer."""
 
     size: int
     asked: int
@@ -66,13 +66,13 @@ class _Axis(NamedTuple):
         return self.asked if self.wrap else min(self.asked, self.size)
 
     def starts(self, tokens: Tensor) -> Tensor:
-        """First place that each token sees; on a ring modulo `size`."""
+        """First position of each token's window; on a ring modulo `size`."""
         first = tokens - self.asked // 2
         return first if self.wrap else first.clamp(0, self.size - self.span)
 
 
-GRAPHS = 64  # that torch.compile may make of flex_attention; its own limit of 8 is passed by three levels
-TILE = (4, 8)  # queries, whose keys are 6 x 16: smaller tiles copy more keys, larger ones compute more masked products
+GRAPHS = 64  # limit of torch.compile's graphs of flex_attention; three levels exceed its default of 8
+TILE = (4, 8)  # queries, with 6 x 16 keys: smaller tiles copy more keys, larger tiles compute more masked products
 
 
 def _tiles(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
@@ -98,13 +98,13 @@ def _tiles(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tens
 
 def _halo(x: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     """Keys of tiles, by rows (tiles_h, keys_h) and columns (tiles_w, keys_w): (B, tiles_h, tiles_w, N, keys, D)."""
-    for dim, places in ((1, rows), (3, columns)):
-        x = x.index_select(dim, places.flatten()).unflatten(dim, places.shape)
+    for dim, positions in ((1, rows), (3, columns)):
+        x = x.index_select(dim, positions.flatten()).unflatten(dim, positions.shape)
     return x.permute(0, 1, 3, 5, 2, 4, 6).flatten(4, 5)
 
 
 def _tile_keys(axis: _Axis, tile: int, device: torch.device) -> Tensor:
-    """Which places the queries of each tile see between them, (tiles, keys); modulo the size on a ring."""
+    """Positions of the keys of each tile's queries, (tiles, keys); modulo the size on a ring."""
     length = tile + axis.span - 1 if axis.wrap else min(tile + axis.span - 1, axis.size)
     starts = torch.arange(0, axis.size, tile, device=device) - axis.asked // 2
     if not axis.wrap:
@@ -113,22 +113,22 @@ def _tile_keys(axis: _Axis, tile: int, device: torch.device) -> Tensor:
 
 
 def _tile_mask(seen_h: Tensor, seen_w: Tensor, dtype: torch.dtype) -> Tensor:
-    """0 where a query sees a key, -inf elsewhere, (tiles_h, tiles_w or 1, 1, queries, keys)."""
+    """0 if the key is in the query's window, else -inf, (tiles_h, tiles_w or 1, 1, queries, keys)."""
     seen = seen_h[:, None, :, None, :, None] & seen_w[None, :, None, :, None, :]
     seen = seen.flatten(4, 5).flatten(2, 3).unsqueeze(2)
     return torch.zeros(seen.shape, dtype=dtype, device=seen.device).masked_fill_(~seen, -torch.inf)
 
 
 def _tile_sees(axis: _Axis, tile: int, keys: Tensor) -> Tensor:
-    """Whether each query of a tile sees each of its keys, (tiles, tile, keys); on a ring all tiles are as the first.
+    """Whether each key of a tile is in each query's window, (tiles, tile, keys); on a ring all tiles are equal.
 
-    By place, not by token: a narrow ring holds one token in several places.
+    Compared by position, not by token: on a narrow ring a token has several positions.
     """
     if axis.wrap:
         keys = keys[:1]
     queries = torch.arange(len(keys) * tile, device=keys.device)
     if not axis.wrap:
-        queries = queries.clamp(max=axis.size - 1)  # those beyond are padding, and cropped
+        queries = queries.clamp(max=axis.size - 1)  # later queries are padding, and cropped
     starts = axis.starts(queries).view(-1, tile, 1)
     return (starts <= keys[:, None]) & (keys[:, None] < starts + axis.span)
 
@@ -137,9 +137,9 @@ def _tile_sees(axis: _Axis, tile: int, keys: Tensor) -> Tensor:
 def _compiled_flex() -> Callable[..., Tensor]:
     from torch.nn.attention.flex_attention import flex_attention
 
-    # A graph for each level, type and mode; past the limit the form that keeps all scores would run.
+    # A graph per level, dtype and mode; beyond the limit, the eager implementation would store all scores.
     config = torch._dynamo.config
-    limit = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # its name in torch 2.6
+    limit = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # name in torch 2.6
     setattr(config, limit, max(GRAPHS, getattr(config, limit)))
     return torch.compile(flex_attention)
 
@@ -157,7 +157,7 @@ def _flex_mask(rows: _Axis, columns: _Axis, device: torch.device):  # type: igno
 
     tokens = rows.size * columns.size
     with torch.inference_mode(False):
-        # Compiled it never holds all pairs of tokens at once: 17 bytes each, 4.6 GB at 64 x 1024.
+        # The compiled function does not store all pairs of tokens: 17 bytes each, 4.6 GB at 64 x 1024.
         create = torch.compile(create_block_mask) if device.type == "cuda" else create_block_mask
         return create(sees, None, None, tokens, tokens, device=str(device))
 
@@ -184,6 +184,6 @@ BACKENDS: Registry[Backend] = Registry("attention backend", tiles=_tiles, flex=_
 
 
 def _fastest(q: Tensor, columns: _Axis) -> str:
-    """What "auto" means for this input."""
-    takes = q.is_cuda and q.dtype != torch.float64 and q.shape[-1] >= 16 and columns.span <= columns.size
-    return "flex" if takes and not torch.compiler.is_compiling() and importlib.util.find_spec("triton") else "tiles"
+    """The backend of "auto" for this input."""
+    supported = q.is_cuda and q.dtype != torch.float64 and q.shape[-1] >= 16 and columns.span <= columns.size
+    return "flex" if supported and not torch.compiler.is_compiling() and importlib.util.find_spec("triton") else "tiles"

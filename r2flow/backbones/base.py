@@ -1,4 +1,4 @@
-"""What all backbones share: images of one shape, seen along rays that they keep, at one time or two."""
+"""Base class of backbones: fields on images of one shape with stored rays, for one time or two."""
 
 import copy
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from r2flow.registry import Positive
 
 
 class CommonOptions(TypedDict, total=False):
-    """The options of every backbone: a subclass takes them as `**common`, after its rays, and hands them on."""
+    """The options of every backbone: a subclass takes them as `**common` and passes them to `Backbone`."""
 
     in_channels: int
     out_channels: int | None
@@ -27,28 +27,27 @@ class Backbone(ExactBuffers):
     X_{t->s}(x) = x + (s - t) u(x, t, s), and u(x, t, t) = v(t, x) (Geng et al. 2025, "Mean flows for one-step
     generative modeling", with the sign of s - t).
 
-    A subclass implements `velocity`; layers that see times are `ExactLinear`, since times stay float32. A class that
-    can do more declares it:
+    A subclass implements `velocity`; layers with times as input are `ExactLinear`, since times stay float32. A class
+    declares its capabilities:
 
-    - unit: What the rows and columns of the image, and of each part of it, are multiples of.
-    - follow_rays: Computes what derives from `coords` into buffers that are not saved; called by its constructor and
-      whenever `coords` is loaded.
-    - takes_second_time: It can be built with `second_time=True`. It then has an `interval_embedding` of s - t, made
-      after all else, whose last layer is zero, and `velocity` is given s (see `condition`).
+    - unit: The rows and columns of the image, and of each part of it, are multiples of the unit.
+    - follow_rays: Computes unsaved buffers from `coords`; called by the constructor and whenever `coords` is loaded.
+    - takes_second_time: The class supports `second_time=True`: it then has an `interval_embedding` of s - t, created
+      after all other layers, whose last layer is zero, and `velocity` takes s (see `condition`).
     - croppable: It can be evaluated on a part of its image. Layers that use the ring have a method `open_ring`.
     - any_size: It takes images of any number of rows and columns.
-    - learns_directions: It learns a vector for each direction, so that scans must not be turned in training.
+    - learns_directions: It learns a vector per direction, so that scans must not be rotated in training.
 
-    A module in it may have a method `macs` (`r2flow.backbones.cost`). `model.compile(dynamic=True)` makes it one graph
-    without breaks for batches of two and more and one for a single image.
+    Its modules may have a method `macs` (`r2flow.backbones.cost`). `model.compile(dynamic=True)` compiles it to a graph
+    without breaks for batches of two or more images, and another for single images.
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
         unit: See above.
-        in_channels: Channels C of the image, and of the condition that is concatenated to it.
-        out_channels: Channels C' of the output; None for C.
+        in_channels: Channels C of the image plus those of the condition concatenated to it.
+        out_channels: Channels C' of the output; None: C.
         second_time: Whether the network takes s.
-        data_std: Standard deviation of the data, for `precondition`; None for a network that gives v itself.
+        data_std: Standard deviation of the data, for `precondition`; None: the network is v itself.
     """
 
     takes_second_time: ClassVar[bool] = False
@@ -71,13 +70,13 @@ class Backbone(ExactBuffers):
         self.unit, self.second_time, self.data_std = unit, second_time, data_std
         self.in_channels, self.out_channels = in_channels, in_channels if out_channels is None else out_channels
         self._check(rays)
-        # on the device that parameters are made on, which `with torch.device(...)` may have set
+        # on the device of the parameters, which `with torch.device(...)` may have set
         device = torch.get_default_device() if rays.device.type == "cpu" else rays.device
         self.register_buffer("coords", rays[None].to(device, torch.float32, copy=True))
         self.register_load_state_dict_post_hook(_follow_loaded_rays)
 
     def forward(self, t: Tensor | float, x: Tensor, s: Tensor | float | None = None) -> Tensor:
-        """v(t, x), or u(x, t, s) where the network takes a second time.
+        """v(t, x), or u(x, t, s) for networks with a second time.
 
         Args:
             t: Time, a scalar or (B,).
@@ -85,7 +84,7 @@ class Backbone(ExactBuffers):
             s: Second time, a scalar or (B,); None for s = t.
 
         Returns:
-            (B, C', H, W), in x's type.
+            (B, C', H, W), in the dtype of x.
         """
         expected = self.in_channels, *(x.shape[2:] if self.any_size else self.coords.shape[2:])
         if x.shape[1:] != expected:
@@ -108,14 +107,14 @@ class Backbone(ExactBuffers):
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better.
 
-        s, of the same kind, is given where the network was built with a second time, and there alone.
+        Only networks with a second time get s, of the same shape and dtype.
         """
         raise NotImplementedError
 
     def condition(self, time_embedding: nn.Module, t: Tensor, s: Tensor | None) -> Tensor:
-        """time_embedding(t) + e(s - t) - e(0), e the `interval_embedding`: what steers the network, (B or 1, K).
+        """The condition time_embedding(t) + e(s - t) - e(0), (B or 1, K), with the `interval_embedding` e.
 
-        The difference is zero when training begins, and always where s = t: u(x, t, t) = v(t, x).
+        The difference is zero at initialisation, and always for s = t: u(x, t, t) = v(t, x).
         """
         c = time_embedding(t)
         if s is None:
@@ -124,26 +123,26 @@ class Backbone(ExactBuffers):
         return c + (e[:-1] - e[-1:])
 
     def second_time_names(self) -> frozenset[str]:
-        """Entries of the state_dict that a network of one time does not have."""
+        """Entries of the state_dict that networks with one time do not have."""
         return frozenset(name for name in self.state_dict() if name.startswith("interval_embedding."))
 
     def follow_rays(self) -> None:
-        """Compute again what derives from `coords`."""
+        """Recompute buffers that derive from `coords`."""
 
     @property
     def learns_directions(self) -> bool:
-        """Whether the network learns a vector for each direction."""
+        """Whether the network learns a vector per direction."""
         return False
 
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
-        """The backbone for a part of its image, (B, C, len(rows), len(columns)), its parameters shared.
+        """The backbone for a part of its image, (B, C, len(rows), len(columns)), with shared parameters.
 
-        The part does not see the rest of the image, and does not wrap where the turn is cut: the field is another one,
-        near the cut most of all.
+        The part ignores the rest of the image and does not wrap a cropped turn, so that its field differs, mostly near
+        the edges of the crop.
 
         Args:
             rows: Numbers of neighbouring rows, ascending.
-            columns: Numbers of neighbouring columns; they may pass the end of the ring.
+            columns: Numbers of neighbouring columns, which may wrap around the ring.
         """
         if not self.croppable:
             raise InputError(
@@ -180,14 +179,14 @@ class Backbone(ExactBuffers):
 
 
 def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Factors of a network F that gives only what a linear estimate of the velocity leaves over:
+    """Factors of a network F that predicts the residual of a linear estimate of the velocity:
 
         v(t, x) = skip(t) x + out(t) F(t, into(t) x)
 
     For x_1 ~ N(0, s^2) and x_t = t x_1 + (1 - t) x_0, of variance V = t^2 s^2 + (1 - t)^2, the best linear estimate is
-    E[v | x_t] = skip x_t with skip = (t s^2 - (1 - t)) / V, and leaves out^2 = Var[v | x_t] = s^2 / V. With into =
-    V^(-1/2) F sees and gives unit variance at every t (Karras et al. 2022, "Elucidating the design space of
-    diffusion-based generative models", table 1, for the straight path). At t = 0 F need not copy the noise.
+    E[v | x_t] = skip x_t with skip = (t s^2 - (1 - t)) / V, and its residual variance out^2 = Var[v | x_t] = s^2 / V.
+    With into = V^(-1/2), input and output of F have unit variance at every t (Karras et al. 2022, "Elucidating the
+    design space of diffusion-based generative models", table 1, for the straight path). At t = 0 F need not copy noise.
 
     Args:
         t: Times, (B,) or (1,).
@@ -208,14 +207,14 @@ def _follow_loaded_rays(backbone: Backbone, _keys: Any) -> None:
 
 def _times(name: str, times: Tensor | float, x: Tensor) -> Tensor:
     times = torch.as_tensor(times, device=x.device)
-    if times.ndim > 1 or times.numel() not in (x.shape[0], 1):  # len(x), or 1 first, would fix the batch of an export
+    if times.ndim > 1 or times.numel() not in (x.shape[0], 1):  # len(x), or 1 first, would fix an export's batch size
         raise ValueError(f"{name} must be a scalar or of shape ({len(x)},), found {tuple(times.shape)}.")
     return at_least_float32(times).reshape(-1)
 
 
 def integers(name: str, values: int | Sequence[int], count: int) -> tuple[int, ...]:
-    """As many integers as asked for, from such a list or from one for all."""
-    found = (int(values),) * count if isinstance(values, int) else tuple(int(value) for value in values)
-    if len(found) != count or not found or min(found) < 1:
-        raise InputError(f"{name} must be {count or 1} integers of at least 1, found {list(found)}.")
-    return found
+    """`count` integers, from a list of this length or from a single integer."""
+    result = (int(values),) * count if isinstance(values, int) else tuple(int(value) for value in values)
+    if len(result) != count or not result or min(result) < 1:
+        raise InputError(f"{name} must be {count or 1} integers of at least 1, found {list(result)}.")
+    return result

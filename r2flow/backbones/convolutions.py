@@ -1,4 +1,4 @@
-"""Pieces that the two U-Nets share: convolutions on a ring, resampling, residual and attention blocks."""
+"""Common layers of the two U-Nets: convolutions on a ring, resampling, residual and attention blocks."""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ EPS = 1e-6
 
 
 class RingConv2d(nn.Conv2d):
-    """3 x 3 convolution, circular in azimuth where the image is a ring, zeros beyond its other edges."""
+    """3 x 3 convolution with circular padding in azimuth on a ring, zero padding at other edges."""
 
     def __init__(self, in_channels: int, out_channels: int, ring: bool) -> None:
         super().__init__(in_channels, out_channels, 3, padding=(1, 0 if ring else 1))
@@ -30,15 +30,15 @@ class RingConv2d(nn.Conv2d):
         return super().forward(wrapped(x, 1, 1) if self.ring else x)
 
     def open_ring(self) -> None:
-        """Zeros beyond the left and right edges too, from now on."""
+        """Switch to zero padding at the left and right edges."""
         self.ring, self.padding = False, (1, 1)
 
 
 class Resample(ExactBuffers):
-    """Twice or half the resolution by a separable filter, circular in azimuth, zeros or repeats beyond other edges.
+    """Resample by a factor of 2 with a separable filter; circular padding in azimuth, else zeros or replication.
 
-    Down: every second value of the filtered image. Up: the filtered image of the pixels among zeros, the filter
-    doubled so that its sum over either phase is 1. The number of filter taps is even.
+    Down: every second value of the filtered image. Up: the filtered image of the pixels interleaved with zeros, with
+    the filter doubled so that its sum over either phase is 1. The number of filter taps is even.
     """
 
     kernel: Tensor
@@ -48,11 +48,11 @@ class Resample(ExactBuffers):
         taps = torch.tensor(window, dtype=torch.float32)
         self.register_buffer("kernel", taps / taps.sum() * (2 if up else 1))
         self.up, self.ring, self.repeat = up, ring, repeat
-        self.margin = len(window) // 2 - 1  # taps that reach beyond a pixel's own pair
+        self.margin = len(window) // 2 - 1  # taps beyond the pair of pixels
 
     def forward(self, x: Tensor) -> Tensor:
         channels, margin = x.shape[1], self.margin
-        rows, columns = self.repeat, self.ring or self.repeat  # whether they are padded here
+        rows, columns = self.repeat, self.ring or self.repeat  # whether they are padded explicitly
         if columns and margin:
             x = wrapped(x, margin, margin) if self.ring else F.pad(x, (margin, margin, 0, 0), mode="replicate")
         if rows and margin:
@@ -65,11 +65,11 @@ class Resample(ExactBuffers):
         return F.conv2d(x, kernel, stride=2, padding=zeros, groups=channels)
 
     def open_ring(self) -> None:
-        """Zeros beyond the left and right edges too, from now on."""
+        """Switch to zero padding at the left and right edges."""
         self.ring = False
 
     def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:
-        """All taps for each output value."""
+        """All taps per output value."""
         return output.numel() * self.kernel.numel() ** 2
 
 
@@ -101,7 +101,7 @@ class AdaGroupNorm(nn.Module):
 
 
 class SinusoidalTime(nn.Module):
-    """sin(f_i t), then cos(f_i t), with f_i = 10^(-4 i / (C / 2 - 1)); t as it is, a flow's time or a log-SNR."""
+    """sin(f_i t), then cos(f_i t), with f_i = 10^(-4 i / (C / 2 - 1)); t is not scaled: a flow's time or a log-SNR."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -115,14 +115,14 @@ class SinusoidalTime(nn.Module):
 
 
 def time_embedding(channels: int, out_channels: int, bias: bool = True) -> nn.Sequential:
-    """t (B,) to (B, out_channels): sinusoids, Linear, SiLU, Linear, the last one with a bias or without."""
+    """t (B,) to (B, out_channels): sinusoids, Linear, SiLU, Linear; `bias` is that of the last layer."""
     layers = ExactLinear(channels, out_channels), nn.SiLU(), ExactLinear(out_channels, out_channels, bias=bias)
     return nn.Sequential(SinusoidalTime(channels), *layers)
 
 
 @dataclass(frozen=True)
 class BlockOptions:
-    """What all residual blocks of a U-Net have in common: see `UNet`."""
+    """Common options of the residual blocks of a `UNet`."""
 
     condition_channels: int
     ring: bool
@@ -132,7 +132,7 @@ class BlockOptions:
 
 
 class ResidualBlock(nn.Module):
-    """(x + f(x)) / sqrt 2, with f = conv silu AdaGN conv silu GN, its last convolution zero at the start."""
+    """(x + f(x)) / sqrt 2, with f = conv silu AdaGN conv silu GN; the last convolution is initialised to zero."""
 
     scale: Tensor
 
@@ -146,13 +146,13 @@ class ResidualBlock(nn.Module):
         self.conv2 = zero_initialised(RingConv2d(out_channels, out_channels, options.ring))
 
     def residual(self, x: Tensor, condition: Tensor) -> Tensor:
-        """f of an x that `norm1` has normed."""
+        """f(x) after `norm1`."""
         x = self.norm2(self.conv1(F.silu(x)), condition)
         return self.conv2(self.dropout(F.silu(x)))
 
 
 class SelfAttention(nn.Module):
-    """(x + attention(GN x)) / sqrt 2 among all pixels, its projection zero at the start."""
+    """(x + attention(GN x)) / sqrt 2 over all pixels; the projection is initialised to zero."""
 
     scale: Tensor
 
@@ -172,21 +172,21 @@ class SelfAttention(nn.Module):
 
 
 class UNet(Backbone):
-    """A field by a U-Net on the image, beside features of its rays.
+    """U-Net on the image concatenated with features of its rays.
 
-    Parameters carry the published weights' names.
+    Parameters have the names of the published weights.
 
     Args:
         base_channels: Width of the first convolution, of the outermost level and of the sinusoidal time features.
         channel_multiplier: Width of each level over base_channels.
-        num_residual_blocks: Residual blocks of each level, or one number for all.
-        num_heads: Heads of self-attention, which is at the deepest level alone.
-        time_channels: Width of the time embedding; None for 4 x base_channels.
-        position: Features beside the image: "fourier_features", "polar", "spherical_harmonics" or "none".
+        num_residual_blocks: Residual blocks of each level, or one number for all levels.
+        num_heads: Heads of self-attention, which is at the deepest level only.
+        time_channels: Width of the time embedding; None: 4 x base_channels.
+        position: Features of the rays: "fourier_features", "polar", "spherical_harmonics" or "none".
         ring: Whether the columns are a full turn.
-        dropout: Share of activations dropped in training.
-        groups: Of group norms; every width is a multiple of it.
-        eps: Added to their variance.
+        dropout: Dropout rate of activations in training.
+        groups: Number of groups of group norms; every width is a multiple of it.
+        eps: Epsilon of group norms.
     """
 
     takes_second_time = True
@@ -230,7 +230,7 @@ class UNet(Backbone):
     def build_levels(
         self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
     ) -> None:
-        """Make all that follows the first convolution, whose output has base_channels."""
+        """Build all layers after the first convolution, whose output has base_channels."""
         raise NotImplementedError
 
     def follow_rays(self) -> None:
@@ -238,7 +238,7 @@ class UNet(Backbone):
             self.register_buffer("features", self.coords_encoding(self.coords), persistent=False)
 
     def entrance(self, x: Tensor) -> Tensor:
-        """The first convolution, on the image and its rays' features."""
+        """The first convolution, on the image and the features of its rays."""
         if self.coords_encoding is None:
             return self.in_conv(x)
         features = self.features.to(x.dtype).expand(x.shape[0], -1, -1, -1)

@@ -1,16 +1,16 @@
-"""What a backbone costs: parameters, and multiply-accumulates by the paper's rule (its table II, "FLOPs").
+"""Cost of a backbone: parameters, and multiply-accumulates by the paper's rule (table II, "FLOPs").
 
 For one image, the rule counts
 
-- a convolution, resampling filters included: taps x input channels for each output value;
-- a linear layer, the four of `nn.MultiheadAttention` included: inputs for each output value;
-- neighbourhood attention: 2 x window x channels for each token of the map padded by half a window on both
-  sides of the ring, where the published models compute it and crop;
-- group norm: 5 for each value where it has a learned scale and shift, 4 where it has none.
+- convolutions, including resampling filters: taps x input channels per output value;
+- linear layers, including the four of `nn.MultiheadAttention`: inputs per output value;
+- neighbourhood attention: 2 x window x channels per token of the map padded by half a window on both sides of the
+  ring, where the published models compute it and crop;
+- group norm: 5 per value with a learned scale and shift, 4 without.
 
-It leaves out biases, activations, other norms, rotations and *global* attention's two matrix products (for HDiT
-0.40 GMAC of 77.8, for the base ADM U-Net 8.6 of 265.6): fused kernels that the paper's counter did not see. It is
-the one rule under which all five rows of the table come out, to 0.02 %.
+It omits biases, activations, other norms, rotations and the two matrix products of *global* attention (for HDiT
+0.40 GMAC of 77.8, for the base ADM U-Net 8.6 of 265.6): fused kernels that the paper's counter did not count. This
+rule reproduces all five rows of the table to 0.02 %.
 """
 
 import torch
@@ -27,12 +27,12 @@ LAYERS = nn.Conv2d, nn.ConvTranspose2d, nn.Linear, nn.GroupNorm, nn.MultiheadAtt
 
 
 def count_parameters(model: nn.Module) -> int:
-    """Learned numbers; buffers are none."""
+    """Number of learned parameters, without buffers."""
     return sum(parameter.numel() for parameter in model.parameters())
 
 
 def count_macs(model: Backbone) -> int:
-    """Multiply-accumulates of one evaluation for one image, by the rule above; nothing is computed."""
+    """Multiply-accumulates of an evaluation for one image, by the rule above, counted on the meta device."""
     on_meta = {name: tensor.to("meta") for name, tensor in (*model.named_parameters(), *model.named_buffers())}
     x = torch.empty(1, model.in_channels, *model.coords.shape[2:], device="meta")
     counts: list[int] = []
@@ -50,10 +50,10 @@ def count_macs(model: Backbone) -> int:
 
 
 def _macs(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> int:
-    """Of one call; those of a module with a method `macs` by that."""
-    own = getattr(module, "macs", None)
-    if own is not None:
-        return int(own(inputs, output))
+    """Multiply-accumulates of a call, by the module's method `macs` if it has one."""
+    macs = getattr(module, "macs", None)
+    if macs is not None:
+        return int(macs(inputs, output))
     match module:
         case nn.Conv2d():
             return output.numel() * module.weight[0].numel()

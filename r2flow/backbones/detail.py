@@ -1,4 +1,4 @@
-"""A convolutional path at full resolution, beside a network of tokens."""
+"""A convolutional path at full resolution, parallel to a network of tokens."""
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -8,11 +8,11 @@ from r2flow.backbones.layers import ExactLinear, RMSNorm, uncast, unshuffle, zer
 
 
 class Detail(nn.Module):
-    """Residual 3 x 3 convolutions on single pixels, told by the tokens what is there.
+    """Residual 3 x 3 convolutions at full resolution, conditioned on the tokens.
 
-    Near t = 1 a velocity is the noise that is left, pixel by pixel. A token of p x q pixels learns to pass it on
-    slowly; a convolution finds it in a few hundred steps, as what differs from the neighbours. The path starts at zero.
-    Its `ends` are the channels of the image and of the answer.
+    Near t = 1 the velocity is mostly the remaining noise of each pixel. Tokens of p x q pixels are slow to learn it; a
+    convolution learns it in a few hundred steps, as the difference from the neighbours. The output is initially zero.
+    `ends` are the channels of the image and of the output.
     """
 
     def __init__(
@@ -37,15 +37,15 @@ class Detail(nn.Module):
     def forward(self, x: Tensor, tokens: Tensor, condition: Tensor) -> Tensor:
         """x (B, C, H, W), tokens (B, H/p, W/q, K), condition (B or 1, L) to (B, C', H, W)."""
         h = unshuffle(self.spread(self.norm(tokens)), self.patch).permute(0, 3, 1, 2)
-        seen = uncast(self.image, x)
-        h = h + seen * (1 + self.gain(condition)[:, :, None, None]).to(seen.dtype)
+        pixels = uncast(self.image, x)
+        h = h + pixels * (1 + self.gain(condition)[:, :, None, None]).to(pixels.dtype)
         for block in self.blocks:
             h = block(h, condition)
         return uncast(self.answer, F.silu(h))
 
 
 class DetailBlock(nn.Module):
-    """x + conv(silu(conv(silu(x)) (1 + a) + b)), with a and b by the condition."""
+    """x + conv(silu(conv(silu(x)) (1 + a) + b)), with a and b from the condition."""
 
     def __init__(self, channels: int, condition_channels: int, ring: bool) -> None:
         super().__init__()

@@ -19,15 +19,15 @@ FILTER = (1, 3, 3, 1)
 
 
 class EfficientUNet(UNet):
-    """A field by an Efficient U-Net, as in R2DM: as many residual blocks at each level on the way down as up.
+    """Efficient U-Net as in R2DM, with equal numbers of residual blocks in encoder and decoder.
 
-    For its options see `UNet`.
+    For the options see `UNet`.
     """
 
     def build_levels(
         self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
     ) -> None:
-        """`d_block1`, `u_block1`, `d_block2`, ... and the last convolution."""
+        """Build `d_block1`, `u_block1`, `d_block2`, ... and the last convolution."""
         for level, (width, count) in enumerate(zip(widths, counts, strict=True), start=1):
             above = widths[level - 2] if level > 1 else base_channels
             deepest = level == self.levels
@@ -51,7 +51,7 @@ class EfficientUNet(UNet):
 
 
 class Level(nn.Module):
-    """One resolution on the way down or up: halving, residual blocks, attention, doubling; each where asked for."""
+    """A level of encoder or decoder: optional downsampling, residual blocks, optional attention and upsampling."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class Level(nn.Module):
 
 
 class SkippedBlock(ResidualBlock):
-    """A residual block with a 1 x 1 convolution for a skip where its width changes."""
+    """A residual block with a 1 x 1 convolution as skip if its width changes."""
 
     def __init__(self, channels: int, out_channels: int, options: BlockOptions) -> None:
         super().__init__(channels, out_channels, options)

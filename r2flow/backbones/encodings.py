@@ -1,6 +1,6 @@
-"""Where a pixel looks, as features: harmonics of the ray angles, for attention and as inputs.
+"""Encodings of ray directions: harmonics of the ray angles, for attention and as inputs.
 
-Rays are elevation e and azimuth a in radians, shape (1, 2, H, W). All of it is float32 or better.
+Rays are elevation e and azimuth a in radians, shape (1, 2, H, W). All computations are in float32 or better.
 """
 
 import math
@@ -16,17 +16,16 @@ from r2flow.registry import Registry
 
 def mean_rays(rays: Tensor, patch: tuple[int, int]) -> Tensor:
     """Mean ray of each patch, (1, 2, H, W) to (1, 2, H / patch_h, W / patch_w)."""
-    # float32 on purpose: harmonics multiply the rounding of the mean, and the published weights were trained
-    # with this one
+    # in float32: harmonics amplify the rounding of the mean, and the published weights were trained with it
     return F.avg_pool2d(rays, patch)
 
 
 class Rotary(ExactBuffers):
-    """Rotary embedding by ray angles, theta = (e f_h, a f_w), with whole harmonics f.
+    """Rotary embedding by ray angles, theta = (e f_h, a f_w), with integer harmonics f.
 
-    Whole numbers, so that azimuth +pi and -pi are the same rotation (paper, section III-B). Frequencies
-    are round(exp(linspace(0, ln M, heads D / 4))) with M the highest harmonic of the axis, dealt out to
-    the heads in turn.
+    For integers, azimuth +pi and -pi are the same rotation (paper, section III-B). Frequencies are
+    round(exp(linspace(0, ln M, heads D / 4))) with M the highest harmonic of the axis, distributed to the heads in
+    turn.
 
     Args:
         heads: Attention heads N.
@@ -51,7 +50,7 @@ class Rotary(ExactBuffers):
 
 
 def rotate(x: Tensor, table: Tensor) -> Tensor:
-    """Turn each pair (x_i, x_{i + D/2}) by theta_i; x (..., N, D), table of `Rotary`."""
+    """Rotate each pair (x_i, x_{i + D/2}) by theta_i; x (..., N, D), table of `Rotary`."""
     cos, sin = table
     first, second = x.chunk(2, dim=-1)
     turned = torch.addcmul(first * cos, second, sin, value=-1), torch.addcmul(second * cos, first, sin)
@@ -79,7 +78,7 @@ class FourierFeatures(RayEncoding):
         ladders = [2.0 ** torch.arange(count) for count in octaves]
         freqs = torch.block_diag(*(ladder[:, None] for ladder in ladders))
         self.register_buffer("freqs", freqs[:, :, None, None])
-        self.register_buffer("phase", torch.zeros(len(freqs)))  # the published weights carry one
+        self.register_buffer("phase", torch.zeros(len(freqs)))  # the published weights have one
         self.channels = 2 * len(freqs)
 
     def forward(self, rays: Tensor) -> Tensor:
@@ -88,7 +87,7 @@ class FourierFeatures(RayEncoding):
 
 
 class Polar(RayEncoding):
-    """The two angles as they are."""
+    """The two angles, unchanged."""
 
     channels = 2
 
@@ -97,10 +96,10 @@ class Polar(RayEncoding):
 
 
 class SphericalHarmonics(RayEncoding):
-    """Real spherical harmonics of degree 0 to 4, 25 of them, ordered by degree l then order m = -l .. l.
+    """The 25 real spherical harmonics of degree 0 to 4, ordered by degree l, then order m = -l .. l.
 
     Y_lm = N_lm P_l^|m|(sin e) times sqrt(2) cos(m b), 1 or sqrt(2) sin(|m| b) for m > 0, = 0, < 0, without
-    the Condon-Shortley phase. b = -a: the published models measure azimuth the other way round here.
+    the Condon-Shortley phase. b = -a: the published models use the opposite sign of azimuth here.
     """
 
     degrees = 5
@@ -119,7 +118,7 @@ class SphericalHarmonics(RayEncoding):
         return torch.stack(harmonics, dim=1).to(rays.dtype)
 
     def _legendre(self, e: Tensor) -> dict[tuple[int, int], Tensor]:
-        """P_l^m(sin e) for 0 <= m <= l, by the recursion upwards in l."""
+        """P_l^m(sin e) for 0 <= m <= l, by recursion in l."""
         z, table = e.sin(), {}
         for m in range(self.degrees):
             below, here = torch.zeros_like(z), math.prod(range(1, 2 * m, 2)) * e.cos() ** m
@@ -137,7 +136,7 @@ PUBLISHED_NAMES = {"learnable_embedding": "learnable", "polar_coordinates": "pol
 
 
 def position_name(position: str | None, *special: str) -> str:
-    """Our name of a position option: the published configs' names are taken too."""
+    """The name of a position option; accepts the names of published configs, too."""
     name = PUBLISHED_NAMES.get(str(position), str(position).lower())
     if name not in special and name not in ENCODINGS:
         raise InputError(f"no position named {position!r}; known: {', '.join([*special, *ENCODINGS])}.")

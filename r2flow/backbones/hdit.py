@@ -1,4 +1,4 @@
-"""HDiT: an hourglass of transformer blocks on image tokens (paper, figure 4), with rays for positions."""
+"""HDiT: an hourglass of transformer blocks on image tokens (paper, figure 4), with rays as positions."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -31,27 +31,27 @@ from r2flow.registry import Bound, Count, Portion
 
 
 class HDiT(Backbone):
-    """A field by an hourglass transformer.
+    """Hourglass transformer.
 
-    Tokens of patch_h x patch_w pixels; at each outer level `depths[l]` blocks of neighbourhood attention on the way
-    down and as many on the way up, 2 x 2 tokens merged between levels and the width doubled; in the middle
-    `depths[-1]` blocks of global attention. Queries and keys are rotated by the ray angles (`Rotary`). Parameters
-    carry the names of the published weights. Under autocast the layers at both ends keep the weights' type (`uncast`).
+    Tokens have patch_h x patch_w pixels. Each outer level has `depths[l]` blocks of neighbourhood attention in the
+    encoder and in the decoder; between levels, 2 x 2 tokens are merged and the width is doubled. The bottleneck has
+    `depths[-1]` blocks of global attention. Queries and keys are rotated by the ray angles (`Rotary`). Parameters have
+    the names of the published weights. Under autocast, the first and last layers keep their weights' dtype (`uncast`).
 
     Args:
-        base_channels: Width of the outermost level, doubled at each level further in.
-        depths: Blocks of each level, the last one the middle.
-        num_heads: Heads of each level; the middle takes the last.
+        base_channels: Width of the outermost level, doubled at each deeper level.
+        depths: Blocks of each level, the bottleneck last.
+        num_heads: Heads of each level, the bottleneck last.
         time_channels: Width of the time embedding.
-        position: What is added to the tokens: "learnable", "fourier_features", "polar", "spherical_harmonics" or
-            "none".
+        position: Position embedding added to the tokens: "learnable", "fourier_features", "polar",
+            "spherical_harmonics" or "none".
         window: Rows and columns of the attention window, odd.
         patch: Rows and columns of a token.
         ring: Whether the columns are a full turn.
-        dropout: Share of attention outputs and of feed-forward activations dropped in training.
+        dropout: Dropout rate of attention outputs and feed-forward activations in training.
         attention: Backend of `neighbourhood_attention`.
-        detail: Blocks and channels of a convolutional path at full resolution beside the tokens (`Detail`), which
-            learns smooth surfaces sooner; None for the paper's network.
+        detail: Blocks and channels of a parallel convolutional path at full resolution (`Detail`), which learns smooth
+            surfaces faster; None: the paper's network.
     """
 
     takes_second_time = True
@@ -75,7 +75,7 @@ class HDiT(Backbone):
     ) -> None:
         levels = max(len(depths), 1)
         depths = integers("depths", depths, levels)
-        if len(num_heads) > levels:  # the published configs may list more: the middle takes the last
+        if len(num_heads) > levels:  # published configs may list more: the bottleneck takes the last
             num_heads = [*num_heads[: levels - 1], num_heads[-1]]
         heads = integers("num_heads", num_heads, levels)
         patch_h, patch_w = integers("patch", patch, 2)
@@ -84,14 +84,14 @@ class HDiT(Backbone):
         rows, columns = rays.shape[1] // patch_h, rays.shape[2] // patch_w
         span_h, span_w = integers("window", window, 2)
         check_window((span_h, span_w))
-        _ = attention == "auto" or BACKENDS[attention]  # an unknown name is refused now
+        _ = attention == "auto" or BACKENDS[attention]  # refuses an unknown name early
         local = Neighbourhood((span_h, span_w), ring, attention)
         widths = [base_channels * 2**level for level in range(levels)]
 
         def blocks(level: int) -> nn.ModuleList:
             highest = max((rows // 2) >> level, 1), max((columns // 2) >> level, 1)
-            seen = None if level == levels - 1 else local
-            options = BlockOptions(widths[level], heads[level], time_channels, highest, seen, dropout)
+            nearby = None if level == levels - 1 else local
+            options = BlockOptions(widths[level], heads[level], time_channels, highest, nearby, dropout)
             return nn.ModuleList([Block(options) for _ in range(depths[level])])
 
         self.timestep_pe = time_embedding(time_channels, dropout)
@@ -177,7 +177,7 @@ def _level(side: nn.ModuleDict, level: int) -> Iterable["Block"]:
 
 
 def _shared_rotation(level: int, blocks: Sequence["Block"]) -> Rotary:
-    """The rotation of all blocks of a level, which share one table: what is loaded for one must hold for all."""
+    """The rotation of all blocks of a level, which share a table: their loaded frequencies must be equal."""
     first, *others = (block.residual_attn.rope for block in blocks)
     for name, buffer in first.named_buffers():
         if not buffer.is_meta and any(not torch.equal(buffer, other.get_buffer(name)) for other in others):
@@ -186,7 +186,7 @@ def _shared_rotation(level: int, blocks: Sequence["Block"]) -> Rotary:
 
 
 class LearnablePosition(nn.Module):
-    """One learned vector for each token, added to it: the absolute position embedding of the paper."""
+    """A learned vector added to each token: the absolute position embedding of the paper."""
 
     def __init__(self, tokens: tuple[int, int], channels: int) -> None:
         super().__init__()
@@ -210,17 +210,17 @@ class FeaturePosition(nn.Sequential):
         super().__init__(features, mapping_network(channels, linear=nn.Linear, dropout=dropout))
 
     def follow(self, rays: Tensor) -> None:
-        """Compute the features again."""
+        """Recompute the features for new rays."""
         features = cast(RayFeatures, self[0])
         features.register_buffer("features", features.embedding(rays).permute(0, 2, 3, 1), persistent=False)
 
-    def forward(self) -> Tensor:  # type: ignore[override]  # its input are the rays, which it holds
+    def forward(self) -> Tensor:  # type: ignore[override]  # the input is the stored features
         features, mapping = self
         return mapping(features())
 
 
 class RayFeatures(ExactBuffers):
-    """W f(rays) for fixed features f, which are computed once."""
+    """W f(rays) with fixed features f, computed once."""
 
     features: Tensor
 
@@ -242,18 +242,18 @@ class Neighbourhood(NamedTuple):
 
 
 class BlockOptions(NamedTuple):
-    """What all blocks of a level have in common."""
+    """Common options of the blocks of a level."""
 
     channels: int
     heads: int
     condition_channels: int
     highest: tuple[int, int]  # harmonics of the rotation in elevation and azimuth
-    neighbourhood: Neighbourhood | None  # what a token attends to; None for all tokens
+    neighbourhood: Neighbourhood | None  # window of attention; None: all tokens
     dropout: float
 
 
 class Block(nn.Module):
-    """x + attention(x), then x + feed-forward(x), both normed under the condition."""
+    """x + attention(x), then x + feed-forward(x), both with norms that depend on the condition."""
 
     def __init__(self, options: BlockOptions) -> None:
         super().__init__()
@@ -297,12 +297,12 @@ class Attention(nn.Module):
         return self.out_proj(self.dropout(out.flatten(-2)))
 
     def open_ring(self) -> None:
-        """Windows are moved inside at the left and right ends too, from now on."""
+        """Shift windows inside at the left and right edges, too."""
         if self.neighbourhood is not None:
             self.neighbourhood = self.neighbourhood._replace(ring=False)
 
     def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:
-        """Both products of neighbourhood attention on the map padded by half a window at both sides of the ring."""
+        """Both products of neighbourhood attention on the map padded by half a window on both sides of the ring."""
         if self.neighbourhood is None:
             return 0
         rows, columns = self.neighbourhood.window
@@ -318,7 +318,7 @@ class Attention(nn.Module):
         return q, k, v
 
     def _normalised(self, qk: Tensor) -> Tensor:
-        """q and k, (..., N, D), each with length sqrt(s); float32, since s multiplies their rounding."""
+        """q and k, (..., N, D), normalised to length sqrt(s); in float32, since s amplifies their rounding."""
         qk = at_least_float32(qk)
         scale = at_least_float32(self.scale).clamp(max=LARGEST_LOG_SCALE).exp().sqrt()
         return qk * (scale * torch.rsqrt(qk.square().sum(-1, keepdim=True) + 1e-6))
@@ -361,7 +361,7 @@ class Shuffle(nn.Module):
 
 
 class Expand(nn.Module):
-    """One token of 2C channels becomes 2 x 2 of C, mixed with the tokens skipped: lerp(skip, x, sigmoid(alpha))."""
+    """A token of 2C channels becomes 2 x 2 of C, mixed with the skip: lerp(skip, x, sigmoid(alpha))."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

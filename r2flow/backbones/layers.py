@@ -1,4 +1,4 @@
-"""Pieces of transformers, and what keeps angles and conditions in float32."""
+"""Transformer layers, and modules that keep angles and conditions in float32."""
 
 import math
 from collections.abc import Callable
@@ -12,15 +12,15 @@ Layer = TypeVar("Layer", bound=nn.Module)
 
 
 def at_least_float32(x: Tensor) -> Tensor:
-    """x in float32, or in its own type where that is wider."""
+    """x in float32, or in its dtype if wider."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
 class ExactBuffers(nn.Module):
-    """A module whose own buffers move between devices but never change type.
+    """A module whose direct buffers move between devices but never change dtype.
 
-    They hold rays, frequencies and what is made of them: at harmonic 128, rounding an azimuth to bfloat16 turns it
-    by a radian. Autocast does not touch buffers; this keeps `.half()` and its like off them.
+    They hold rays, frequencies and derived values: at harmonic 128, rounding an azimuth to bfloat16 rotates it by a
+    radian. Autocast does not change buffers; this class protects them from `.half()` and similar methods.
     """
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -34,27 +34,27 @@ class ExactBuffers(nn.Module):
 
 
 class ExactLinear(nn.Linear):
-    """A linear layer computed in float32 whatever autocast does; for the few numbers that steer all others."""
+    """A linear layer computed in float32 even under autocast, for conditions."""
 
     def forward(self, x: Tensor) -> Tensor:
         weight, bias = at_least_float32(self.weight), self.bias
-        kind = x.device.type if x.device.type != "meta" else "cpu"  # shapes alone have no autocast of their own
+        kind = x.device.type if x.device.type != "meta" else "cpu"  # the meta device has no autocast
         with torch.autocast(kind, enabled=False):
             return F.linear(x.to(weight.dtype), weight, None if bias is None else bias.to(weight.dtype))
 
 
 def uncast(layer: nn.Module, x: Tensor) -> Tensor:
-    """layer(x) in the type of its weights, whatever autocast does.
+    """layer(x) in the dtype of its weights, even under autocast.
 
-    For the layers at both ends of a network, which see an image's own values: rounded to bfloat16, of 8 bits, these are
-    rougher than surfaces are.
+    For the first and last layers of a network, which process image values: rounded to bfloat16, with 8 bits, these are
+    rougher than real surfaces.
     """
     with torch.autocast(x.device.type if x.device.type != "meta" else "cpu", enabled=False):
         return cast(Tensor, layer(x.to(next(layer.parameters()).dtype)))
 
 
 def zero_initialised(layer: Layer) -> Layer:
-    """The layer with zero weights and bias: a residual branch that starts as the identity."""
+    """Set the weights and bias of a layer to zero, so that a residual block starts as the identity."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
     return layer
@@ -79,20 +79,20 @@ class RMSNorm(nn.Module):
 
 
 class AdaRMSNorm(nn.Module):
-    """rms_norm(x) (1 + W c): the condition c sets the scale, and W = 0 at the start."""
+    """rms_norm(x) (1 + W c) with condition c; W is initialised to zero."""
 
     def __init__(self, channels: int, condition_channels: int) -> None:
         super().__init__()
-        # a Sequential of one, because the published weights are named `proj.0`
+        # a Sequential of one layer, because the published weights are named `proj.0`
         self.proj = nn.Sequential(zero_initialised(ExactLinear(condition_channels, channels, bias=False)))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """x (B, H, W, C) normed under a condition (B, K), or (1, K) for the whole batch."""
+        """Normalise x, (B, H, W, C), with a condition (B, K), or (1, K) for the whole batch."""
         return rms_norm(x, 1 + self.proj(condition)[:, None, None, :])
 
 
 class GEGLU(nn.Module):
-    """h gelu(g) with (h, g) the two halves of one projection, and gelu the exact one (erf)."""
+    """h gelu(g) with (h, g) the two halves of a projection, and the exact gelu (erf)."""
 
     def forward(self, x: Tensor) -> Tensor:
         h, gate = x.chunk(2, dim=-1)
@@ -103,7 +103,7 @@ class RandomFourierFeatures(ExactBuffers):
     """W [cos(2 pi f t), sin(2 pi f t)] with fixed frequencies f ~ N(0, 1).
 
     Args:
-        channels: Width of the embedding; half as many frequencies.
+        channels: Width of the embedding, twice the number of frequencies.
     """
 
     freqs: Tensor
@@ -120,7 +120,7 @@ class RandomFourierFeatures(ExactBuffers):
 
 
 class MappingLayer(nn.Module):
-    """x + W_2 GEGLU(W_1 rms_norm(x)), three times as wide inside."""
+    """x + W_2 GEGLU(W_1 rms_norm(x)), with hidden width 3 C."""
 
     def __init__(self, channels: int, linear: type[nn.Linear], dropout: float) -> None:
         super().__init__()
@@ -137,15 +137,15 @@ class MappingLayer(nn.Module):
 def mapping_network(
     channels: int, layers: int = 2, linear: type[nn.Linear] = ExactLinear, dropout: float = 0.0
 ) -> nn.Sequential:
-    """RMSNorm, residual GEGLU layers, RMSNorm: what HDiT puts between an embedding and its use."""
+    """RMSNorm, residual GEGLU layers, RMSNorm: the mapping network of HDiT's embeddings."""
     middle = [MappingLayer(channels, linear, dropout) for _ in range(layers)]
     return nn.Sequential(RMSNorm(channels), *middle, RMSNorm(channels))
 
 
 def wrapped(x: Tensor, left: int, right: int) -> Tensor:
-    """An image (B, C, H, W) with columns of its other end before and behind it.
+    """Pad an image, (B, C, H, W), circularly by `left` and `right` columns.
 
-    As F.pad(mode="circular") makes it, whose backward takes five times as long and more.
+    Equal to F.pad(mode="circular"), whose backward takes at least five times as long.
     """
     if x.shape[3] < left + right:
         return F.pad(x, (left, right, 0, 0), mode="circular")
@@ -163,11 +163,11 @@ BAND = 1024  # tokens
 
 
 def rows_at_once(x: Tensor) -> int:
-    """How many rows of a map (B, H, W, ...) to work on at a time.
+    """Number of rows of a map (B, H, W, ...) to process at a time.
 
-    All of them, but on a CPU outside training only a band of about `BAND` tokens, so that what is needed on the
-    way stays in the cache and in memory that is already mapped: the paper's HDiT then reaches 0.75 rather than
-    0.62 of the rate of plain matrix products.
+    All rows, except on a CPU without gradients: a band of about `BAND` tokens, so that intermediate results stay in
+    the cache and in mapped memory. The paper's HDiT then reaches 0.75 instead of 0.62 of the speed of plain matrix
+    products.
     """
     batch, rows, columns = x.shape[:3]
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or not x.is_cpu:
@@ -176,7 +176,7 @@ def rows_at_once(x: Tensor) -> int:
 
 
 def in_bands(f: Callable[..., tuple[Tensor, ...]], *maps: Tensor) -> tuple[Tensor, ...]:
-    """f(*maps) for maps (., H, ...) and an f that acts on each row alone, `rows_at_once`."""
+    """f(*maps) for maps (., H, ...) and a row-wise f, in bands of `rows_at_once` rows."""
     rows, band = maps[0].shape[1], rows_at_once(maps[0])
     if band == rows:
         return f(*maps)

@@ -1,4 +1,4 @@
-"""A small convolutional network at full resolution, for work that needs no more than a ray's surroundings."""
+"""A small convolutional network at full resolution, for tasks that need only a ray's neighbourhood."""
 
 from collections.abc import Sequence
 from typing import Unpack
@@ -16,7 +16,7 @@ from r2flow.registry import Count
 class Local(Backbone):
     """Residual 3 x 3 convolutions, dilated along the rows, on images of any number of rows and columns.
 
-    Columns are circular where the image is a full turn; elsewhere zeros lie beyond its edges.
+    Padding is circular in azimuth if the image is a full turn, else zero.
 
     Args:
         channels: Width of the hidden layers.
@@ -36,7 +36,7 @@ class Local(Backbone):
     ) -> None:
         super().__init__(rays, (1, 1), **common)
         widths = integers("backbone.dilations", dilations, len(dilations))
-        self.ring, self.margin = ring, 2 + 2 * sum(widths)  # how far a pixel is seen
+        self.ring, self.margin = ring, 2 + 2 * sum(widths)  # radius of the receptive field
         self.time = time_embedding(channels, channels)
         self.image = nn.Conv2d(self.in_channels, channels, 3, padding=1)
         self.blocks = nn.ModuleList([_Block(channels, width) for width in widths])
@@ -45,7 +45,7 @@ class Local(Backbone):
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         columns = x.shape[3]
         margin = min(self.margin, columns) if self.ring else 0
-        x = x.contiguous(memory_format=torch.channels_last)  # in which a CPU convolves up to twice as fast
+        x = x.contiguous(memory_format=torch.channels_last)  # up to twice as fast on a CPU
         h = uncast(self.image, wrapped(x, margin, margin) if margin else x)
         h = h + self.time(t)[:, :, None, None].to(h.dtype)
         for block in self.blocks:
@@ -53,7 +53,7 @@ class Local(Backbone):
         return uncast(self.answer, F.silu(h))[..., margin : margin + columns].contiguous()
 
     def open_ring(self) -> None:
-        """Zeros beyond the left and right edges from now on."""
+        """Switch to zero padding at the left and right edges."""
         self.ring = False
 
 

@@ -1,4 +1,4 @@
-"""A network for large images: one for small images inside, convolutions at full resolution around it."""
+"""A network for large images: an inner network for downsampled images, and convolutions at full resolution."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Unpack
@@ -16,35 +16,35 @@ from r2flow.backbones.layers import ExactLinear, zero_initialised
 from r2flow.errors import InputError
 from r2flow.registry import Bound, Positive
 
-ANY_SIZE = 2, 256, 1024  # of rays: a network is built for it to learn what its sizes are multiples of
+ANY_SIZE = 2, 256, 1024  # shape of rays, to build a network and read its unit
 
 
 class Pyramid(Backbone):
-    """A field by a network for the image's means, and a path for what lies below them.
+    """An inner network for the image's block means, and a convolutional path for the residual.
 
-    P takes the mean of n = p x q pixels, U repeats it. Means of x_t = t x_1 + (1 - t) x_0 have less noise than its
+    P takes means of n = p x q pixels, U repeats them. Means of x_t = t x_1 + (1 - t) x_0 have less noise than its
     pixels: with w = t sqrt(n) + 1 - t,
 
         y = sqrt(n) / w P x_t = t' P x_1 + (1 - t') e,    t' = t sqrt(n) / w,    e ~ N(0, 1),
 
-    is a state of a flow of small images, at a later time. The inner network gives its velocity v'(t', y), and with it
-    that of the means, P v = (sqrt(n) - 1) / sqrt(n) y + v' / w. Of what is left, h = x_t - U P x_t, the best linear
-    estimate is skip(t) h (`precondition`), and F is what a path of convolutions finds beyond it:
+    is a state of a flow of small images, at a later time. The inner network gives its velocity v'(t', y), and thereby
+    the velocity of the means, P v = (sqrt(n) - 1) / sqrt(n) y + v' / w. For the residual h = x_t - U P x_t, the best
+    linear estimate of the velocity is skip(t) h (`precondition`), and a convolutional path F corrects it:
 
         v(t, x_t) = U P v + skip(t) h + out(t) F(t, h, y, y + (1 - t') v')
 
-    F starts at zero. So the means of what the network draws are at once the images of the inner one; below them is
-    noise. With a second time the inner network gives the mean velocity u'(y, t', s'), s' of s as t' of t. The formula
-    stays: P x_s = w_s / sqrt(n) y_s and s' - t' = sqrt(n) (s - t) / (w_s w), so that
+    F is initially zero: the means of the samples are then samples of the inner network, and the residual is noise.
+    With a second time, the inner network gives the mean velocity u'(y, t', s'), with s' from s as t' from t. The same
+    formula holds: P x_s = w_s / sqrt(n) y_s and s' - t' = sqrt(n) (s - t) / (w_s w), so that
     P u = (P x_s - P x_t) / (s - t) = (sqrt(n) - 1) / sqrt(n) y + u' / w.
 
     Args:
         inner: Name and options of the inner network.
-        factor: Rows p and columns q of a mean.
-        coarse: Blocks and channels of the path among the means.
-        detail: Blocks and channels of the path among the pixels.
+        factor: Rows p and columns q of a block mean.
+        coarse: Blocks and channels of the path at the resolution of the means.
+        detail: Blocks and channels of the path at full resolution.
         time_channels: Width of the path's time embedding.
-        below_std: Standard deviation of x_1 - U P x_1 in model space, times sqrt(n / (n - 1)), for a mean of n values
+        below_std: Standard deviation of x_1 - U P x_1 in model space, times sqrt(n / (n - 1)), as the mean of n values
             takes a degree of freedom.
         ring: Whether the columns are a full turn.
     """
@@ -71,15 +71,15 @@ class Pyramid(Backbone):
         if rows * columns == 1:
             raise InputError("backbone.factor must be of more than one pixel, such as [2, 4]; found [1, 1].")
         channels = common.get("in_channels", 2)
-        answered = common.get("out_channels") or channels
+        out_channels = common.get("out_channels") or channels
         whole = rays.shape[-2] % rows == 0 and rays.shape[-1] % columns == 0
-        seen = mean_rays(rays[None], (rows, columns))[0] if whole else rays.new_zeros(ANY_SIZE)
+        coarse_rays = mean_rays(rays[None], (rows, columns))[0] if whole else rays.new_zeros(ANY_SIZE)
         try:
-            small = build_backbone(inner, seen, channels, answered)
+            small = build_backbone(inner, coarse_rays, channels, out_channels)
         except InputError as error:
             try:
-                small = build_backbone(inner, rays.new_zeros(ANY_SIZE), channels, answered)
-            except InputError:  # the size is not at fault
+                small = build_backbone(inner, rays.new_zeros(ANY_SIZE), channels, out_channels)
+            except InputError:  # the size is not the cause
                 raise error from None
         super().__init__(rays, (rows * small.unit[0], columns * small.unit[1]), **common)
         self.factor, self.below_std, self.inner = (rows, columns), below_std, small
@@ -90,13 +90,13 @@ class Pyramid(Backbone):
         ends = channels + self.out_channels, self.out_channels
         count, wide = integers("detail", detail, 2)
         self.detail = Detail(count, wide, ends, width, self.factor, time_channels, ring)
-        if self.second_time:  # after all else, so that a seed gives the weights of one time with it and without
+        if self.second_time:  # last, so that a seed gives the same other weights with one time
             last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
             self.interval_embedding = time_embedding(time_channels, dropout=0.0).append(last)
-            self.inner = build_backbone(inner, seen, channels, answered, second_time=True)
+            self.inner = build_backbone(inner, coarse_rays, channels, out_channels, second_time=True)
             self.inner.load_state_dict({**self.inner.state_dict(), **small.state_dict()})
 
-    # Not `velocity`: that is given x in the type of the weights, and means and rest are taken of the exact x.
+    # Not `velocity`, which gets x in the dtype of the weights: means and residual need the exact x.
     def _evaluated(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
         image, rest = x[:, : self.out_channels], x[:, self.out_channels :]
         means = self._means(x)
@@ -110,7 +110,8 @@ class Pyramid(Backbone):
         velocity = self.inner(later, y, *inner_s)
         estimate = state + (1 - later)[:, None, None, None] * velocity
         into, skip, out = precondition(t, self.below_std)
-        pixels = torch.cat([into * below, rest, self._spread(estimate)], dim=1)  # as the means: image, condition, more
+        # In the order of the means: image, condition, estimate.
+        pixels = torch.cat([into * below, rest, self._spread(estimate)], dim=1)
         path = self._path(t, s, pixels, torch.cat([y, estimate], dim=1)).to(x.dtype)
         return self._spread((root - 1) / root * state + velocity / wide) + skip * below + out * path
 

@@ -1,4 +1,4 @@
-"""The one DataModule that every stage shares."""
+"""The DataModule of all stages."""
 
 import hashlib
 import logging
@@ -35,14 +35,15 @@ log = logging.getLogger(__name__)
 class ScanDataModule(L.LightningDataModule):
     """Projected scans with their noise, or pairs that a flow has drawn, for training and validation.
 
-    What a batch holds is said by `r2flow.data.loader.FlowDataset`. Noise, times and order derive from the run's seed
-    (`r2flow.noise`); the noise of one scan has the encoding's shape, (C, H, W), if none is given.
+    `r2flow.data.loader.FlowDataset` describes a batch. Noise, times and order derive from the run's seed
+    (`r2flow.noise`).
 
     Args:
+        noise_shape: Shape of one scan's noise; None: the encoding's, (C, H, W).
         keys: The keys of `r2flow.data.options.DataOptions`.
 
     Attributes:
-        further: What the run's stage adds to each scan of a batch.
+        further: Function of the run's stage that adds items to each scan of a batch.
     """
 
     def __init__(
@@ -63,13 +64,13 @@ class ScanDataModule(L.LightningDataModule):
         self.training_source: ScanSource | PairSource | None = None
         self.validation_source: ScanSource | PairSource | None = None
         self.pairs = self._pair_options() if self.options.name == PAIRS else None
-        self.scans: ScanSource | None = None  # beside pairs
+        self.scans: ScanSource | None = None  # next to pairs
 
     def _pair_options(self) -> PairOptions:
         options = self.options.pairs or {}
         check_options("data.pairs", PairOptions, options)
         if self.augment:
-            raise InputError("data.augment changes scans, and a changed pair is none of the flow's; leave it out.")
+            raise InputError("data.augment changes scans, and an augmented pair is not a flow's pair; leave it out.")
         if self.validation.data is not None:
             raise InputError("data.validation.data cannot be held out from pairs; leave it out.")
         if self.options.root is None:
@@ -78,7 +79,7 @@ class ScanDataModule(L.LightningDataModule):
 
     @property
     def pair_store(self) -> PairStore:
-        """The folder of the run's pairs, whatever it holds yet."""
+        """The folder of the run's pairs, complete or not."""
         assert self.pairs is not None
         recipe = self.pairs.recipe(self.encoding.shape, self.noise_shape)
         return PairStore(self.options.folder, recipe, self.pairs.num)
@@ -87,24 +88,24 @@ class ScanDataModule(L.LightningDataModule):
         if self.training_source is not None or self.scans is not None:
             return
         if self.pairs is not None:
-            _ = self.pair_store  # other pairs in its folder are refused now; missing ones are made later
+            _ = self.pair_store  # refuses other pairs in the folder early; missing pairs are made later
             if self.options.next_to_pairs is not None:
                 source = self._open(self.options.next_to_pairs)
                 self.names = list(source.names)
-                self.scans = self._kept(source, "scans beside the pairs")
+                self.scans = self._kept(source, "scans next to the pairs")
             return
         training, held = self.sources()
-        self._order(training)  # weights that it refuses are refused before anything is read or written
+        self._order(training)  # refuses wrong weights before anything is read or written
         self.training_source = self._kept(training, "training scans")
         self.validation_source = self._kept(held, "validation scans")
 
     def sources(self) -> tuple[ScanSource, ScanSource]:
-        """The scans to train on and those held out, none of them read yet.
+        """The training and the validation scans, not yet read.
 
-        Without other data to hold out, each part of a mixture holds out its own block.
+        Without `validation.data`, each part of a mixture holds out one block.
         """
         whole = [self._open(options) for options in self.parts]
-        # What goes before the names of each part's scans tells them apart.
+        # A prefix makes the names of the parts' scans distinct.
         labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
         self.names = [f"{label}{name}" for label, source in zip(labels, whole, strict=True) for name in source.names]
         other = self.options.held_out
@@ -116,7 +117,7 @@ class ScanDataModule(L.LightningDataModule):
                 training.append(source.subset(first))
                 held.append(source.subset(last))
         else:
-            # Scenes that are held out come after those that are trained on.
+            # Held-out scenes come after training scenes.
             first_scene = max((part.scenes for part in self.parts if part.name == SIMULATED), default=0)
             training, held = whole, [self._open(other, first_scene)]
             shared = held[0].places() & set().union(*(source.places() for source in whole))
@@ -134,7 +135,7 @@ class ScanDataModule(L.LightningDataModule):
         return open_source(options, reading, self.seed, first_scene)
 
     def _order(self, source: ScanSource | PairSource) -> Order:
-        """Which scan is image k of the run."""
+        """Order of the scans: maps image k of the run to a scan."""
         weights = [part.weight for part in self.parts if part.weight is not None]
         if len(weights) > 1:
             assert isinstance(source, Mixture)
@@ -142,7 +143,7 @@ class ScanDataModule(L.LightningDataModule):
         return Permutations(len(source), self.seed)
 
     def fingerprint(self) -> str:
-        """What is trained on, wherever it lies: a run resumes only with the same scans in the same order."""
+        """Identity of the training data, independent of its path: a run resumes only with the same scans and order."""
         if self.pairs is not None:
             pairs = f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"
             other = self.options.next_to_pairs
@@ -151,14 +152,14 @@ class ScanDataModule(L.LightningDataModule):
         return self._named(self.training_source, self.parts)
 
     def _named(self, taken: ScanSource, parts: Sequence[SourceOptions]) -> str:
-        """How many of the run's scans are taken, and a hash of their names."""
-        # Another revision of the simulator draws other scans of the same name.
+        """The number of the run's scans that are taken, and a hash of all names."""
+        # Revisions of the simulator draw different scans of the same name.
         revision = [f"simulator {simulator.REVISION}"] if any(p.name == SIMULATED for p in parts) else []
         names = hashlib.sha256(os.fsencode("\n".join([*self.names, *revision]))).hexdigest()[:12]
         return f"{len(taken)} of {len(self.names)} scans, {names}"
 
     def _kept(self, source: ScanSource, what: str) -> ScanSource:
-        """The source in memory where all that is slow to get of it fits there, read with a progress bar."""
+        """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = list(source.parts) if isinstance(source, Mixture) else [source]
         slow = sum(len(part) for part in parts if part.slow)
         size = slow * (1 + self.encoding.reflectance) * math.prod(self.sensor.shape) * 4
@@ -177,7 +178,7 @@ class ScanDataModule(L.LightningDataModule):
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def check_run(self, ranks: int, accumulated: int, max_steps: int) -> None:
-        """Refuse a run whose global batch cannot be shared, or that has no length."""
+        """Refuse a run whose global batch cannot be divided among devices, or that has no steps."""
         if self.batch_size % (ranks * accumulated):
             raise InputError(
                 f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
@@ -187,7 +188,7 @@ class ScanDataModule(L.LightningDataModule):
             raise InputError(f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run.")
 
     def train_dataloader(self) -> RunLoader:
-        """The rest of the run: from the trainer's step on, to max_steps."""
+        """Batches from the trainer's current step to max_steps."""
         self._ready()
         assert self.training_source is not None
         assert self.trainer is not None
@@ -201,7 +202,7 @@ class ScanDataModule(L.LightningDataModule):
         return RunLoader(dataset, batch_sampler=sampler, **self._loader_options())
 
     def _ready(self) -> None:
-        """Open what is there by now: pairs are made after `setup`."""
+        """Open the pairs, which are made after `setup`."""
         self.setup()
         if self.pairs is not None and self.training_source is None:
             pairs = PairSource(self.pair_store)
@@ -225,8 +226,8 @@ class ScanDataModule(L.LightningDataModule):
             return []
         rank, ranks = self._ranks()
         scans, batch_size = len(self.validation_source), max(self.batch_size // ranks, 1)
-        # Every rank needs as many batches as the others, or they would wait for each other: with fewer scans
-        # than ranks all take all of them, else the few that are left over are left out.
+        # All ranks need the same number of batches, or they would wait for each other: with fewer scans than ranks,
+        # every rank takes all scans; otherwise the remainder is left out.
         if scans < ranks:
             rank, ranks = 0, 1
         batches = fixed_batches(scans - scans % ranks, batch_size, rank, ranks)

@@ -1,4 +1,4 @@
-"""Where the scans of a data set lie: each layout finds its drives, in order."""
+"""Folder layouts of data sets: each layout finds the drives and scans of a data set, in order."""
 
 import logging
 import os
@@ -23,50 +23,50 @@ OBJECT_SPLIT = {"train": ("training",), "test": ("testing",)}
 
 @dataclass(frozen=True)
 class Drive:
-    """One recording: scans that follow each other."""
+    """One recording: consecutive scans."""
 
-    name: str  # what `data.drives` may call it
-    scans: tuple[str, ...]  # paths: of a hundred thousand, Path objects take seconds and ten times the memory
+    name: str  # its name in `data.drives`
+    scans: tuple[str, ...]  # paths as strings: 100,000 Path objects take seconds and ten times the memory
 
 
 class SourceKind:
-    """A kind of scans that a name opens, `data=NAME` in a run and `NAME:ROOT` in a verb; an entry of `SOURCES`."""
+    """A kind of scans, an entry of `SOURCES`: `data=NAME` in a run, `NAME:ROOT` in a command."""
 
-    splits: Mapping[str, Sequence[int | str]] = {}  # names or numbers of the drives of each part of a standard split
-    sensor = "hdl64e"  # name of the usual sensor
-    reflectance_scale = 1.0  # the usual value that means full reflectance
+    splits: Mapping[str, Sequence[int | str]] = {}  # standard split: names or numbers of each part's drives
+    sensor = "hdl64e"  # name of the default sensor
+    reflectance_scale = 1.0  # default value of full reflectance
     levels: int | None = None  # reflectance is n / levels
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        """The scans in their order, none of them read yet; `seed` and `first_scene` are for simulated ones.
+        """The scans in order, not yet read; `seed` and `first_scene` are for simulated scans.
 
         `reading.reflectance` is True or False.
         """
         raise NotImplementedError
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
-        """Why the scans count as scans without reflectance; None where they have it."""
+        """Reason why the scans count as scans without reflectance; None if they have reflectance."""
         return None
 
     def levels_of(self, options: SourceOptions) -> int | None:
-        """The levels of these scans' reflectance, n / levels; None if they are not known."""
+        """The levels of these scans' reflectance, n / levels; None if unknown."""
         return self.levels
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
         """The drives of scan files, in order."""
-        raise InputError(f"{options.name} scans are no files in drives.")
+        raise InputError(f"{options.name} scans are not files in drives.")
 
     def split_of(self, drive: str) -> str | None:
-        """The part of the standard split that a drive belongs to, by its name; None where it is in none."""
+        """The part of the standard split that contains a drive, by its name, or None."""
         names = {drive, *_numbers(drive)}
         return next((part for part, members in self.splits.items() if names & set(members)), None)
 
     def chosen(self, drives: list[Drive], split: str | None, names: Sequence[str | int] | None) -> list[Drive]:
-        """Those of a part of the standard split; of these, those of some names or numbers; None takes all."""
+        """Select drives by a part of the standard split, then by names or numbers; None takes all."""
         if split is not None:
             if split not in self.splits:
-                known = f"known: {', '.join(self.splits)}" if self.splits else "the data set has no standard split"
-                raise InputError(f"no split named {split!r}; {known}.")
+                splits = f"known: {', '.join(self.splits)}" if self.splits else "the data set has no standard split"
+                raise InputError(f"no split named {split!r}; {splits}.")
             drives = [drive for drive in drives if self.split_of(drive.name) == split]
         if names is None:
             return drives
@@ -75,34 +75,34 @@ class SourceKind:
 
 @dataclass(frozen=True)
 class Layout(SourceKind):
-    """A data set of scan files, whose drives `find` finds below its folder, in order."""
+    """A data set of scan files; `find` lists its drives below a folder, in order."""
 
-    find: Callable[[Path], list[Drive]]  # the first line of its docstring says what it looks for
+    find: Callable[[Path], list[Drive]]  # the first line of its docstring is the pattern of its files
     splits: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
     sensor: str = "hdl64e"
     reflectance_scale: float = 1.0
     levels: int | None = None
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
-        """Those of the split and the drives that `options` names; a drive without a scan is none."""
+        """The drives of the split and the names in `options`, without empty drives."""
         name, split, root = options.name, options.split, Path(options.folder).expanduser()
-        self.chosen([], split, None)  # a split that is not known is refused before anything is looked for
+        self.chosen([], split, None)  # refuses an unknown split before any search
         if not root.is_dir():
             raise InputError(
                 f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb {name}:FOLDER)."
             )
-        held = [drive for drive in self.find(root) if drive.scans]
-        if not held:
+        nonempty = [drive for drive in self.find(root) if drive.scans]
+        if not nonempty:
             where = (self.find.__doc__ or "").splitlines()[0]
             raise InputError(f"{root} holds no scan. Looked for ({name}): {where}{_elsewhere(root)}")
-        found = self.chosen(held, split, None)
-        if not found:
-            names = ", ".join(f"{drive.name} ({self.split_of(drive.name)})" for drive in held)
+        drives = self.chosen(nonempty, split, None)
+        if not drives:
+            names = ", ".join(f"{drive.name} ({self.split_of(drive.name)})" for drive in nonempty)
             raise InputError(
                 f"{root} holds no scan of its {split} split; it holds {names[:200]}: give another data.split "
                 "(--split), or null for all."
             )
-        return self.chosen(found, None, options.drives)
+        return self.chosen(drives, None, options.drives)
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanFiles:
         if reading.projection == "unfolding" and reading.sensor.name == "hdl64e":
@@ -110,11 +110,11 @@ class Layout(SourceKind):
                 "unfolded rows are the sensor's rings, which are not evenly spaced: sensor=hdl64e_rings has their "
                 "elevations, sensor=hdl64e is up to 6 degrees off"
             )
-        found = self.find_drives(options)
-        drives = {drive.name: span for drive, span in zip(found, spans_of(found), strict=True)}
+        selected = self.find_drives(options)
+        drives = {drive.name: span for drive, span in zip(selected, spans_of(selected), strict=True)}
         about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
-        root = Path(options.folder).expanduser()  # as the paths begin that are found in it, however it was written
-        paths = [path for drive in found for path in drive.scans]
+        root = Path(options.folder).expanduser()  # the prefix of all paths found in it
+        paths = [path for drive in selected for path in drive.scans]
         warn_of_other_sensor(paths, reading, root)
         return ScanFiles(paths, reading, root, drives, about)
 
@@ -153,8 +153,8 @@ def kitti_object(root: Path) -> list[Drive]:
 def nuscenes(root: Path) -> list[Drive]:
     """`samples/LIDAR_TOP/*.pcd.bin` and `sweeps/LIDAR_TOP/*.pcd.bin`, or such files in the folder itself.
 
-    A drive is a log, named at the head of each file: n015-2018-07-24-11-22-45+0800. Samples are the annotated scans
-    among its sweeps; here they follow each other as they were recorded.
+    A drive is a log, named at the start of each file name: n015-2018-07-24-11-22-45+0800. Samples, the annotated scans,
+    and sweeps are merged in the order of recording.
     """
     logs: dict[str, list[tuple[str, str]]] = {}
     for folder in (root / "samples" / "LIDAR_TOP", root / "sweeps" / "LIDAR_TOP", root):
@@ -167,8 +167,8 @@ def nuscenes(root: Path) -> list[Drive]:
 def folder(root: Path) -> list[Drive]:
     """Any folder of .bin, .pcd.bin, .pcd, .ply, .npy, .xyz, .las, .laz, .feather, .parquet, else of .csv, .txt, .npz.
 
-    Each folder below it that holds some is a drive. Of a scan that lies there in several formats, one file is taken:
-    its range image, else the last by its ending.
+    Each folder below it with such files is a drive. If a scan exists in several formats, one file is taken: its range
+    image, else the last by its ending.
     """
     below = sorted(Path(place) for place, _ in _walk(root))
     for endings in (FIRM_ENDINGS, LOOSE_ENDINGS):
@@ -179,7 +179,7 @@ def folder(root: Path) -> list[Drive]:
 
 
 def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
-    """Every folder from a root down and its files, through links to folders too, each folder once."""
+    """All folders from a root down with their files, following links, each folder once."""
     seen: set[str] = set()
     for place, folders, names in os.walk(root, followlinks=True):
         real = os.path.realpath(place)
@@ -192,7 +192,7 @@ def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def _elsewhere(root: Path) -> str:
-    """What turns the files of a folder that holds no scan into some, where they hold scans in another form."""
+    """Advice on how to convert the files of a folder without scans, if they hold scans in another form."""
     for place, names in _walk(root):
         for name in sorted(names):
             for ending, advice in ELSEWHERE.items():
@@ -209,19 +209,19 @@ def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def spans_of(drives: Sequence[Drive]) -> list[range]:
-    """The numbers of each drive's scans, where the drives lie end to end."""
+    """The numbers of each drive's scans in the concatenation of all drives."""
     ends = accumulate(len(drive.scans) for drive in drives)
     return [range(end - len(drive.scans), end) for drive, end in zip(drives, ends, strict=True)]
 
 
 def named_drive(drives: list[Drive], name: str) -> Drive:
-    """The drive of a name, or of a number in its name; none and several are refused."""
+    """The only drive with a name, or with a number in its name; refuses names that match no drive or several."""
     matches = [d for d in drives if name == d.name or (name.isdecimal() and int(name) in _numbers(d.name))]
     if len(matches) != 1:
         names = [drive.name for drive in drives]
-        known = "none, its scans lie in one folder" if names == ["."] else ", ".join(names)
+        listed = "none, its scans are in one folder" if names == ["."] else ", ".join(names)
         problem = "no drive" if not matches else f"{len(matches)} drives"
-        raise InputError(f"{problem} named {name!r}; known: {known}.")
+        raise InputError(f"{problem} named {name!r}; known: {listed}.")
     return matches[0]
 
 
@@ -233,12 +233,12 @@ def _numbers(name: str) -> set[int]:
 
 
 def _in_order(name: str) -> list[tuple[int, str]]:
-    """By the numbers in a name: 2.bin comes before 10.bin."""
+    """Sort key by the numbers in a name: 2.bin comes before 10.bin."""
     return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"([0-9]+)", name)]
 
 
 def _files(folder: Path, endings: tuple[str, ...]) -> tuple[str, ...]:
-    """The files of a folder by their endings, in order; hidden ones (macOS leaves ._NAME beside NAME) are none."""
+    """The files of a folder with some endings, in order, without hidden files (macOS writes ._NAME next to NAME)."""
     names = sorted(
         (n for n in os.listdir(folder) if n.lower().endswith(endings) and not n.startswith(".")), key=_in_order
     )

@@ -1,4 +1,4 @@
-"""Batches that a run can leave and come back to."""
+"""Resumable batches of a run."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
@@ -14,20 +14,19 @@ from r2flow.data.sources import ScanSource
 from r2flow.lidar.encoding import Encoding
 
 Item = dict[str, Tensor]
-Further = Callable[[Tensor, np.random.Generator], Item]  # of x_1, (C, H, W), and draws of the image's own
+Further = Callable[[Tensor, np.random.Generator], Item]  # of x_1, (C, H, W), and the image's generator
 
 
 class FlowDataset(Dataset[Item]):
     """Image k of a run as a training item.
 
-    A batch has these keys; each depends on (seed, purpose, k) and on the scan alone:
+    A batch has these keys; each depends only on (seed, purpose, k) and the scan:
 
     - x_1, (B, C, H, W): scans in model space, where t = 1;
     - x_0, (B, *noise_shape): standard normal noise, where t = 0;
-    - u, (B,): uniform in [0, 1); the stage makes t of it;
-    - k, (B,): number of the image in the run. A stage that needs more draws for an image derives them from
-      (seed, purpose, k);
-    - what `further` makes of the image: a stage's conditions. Those of validation are the same for every seed.
+    - u, (B,): uniform in [0, 1); the stage maps it to t;
+    - k, (B,): number of the image in the run; a stage derives further draws for an image from (seed, purpose, k);
+    - the keys of `further`: a stage's conditions, the same for every seed in validation.
     """
 
     def __init__(
@@ -64,15 +63,15 @@ class FlowDataset(Dataset[Item]):
 
 
 class Order(Protocol):
-    """Which scan is image k of a run, a function of k alone."""
+    """Maps image k of a run to a scan, as a function of k only."""
 
     def __getitem__(self, k: int) -> int: ...
 
 
 class Permutations:
-    """Scan permutation_{k // n}[k mod n] of n: every scan once, in an order of its own, then every scan again.
+    """Scan permutation_{k // n}[k mod n] of n scans: every epoch has every scan once, in a new order.
 
-    The permutations are counter-based, so that the order is known at every k without having drawn what came before.
+    The permutations are counter-based: the order at k does not need the draws before k.
     """
 
     def __init__(self, scans: int, seed: int) -> None:
@@ -88,10 +87,10 @@ class Permutations:
 
 
 class RunSampler(Sampler[list[tuple[int, int]]]):
-    """The batches of one rank over a whole run, (k, scan) each, from batch `first_batch` on.
+    """The batches of one rank over a whole run as lists of (k, scan), starting at batch `first_batch`.
 
-    Global batch m holds images [m B, (m + 1) B); rank r of R takes every R-th of them, from r on. The length is that of
-    the run even if a resumed iterator starts late: Lightning adds the batches of a resumed run to what it fetches.
+    Global batch m holds images [m B, (m + 1) B); rank r of R takes images r, r + R, ... of it. The length is that of
+    the whole run, even if it starts at a later batch: Lightning adds a resumed run's finished batches to its count.
     """
 
     def __init__(self, order: Order, batch_size: int, batches: int, rank: int = 0, ranks: int = 1) -> None:
@@ -109,10 +108,10 @@ class RunSampler(Sampler[list[tuple[int, int]]]):
 
 
 class RunLoader(DataLoader[Item]):
-    """A loader whose one epoch is the whole run, by a `RunSampler`."""
+    """A loader whose only epoch is the whole run, by a `RunSampler`."""
 
-    # Lightning takes a loader with these two for one that resumes. The position itself comes from the
-    # trainer's step (ScanDataModule.train_dataloader), which also holds when the number of ranks changed.
+    # With these two methods, Lightning treats the loader as resumable. The position itself comes from the trainer's
+    # step (ScanDataModule.train_dataloader), which also works with another number of ranks.
     def state_dict(self) -> dict[str, Any]:
         return {}
 
@@ -121,6 +120,6 @@ class RunLoader(DataLoader[Item]):
 
 
 def fixed_batches(scans: int, batch_size: int, rank: int = 0, ranks: int = 1) -> list[list[tuple[int, int]]]:
-    """Every `ranks`-th scan in order, the key of each its own number: the same items at every validation."""
+    """Batches of (scan, scan) for every `ranks`-th scan from `rank` on: every validation has the same items."""
     keys = [(scan, scan) for scan in range(rank, scans, ranks)]
     return [keys[i : i + batch_size] for i in range(0, len(keys), batch_size)]

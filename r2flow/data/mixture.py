@@ -1,4 +1,4 @@
-"""Several data sets in one run: their scans end to end, and whose turn it is at each image."""
+"""Mixtures of data sets: their concatenated scans, and the random choice of a scan for each image."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from r2flow.errors import InputError
 
 
 class Mixture(ScanSource):
-    """Sources end to end, numbered through."""
+    """Concatenated sources."""
 
     def __init__(self, parts: Sequence[ScanSource]) -> None:
         self.parts = list(parts)
@@ -28,7 +28,7 @@ class Mixture(ScanSource):
         return int(self.starts[-1])
 
     def locate(self, index: int) -> tuple[int, int]:
-        """(part, number in it) of a scan."""
+        """The part of a scan, and its number in that part."""
         if not 0 <= index < len(self):
             raise IndexError(index)
         part = int(np.searchsorted(self.starts, index, side="right")) - 1
@@ -43,18 +43,18 @@ class Mixture(ScanSource):
         return self.parts[part].with_points(number)
 
     def subset(self, indices: Sequence[int]) -> "Mixture":
-        """Some of the scans, named in ascending order, as a mixture of the same parts."""
+        """Some of the scans, by ascending numbers, as a mixture of the same parts."""
         chosen: list[list[int]] = [[] for _ in self.parts]
         for index in indices:
             part, number = self.locate(index)
             chosen[part].append(number)
-        return Mixture([part.subset(own) for part, own in zip(self.parts, chosen, strict=True)])
+        return Mixture([part.subset(numbers) for part, numbers in zip(self.parts, chosen, strict=True)])
 
 
 class MixedOrder:
-    """Which scan of a mixture is image k of a run: a part by its weight, then one of its scans, each alike.
+    """Maps image k of a run to a scan of a mixture, as a function of (seed, k).
 
-    A function of (seed, k): part p with probability w_p / sum w, drawn with replacement.
+    Part p has probability w_p / sum w; its scan is drawn uniformly, with replacement.
     """
 
     def __init__(self, sizes: Sequence[int], weights: Sequence[float], seed: int) -> None:

@@ -1,10 +1,10 @@
-"""From a name to its scans: for runs, verbs and reports alike.
+"""Open scans by name, for runs, commands and reports.
 
     scans = open_scans("kitti_360:/data/KITTI-360", Reading(SENSORS["hdl64e"]), split="test")
     scans.source[0]                 range in metres and reflectance, (2, H, W)
 
-`SOURCES` is the table of what a name may be. To add a kind of scans, enter it there:
-`SOURCES.add("mine", Layout(find_mine))` for scan files that `find_mine(root)` finds, or a `SourceKind` of your own.
+`SOURCES` is the registry of names. To add a kind of scans, register it: `SOURCES.add("mine", Layout(find_mine))` for
+scan files listed by `find_mine(root)`, or a subclass of `SourceKind`.
 """
 
 import logging
@@ -33,7 +33,7 @@ from r2flow.store import MANIFEST, read_manifest
 
 log = logging.getLogger(__name__)
 
-SCENES = 1000  # of simulated scans, where nobody says how many
+SCENES = 1000  # default number of simulated scans
 
 
 class Simulated(SourceKind):
@@ -80,18 +80,18 @@ def open_scans(
     num: int | None = None,
     own_size: bool = False,
 ) -> ScanSet:
-    """The scans that a name stands for, none of them read yet but for what decides whether they have reflectance.
+    """Open the scans of a name. Scans are read on access, except those that decide whether the set has reflectance.
 
     Args:
         spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`, `NAME:ROOT` with a
-            name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run folder, which stands for its samples.
-        reading: How scans become images; `reading_for` the scans if left out.
+            name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run folder (its samples).
+        reading: How scans become images; None: `reading_for([spec])`.
         split: A part of the data set's standard split.
-        num: At most so many, by a fixed shuffle; the number of simulated scenes.
-        own_size: For pictures: a range image's own size is taken in place of the sensor's, and no beams are compared.
+        num: Maximum number of scans, chosen by a fixed shuffle; the number of simulated scenes.
+        own_size: For pictures: take the size of the range image instead of the sensor's, and do not compare beams.
 
     Raises:
-        InputError: nothing is there, or what is there cannot become such images.
+        InputError: the scans do not exist, or cannot become such images.
     """
     label = str(spec)
     options, file = parse(label)
@@ -104,7 +104,7 @@ def open_scans(
             return ScanSet(label, open_source(options, reading, seed), reading.sensor)
         return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
     image = read_range_image(file)
-    if image is not None:  # points can be seen through any sensor
+    if image is not None:  # points can be projected for any sensor
         refuse_other_samples(file.parent, reading.sensor)
     elif not own_size:
         warn_of_other_sensor([file], reading, file)
@@ -116,11 +116,11 @@ def open_scans(
 
 
 def open_source(options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-    """The scans of some options: `SourceKind.open`, with its arguments and `reading.reflectance` decided."""
+    """Open the scans of some options by `SourceKind.open`, after resolving `reading.reflectance`."""
     kind = SOURCES[options.name]
     if options.name == FOLDER:
         refuse_other_samples(Path(options.folder), reading.sensor)
-        if made_here(options.folder):  # which is believed
+        if made_here(options.folder):  # its reflectance is in [0, 1]
             reading = replace(reading, reflectance_scale=1.0)
     if reading.reflectance == AUTO:
         reading = replace(reading, reflectance=kind.lacks_reflectance(options, reading.on_bad_scan) is None)
@@ -128,7 +128,7 @@ def open_source(options: SourceOptions, reading: Reading, seed: int = 0, first_s
 
 
 def parse(text: str) -> tuple[SourceOptions, Path | None]:
-    """The options that a user's name stands for, and the file where it is one."""
+    """The options of a name of scans, and the file if the name is a file."""
     path = Path(text).expanduser()
     kind, colon, rest = text.partition(":")
     if colon and kind in SOURCES:
@@ -155,11 +155,11 @@ def find_drives(
     return SOURCES[name].find_drives(SourceOptions(name, str(root), split, None if drives is None else list(drives)))
 
 
-# What scans say of themselves
+# How scans are read
 
 
 def samples_of(run: Path) -> Path | None:
-    """The folder `samples` of a run folder; None where it is no run folder."""
+    """The folder `samples` of a run folder; None if the folder is not a run folder."""
     if not (run / "config.yaml").is_file() and not (run / "checkpoints").is_dir():
         return None
     if not (run / "samples").is_dir():
@@ -168,7 +168,7 @@ def samples_of(run: Path) -> Path | None:
 
 
 class Model(Protocol):
-    """A trained generator, as far as its images are concerned."""
+    """The attributes of a trained generator that determine its images."""
 
     @property
     def config(self) -> Mapping[str, Any]: ...
@@ -187,49 +187,49 @@ def reading_for(
     reflectance_scale: float | None = None,
     columns: Sequence[str] | None = None,
 ) -> Reading:
-    """How scans become images: as asked for, else as the model's training scans, else as the scans say, else as usual.
+    """How scans become images: arguments first, then the model's training scans, the scans' manifest, the defaults.
 
     Args:
-        scans: Names as for `open_scans`; None is passed over.
+        scans: Names as for `open_scans`; None is skipped.
         model: The model that the scans are for; another sensor or size than the model's is refused.
-        sensor, size, ...: What was asked for; None where nothing was.
+        sensor, size, ...: Requested fields; None: not requested.
 
     Raises:
-        InputError: an unknown name, or another sensor or size than the model's or a folder's of samples.
+        InputError: unknown name, or a sensor or size that differs from the model's or from those of given samples.
     """
-    named = [str(one) for one in scans if one is not None]
-    own = next((reading for one in named if (reading := own_reading(one)) is not None), None)
-    kind = SOURCES[parse(named[0])[0].name] if named else SourceKind()
-    reading = _reading_of(model) if model else own or Reading(SENSORS[kind.sensor])
+    specs = [str(spec) for spec in scans if spec is not None]
+    stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
+    kind = SOURCES[parse(specs[0])[0].name] if specs else SourceKind()
+    reading = _reading_of(model) if model else stored or Reading(SENSORS[kind.sensor])
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and (chosen.shape != model.sensor.shape or chosen.elevations != model.sensor.elevations):
-        there, asked = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (model.sensor, chosen))
-        raise InputError(f"the flow's images are of {there}, not of {asked}; leave --sensor and --size out.")
+        expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
+        raise InputError(f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out.")
     reading = replace(reading, sensor=reading.sensor if model else chosen)
-    for spec in named:  # before anything is read
+    for spec in specs:  # before anything is read
         options, _ = parse(spec)
         if options.name == FOLDER:
             refuse_other_samples(Path(options.folder), reading.sensor)
-    if reflectance_scale is None and named:
-        reflectance_scale = usual_scale(named[0], reading.sensor)
-    asked_for = {
+    if reflectance_scale is None and specs:
+        reflectance_scale = usual_scale(specs[0], reading.sensor)
+    requested = {
         "projection": projection, "convention": convention, "reflectance_scale": reflectance_scale,
         "columns": None if columns is None else tuple(columns),
     }  # fmt: skip
-    return replace(reading, **{key: value for key, value in asked_for.items() if value is not None})  # type: ignore[arg-type]
+    return replace(reading, **{key: value for key, value in requested.items() if value is not None})  # type: ignore[arg-type]
 
 
 def _reading_of(model: Model) -> Reading:
-    """How a model's training scans became images; of a mixture, what all its parts say."""
+    """How a model's training scans became images; for a mixture, the fields on which all parts agree."""
     data = model.config.get("data", {})
     readings = [part.get("reading") for part in data.get("parts") or ()] or [data.get("reading")]
     fields = ("projection", "convention", "reflectance_scale")
-    agreed = {key: values.pop() for key in fields if len(values := {(one or {}).get(key) for one in readings}) == 1}
+    agreed = {key: values.pop() for key in fields if len(values := {(r or {}).get(key) for r in readings}) == 1}
     return Reading(model.sensor, **{key: value for key, value in agreed.items() if value is not None})
 
 
 def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
-    """A sensor, by its name or its YAML file too, at an image size of (rows, columns)."""
+    """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
     if isinstance(sensor, Sensor):
         return sensor if size is None else sensor.resized(*size)
     build = read_sensor if sensor.lower().endswith(ENDINGS) else build_sensor
@@ -245,7 +245,7 @@ def read(path: str | Path, sensor: Sensor | str | None = None) -> Tensor:
 
 
 def own_reading(spec: str | Path) -> Reading | None:
-    """How scans that r2flow wrote are read: prepared scans, samples and simulated scans; None for other scans."""
+    """The stored reading of scans that r2flow wrote (prepared, sampled or simulated); None for other scans."""
     options, _ = parse(str(spec))
     if options.name not in (PREPARED, FOLDER):
         return None
@@ -256,7 +256,7 @@ def own_reading(spec: str | Path) -> Reading | None:
 
 
 def usual_scale(spec: str | Path, sensor: Sensor) -> float:
-    """The value in the files of a set of scans that usually means full reflectance: 1 in what r2flow wrote."""
+    """Default value of full reflectance in the files of a set of scans; 1 in files that r2flow wrote."""
     options = parse(str(spec))[0]
     if options.name == FOLDER:
         return 1.0 if made_here(options.folder) else sensor.reflectance_scale or 1.0
@@ -264,7 +264,7 @@ def usual_scale(spec: str | Path, sensor: Sensor) -> float:
 
 
 def _manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a folder that r2flow wrote, empty where there is none."""
+    """The manifest of a folder; empty if the folder has none."""
     try:
         return read_manifest(folder)
     except (FileNotFoundError, NotADirectoryError):
@@ -272,32 +272,32 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def drawn_recipe(folder: Path) -> dict[str, Any] | None:
-    """The recipe of a folder of samples or of completed scans; None of another folder."""
+    """The recipe of a folder of samples or completed scans; None for other folders."""
     manifest = _manifest(folder)
     return manifest["recipe"] if manifest.get("format") in ("r2flow samples", "r2flow answers") else None
 
 
 def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
-    """Refuse a folder whose note says that its images are of another sensor or size."""
+    """Refuse a folder whose manifest has another sensor or size."""
     recipe = drawn_recipe(folder)
     if recipe is None:
         return
-    own = Reading.of(recipe["reading"])
-    if own.sensor.shape == sensor.shape and np.allclose(own.sensor.elevations, sensor.elevations):
+    stored = Reading.of(recipe["reading"])
+    if stored.sensor.shape == sensor.shape and np.allclose(stored.sensor.elevations, sensor.elevations):
         return
-    there, here = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (own.sensor, sensor))
+    theirs, ours = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (stored.sensor, sensor))
     raise InputError(
-        f"{folder} holds images of {there} (its {MANIFEST} says so), not of {here}: give no other --sensor or --size, "
-        "no scans of another one beside them, and for a model of another one point clouds (.ply, .bin)."
+        f"{folder} holds images of {theirs} (its {MANIFEST} says so), not of {ours}: give no other --sensor or --size, "
+        "no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, .bin)."
     )
 
 
 def refuse_parts(spec: str | Path) -> None:
-    """Refuse samples of a part of each image: beside whole scans they would be judged as scans that lack the rest."""
+    """Refuse samples of a region of the image: metrics would treat the rest of the image as missing returns."""
     options, _ = parse(str(spec))
     if options.name == FOLDER and (drawn_recipe(Path(options.folder)) or {}).get("region"):
         raise InputError(
-            f"{spec} holds a part of each scan alone (its {MANIFEST} says so) and cannot be judged beside whole scans: "
+            f"{spec} holds a part of each scan alone (see its {MANIFEST}) and cannot be compared with whole scans: "
             "sample without --sector and --rows."
         )
 
@@ -308,17 +308,17 @@ def refuse_parts(spec: str | Path) -> None:
 def open_prepared(
     root: str | Path, reading: Reading, split: str | None = None, drives: Sequence[str | int] | None = None
 ) -> PreparedScans:
-    """The scans of a folder that `r2flow prepare` has written, by the split and the drives of their data set."""
+    """Open a folder of `r2flow prepare`, by the split and the drives of its data set."""
     folder = Path(root).expanduser()
-    recipe, held = read_prepared(folder)
+    recipe, stored = read_prepared(folder)
     refuse_other_images(folder, recipe, reading)
     kind = SOURCES[recipe["layout"]] if recipe["layout"] in SOURCES else SourceKind()
     if split is None and drives is None:
-        parts = sorted({part for drive in held if (part := kind.split_of(drive.name))})
+        parts = sorted({part for drive in stored if (part := kind.split_of(drive.name))})
         if len(parts) > 1:
             log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(parts))
-    spans = dict(zip(map(id, held), spans_of(held), strict=True))
-    numbers = [number for drive in kind.chosen(held, split, drives) for number in spans[id(drive)]]
+    spans = dict(zip(map(id, stored), spans_of(stored), strict=True))
+    numbers = [number for drive in kind.chosen(stored, split, drives) for number in spans[id(drive)]]
     scans = PreparedScans(folder, numbers, bool(reading.reflectance))
     if not len(scans):
         raise InputError(f"{folder} holds no usable scan of split={split!r}, drives={drives}.")

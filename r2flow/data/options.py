@@ -1,4 +1,4 @@
-"""Every key of a run's `data`, once: its type, its default and what it means."""
+"""Keys of a run's `data`: types, defaults and meaning."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,15 +13,15 @@ from r2flow.lidar.scan_files import check_columns
 from r2flow.registry import Count, Natural, NonNegative, Portion, Positive, Seed, check_options
 from r2flow.samplers import build_sampler
 
-SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
+SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # names in `r2flow.data.opening.SOURCES`
 Data = dict[str, Any]  # of a config
-MIXED, PAIRS = "mixed", "pairs"  # what `data.name` may be besides: several sets of scans, and pairs drawn by a flow
-MOST_SCENES = 10**7  # whose order alone takes 80 MB
+MIXED, PAIRS = "mixed", "pairs"  # other values of `data.name`: several sets of scans, and pairs drawn by a flow
+MOST_SCENES = 10**7  # their order takes 80 MB
 
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """The fields of a `Reading` that a config chooses (`data.reading`); None: the parent's, the scans' or the usual."""
+    """Fields of a `Reading` in a config (`data.reading`); None: from the parent run or the scans, or default."""
 
     projection: Projection | None = None
     convention: Convention | None = None
@@ -32,15 +32,15 @@ class ReadingOptions:
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """One set of scans. A value that cannot be is refused (`InputError`), here and in the options below."""
+    """One set of scans. Invalid values raise `InputError`, here and in the options below."""
 
-    name: str = SIMULATED  # its kind: a name in `r2flow.data.opening.SOURCES`
+    name: str = SIMULATED  # kind of scans: a name in `r2flow.data.opening.SOURCES`
     root: str | int | None = None  # folder of the data set
     split: str | None = None  # part of the data set's standard split; None takes all
     drives: list[str | int] | None = None  # names or numbers of the drives to take; None takes all
     scenes: int = 512  # number of simulated scenes
     reading: Mapping[str, Any] | None = None  # fields of `r2flow.data.reading.Reading`: projection, convention, ...
-    weight: Positive | None = None  # of one of several sets: its share of a run's images
+    weight: Positive | None = None  # of a part of `mixed`: relative share of a run's images
 
     def __post_init__(self) -> None:
         if not 1 <= self.scenes <= MOST_SCENES:
@@ -50,7 +50,7 @@ class SourceOptions:
 
     @property
     def chosen(self) -> dict[str, Any]:
-        """What `reading` says."""
+        """The fields of `reading` that are not None."""
         return {key: value for key, value in (self.reading or {}).items() if value is not None}
 
     @property
@@ -59,12 +59,12 @@ class SourceOptions:
 
     @property
     def on_bad_scan(self) -> str:
-        found: str = self.chosen.get("on_bad_scan", "error")
-        return found
+        action: str = self.chosen.get("on_bad_scan", "error")
+        return action
 
     @property
     def folder(self) -> str:
-        """`root`, which is a folder's name even where it looks like a number."""
+        """`root` as a string: YAML reads a folder name of digits as a number."""
         if self.root is None:
             raise InputError(f"data={self.name} needs the folder of its scans: data.root=FOLDER.")
         return str(self.root)
@@ -72,30 +72,30 @@ class SourceOptions:
 
 @dataclass(frozen=True)
 class ValidationOptions:
-    """What is held out of the training (`data.validation`)."""
+    """Held-out scans (`data.validation`)."""
 
-    share: Portion = 0.1  # about this share of the scans, in one contiguous block
-    scans: Natural = 64  # the most scans to validate on
+    share: Portion = 0.1  # approximate share of the scans to hold out, in one contiguous block
+    scans: Natural = 64  # maximum number of validation scans
     data: Mapping[str, Any] | None = None  # another set of scans to hold out instead: {name, root, split, drives, ...}
 
 
 @dataclass(frozen=True)
 class PairOptions:
-    """The choices behind a set of pairs (`data.pairs`)."""
+    """Settings of a set of pairs (`data.pairs`)."""
 
     num: Count = 1000
     sampler: Mapping[str, Any] = field(default_factory=lambda: {"name": "adams3"})  # of the flow that draws them
-    batch_size: Count = 16  # pairs solved together; the last bits of a pair depend on it
-    shard_mib: Positive = 16.0  # of a shard, which a killed process begins again
-    seed: Seed = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
-    first: Seed | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
-    precision: Precision = "32-true"  # of the network
-    knots: Natural | None = None  # inner states of each path to keep with its pair, for stage=flow_map
-    of: str | None = None  # the flow that draws them; None: that of stage.init
-    parent: str | None = None  # hash of the flow; the run fills it in
+    batch_size: Count = 16  # pairs solved in one batch; the last bits of a pair depend on it
+    shard_mib: Positive = 16.0  # size of a shard; a killed process repeats its shard
+    seed: Seed = 0  # seed of the noise, separate from the run's: runs of several seeds can share one set of pairs
+    first: Seed | None = None  # index of the first pair; None: after the pairs that the flow itself was trained on
+    precision: Precision = "32-true"  # precision of the network
+    knots: Natural | None = None  # number of inner states of each path to store with its pair, for stage=flow_map
+    of: str | None = None  # the flow that draws the pairs; None: the flow of stage.init
+    parent: str | None = None  # hash of the flow, filled in by the run
 
     def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
-        """All that pairs depend on, where scans and their noise have these shapes in model space."""
+        """The recipe of the pairs for these shapes of scans and noise in model space."""
         sampler = build_sampler(self.sampler).asdict()
         if self.knots:
             build_sampler(sampler).knot_times(self.knots)
@@ -109,19 +109,19 @@ class PairOptions:
 
 @dataclass(frozen=True)
 class DataOptions(SourceOptions):
-    """All of a run's `data`. `name` may also be `mixed` or `pairs`; `root` is then that of the pairs.
+    """All keys of a run's `data`. `name` may also be `mixed` or `pairs`; for `pairs`, `root` is their folder.
 
-    Weights of parts are the shares of the run's images; without any, all scans are one set.
+    The weights of parts are relative shares of the run's images; without weights, the parts are concatenated.
     """
 
     parts: Sequence[Mapping[str, Any]] | None = None  # of `mixed`: {name, root, split, drives, ..., weight} each
-    augment: Mapping[str, Any] | None = None  # `r2flow.data.augment.Augmentation`, of training scans alone
+    augment: Mapping[str, Any] | None = None  # `r2flow.data.augment.Augmentation`, of training scans only
     batch_size: Count = 8  # images in one optimiser step, over all devices and accumulated batches
-    workers: Natural = 0  # loader processes of each device
-    memory_gib: NonNegative = 2.0  # training scans are kept in memory where they fit into this, else read when needed
+    workers: Natural = 0  # loader processes per device
+    memory_gib: NonNegative = 2.0  # training scans that fit into this are kept in memory, others read when needed
     validation: Mapping[str, Any] | None = None  # `ValidationOptions`
-    pairs: Mapping[str, Any] | None = None  # `PairOptions`, where the data are pairs
-    scans: Mapping[str, Any] | None = None  # `SourceOptions` of scans beside pairs, for the velocities of a flow map
+    pairs: Mapping[str, Any] | None = None  # `PairOptions`, for pairs
+    scans: Mapping[str, Any] | None = None  # `SourceOptions` of scans next to pairs, for the velocities of a flow map
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -138,15 +138,15 @@ class DataOptions(SourceOptions):
         check_options("data.validation", ValidationOptions, self.validation or {})
         return ValidationOptions(**(self.validation or {}))
 
-    # What follows needs the `data` of `r2flow.data.resolving.resolve`.
+    # The following properties need the `data` of `r2flow.data.resolving.resolve`.
 
     @property
     def sets(self) -> list[SourceOptions]:
         """The sets of scans to train on; empty for pairs."""
         if self.name == MIXED:
             return [SourceOptions(**part) for part in self.parts or ()]
-        alone = SourceOptions(**{f.name: getattr(self, f.name) for f in fields(SourceOptions)})
-        return [] if self.name == PAIRS else [alone]
+        single = SourceOptions(**{f.name: getattr(self, f.name) for f in fields(SourceOptions)})
+        return [] if self.name == PAIRS else [single]
 
     @property
     def held_out(self) -> SourceOptions | None:

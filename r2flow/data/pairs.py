@@ -1,4 +1,4 @@
-"""Reflow pairs (x_0, x_1): noise and where a flow carries it."""
+"""Reflow pairs (x_0, x_1): noise and the sample that a flow maps it to."""
 
 import copy
 import time
@@ -23,29 +23,29 @@ from r2flow.models import name_of
 from r2flow.samplers import build_sampler
 from r2flow.store import Damaged, Store
 
-ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
+ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # advice for messages: how to choose another folder
 
 
 @dataclass(frozen=True)
 class PairRecipe:
-    """What a pair depends on, apart from its index: two folders of one recipe hold the same bytes."""
+    """All that a pair depends on, except its index: folders with equal recipes hold the same bytes."""
 
-    parent: str  # hash of the flow's weights and of what they mean
+    parent: str  # hash of the flow's weights and config
     shape: tuple[int, int, int]  # (C, H, W) of a scan in model space
-    seed: int  # x_0 of index i is the noise of (seed, "pairs", i); it is never stored
+    seed: int  # x_0 of index i is the noise of (seed, "pairs", i), which is not stored
     first: int  # index of the first pair
-    sampler: dict[str, Any]  # name and fields of the flow's
-    batch_size: int  # consecutive indices that are solved together
+    sampler: dict[str, Any]  # name and fields of the flow's sampler
+    batch_size: int  # consecutive indices that are solved in one batch
     shard_batches: int  # batches in a shard
-    noise_shape: tuple[int, ...] | None = None  # of x_0, where it is not the scan's
-    knots: int = 0  # inner states of each path that are kept with it
-    precision: Precision = "32-true"  # of the network
+    noise_shape: tuple[int, ...] | None = None  # shape of x_0, if it differs from the scan's
+    knots: int = 0  # number of inner states stored per path
+    precision: Precision = "32-true"  # precision of the network
 
 
 class PairStore(Store):
     """A folder of pairs: shard s holds the batches [s S, (s + 1) S), batch b the indices first + [b B, (b + 1) B).
 
-    The last shard is as long as the first `num` pairs need, and is made again when more are asked for.
+    The last shard has only the batches that the first `num` pairs need; it is made again for a larger `num`.
     """
 
     def __init__(self, folder: str | Path, recipe: PairRecipe, num: int) -> None:
@@ -60,7 +60,7 @@ class PairStore(Store):
         return range(shard * size, min((shard + 1) * size, -(-self.num // self.recipe.batch_size)))
 
     def has(self, item: int) -> bool:
-        """Whether a shard is there and as long as the first `num` pairs need."""
+        """Whether a shard exists and has all batches that the first `num` pairs need."""
         try:
             usable = self.head(item)["usable"]
         except (FileNotFoundError, Damaged):
@@ -68,22 +68,22 @@ class PairStore(Store):
         return len(usable) >= len(self.batches_of(item)) * self.recipe.batch_size
 
     def missing_pairs(self) -> int:
-        """How many pairs are in the shards that have yet to be made."""
+        """Number of pairs in missing shards."""
         return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.recipe.batch_size
 
 
 def pair_noise(recipe: PairRecipe, index: int) -> Tensor:
-    """x_0 of a pair, of the recipe's noise shape or (C, H, W), drawn again from its index."""
+    """x_0 of a pair, in the recipe's noise shape or (C, H, W), drawn from its index."""
     return noise.standard_normal(recipe.noise_shape or recipe.shape, recipe.seed, "pairs", index)
 
 
 @dataclass
 class Made:
-    """What one process has done."""
+    """Progress of one process."""
 
     pairs: int = 0
     evaluations: int = 0
-    unusable: int = 0  # pairs that are left out
+    unusable: int = 0  # pairs left out
     seconds: float = 0.0
 
 
@@ -95,22 +95,22 @@ def make_pairs(
     progress: Callable[[Made], None] = lambda made: None,
     wait: bool = True,
 ) -> Made:
-    """Make those of the store's pairs that are missing or damaged, and that no other process is making.
+    """Make the missing or damaged pairs of a store, except those that other processes are making.
 
-    x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. By `chord` or
-    `renoise` of a flow map it is where its first jump goes, as its later jumps correct it; fresh noise is a function of
-    (seed, index, step). A batch is computed alike whoever makes it, so the shards are the same, byte for byte, for any
-    number of processes; rank r of R begins with shard r, r + R, ... `progress` is called after each batch.
+    x_1 is the generator's sample for x_0 = `pair_noise`, neither clamped nor snapped, in half precision. With `chord`
+    or `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function
+    of (seed, index, step). Batches do not depend on the process: shards are byte-identical for any number of processes.
+    Rank r of R starts with shards r, r + R, ... `progress` is called after each batch.
 
     Args:
-        wait: Whether to wait for the shards that other processes are making.
+        wait: Whether to wait for shards that other processes are making.
     """
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
-        raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
+        raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")
     sampler = build_sampler(store.recipe.sampler)
     sampler.check(generator)
     if not sampler.paired:
-        raise InputError(f"a pair is the ends of one path, which sampler {sampler.name} leaves: give a solver.")
+        raise InputError(f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
     if generator.fixed and sampler != generator.sampler:
         raise InputError(
             f"this generator was distilled for {generator.sampler} and draws no pairs by {sampler}: give the same "
@@ -147,7 +147,7 @@ def make_pairs(
 def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> dict[str, np.ndarray]:
     """The pairs first + [b B, (b + 1) B) of batch b: x_1, evaluations, usable and, with knots, the inner states.
 
-    States are float16, (B, C, H, W) and (B, K, C, H, W); a pair with one that half precision cannot hold is not usable.
+    States are float16, (B, C, H, W) and (B, K, C, H, W); pairs whose states overflow float16 are not usable.
     """
     indices = range(recipe.first + batch * recipe.batch_size, recipe.first + (batch + 1) * recipe.batch_size)
     x_0 = torch.stack([pair_noise(recipe, index) for index in indices]).to(generator.device)
@@ -170,7 +170,7 @@ def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> dict[st
 
 
 class PairSource:
-    """The usable ones of a store's pairs, each (x_0, x_1), both (C, H, W) float32 in model space."""
+    """The usable pairs of a store: (x_0, x_1), both (C, H, W) float32 in model space."""
 
     def __init__(self, store: PairStore) -> None:
         self.store = store
@@ -210,11 +210,11 @@ class PairSource:
 
 
 class PairDataset(Dataset[Item]):
-    """A pair as a training item, with the keys of `FlowDataset`; u is a function of (seed, purpose, k) alone.
+    """Pairs as training items, with the keys of `FlowDataset`; u depends only on (seed, purpose, k).
 
-    With knots there are two keys more: knots, (K, C, H, W), the inner states of the path, and times, (K + 2,), those of
-    x_0, the knots and x_1. With scans beside the pairs two others: scan, (C, H, W), one of them in model space, and
-    noise, (*noise_shape), which does not belong to it.
+    Further keys with knots: knots, (K, C, H, W), the inner states of the path, and times, (K + 2,), the times of x_0,
+    the knots and x_1. Further keys with `scans`: scan, (C, H, W), a scan in model space, and noise, (*noise_shape),
+    independent of the scan.
     """
 
     def __init__(
@@ -241,15 +241,15 @@ class PairDataset(Dataset[Item]):
         if self.times is not None:
             item |= {"knots": self.source.knots(index), "times": self.times}
         if self.scans is not None and self.order is not None:
-            beside = self.scans[k, self.order[k]]
-            item |= {"scan": beside["x_1"], "noise": beside["x_0"]}
+            scan = self.scans[k, self.order[k]]
+            item |= {"scan": scan["x_1"], "noise": scan["x_0"]}
         return item
 
 
 def default_folder(checkpoint: Path) -> Path:
-    """The usual folder of a flow's pairs: `pairs` in its run's folder, or next to its file.
+    """The default folder of a flow's pairs: `pairs` in its run folder, or a folder next to its file.
 
-    Those of a model lie in `runs`, for its own folder is that of the package or of the models.
+    The pairs of an installed model lie in `runs`, not in the folder of the package or of the models.
     """
     if checkpoint.parent.name == "checkpoints":
         return checkpoint.parent.parent / "pairs"

@@ -1,4 +1,4 @@
-"""Scans of any sensor as what is known of a model's images: for `r2flow complete`.
+"""Scans of any sensor as partially measured images of a model's sensor, for `r2flow complete`.
 
 scans, lines = open_partial(["scans"], reading_for([], flow))
 scans[0].read()         image, state, xyz
@@ -34,25 +34,25 @@ from r2flow.lidar.transfer import (
 
 log = logging.getLogger(__name__)
 
-FEWER = 0.9  # of the columns: a turn of fewer rays leaves pixels between them
-FEW = 4  # simulated scans, where nobody says how many
+FEWER = 0.9  # with less than this share of rays per column, pixels between the rays are not measured
+FEW = 4  # default number of simulated scans
 
 Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors
 
 
 @dataclass(frozen=True)
 class PartialScan:
-    """A scan that is read when its turn comes."""
+    """A scan that is read on demand."""
 
-    name: str  # of its answers, without an ending: its path below the folder that was named
-    ending: str  # of its file; `.npy` of an image
+    name: str  # file name of its completions, without ending: its path below the given folder
+    ending: str  # ending of its file; `.npy` for an image
     read: Callable[[], Partial]
     content: Callable[[], bytes]
-    path: Path | None = None  # its file; None where it has none of its own
-    image: bool = True  # whether it is a range image, as its answers are then, or points
+    path: Path | None = None  # its file; None if it has no file
+    image: bool = True  # whether it is a range image or points; completions have the same form
 
     def identity(self) -> str:
-        """What tells the scan from another scan of its name."""
+        """Hash of the content, which distinguishes scans of the same name."""
         return hashlib.sha256(self.content()).hexdigest()[:16]
 
 
@@ -63,20 +63,20 @@ def open_partial(
     scale: float | None = None,
     most: int | None = None,
 ) -> Opened:
-    """The scans that names stand for (`open_scans`), read later but for some that tell their sensor.
+    """Open the scans of some names (`open_scans`). Scans are read on demand, except a few to determine their sensor.
 
-    A scan of the model's own sensor is measured everywhere. Of another sensor's, the rows are measured that its beams
-    look into: the beams of `source`, else of the sensor that samples and prepared scans name, else those found in the
-    scans.
+    A scan of the model's sensor is measured everywhere. A scan of another sensor is measured in the rows that contain
+    its beams: the beams of `source`, else of the sensor stored with samples and prepared scans, else an estimate from
+    the scans.
 
     Args:
         reading: How the model's training scans became images.
-        source: The sensor of the scans, where it is known.
-        scale: The value in scan files that means full reflectance; the usual one if left out.
-        most: The most scans of each name, evenly spread; all of them, and `FEW` simulated ones, if left out.
+        source: The sensor of the scans, if known.
+        scale: The value in scan files that means full reflectance; None: the default.
+        most: Maximum number of scans per name, evenly spread; None: all scans, or `FEW` simulated scans.
     """
     opened: list[Opened] = []
-    groups: dict[tuple[Path, str], list[Path]] = {}  # files that are named one by one, by their folder
+    groups: dict[tuple[Path, str], list[Path]] = {}  # files by their folder and name
     for spec in specs:
         options, file = parse(str(spec))
         if options.name in (SIMULATED, PREPARED):
@@ -91,9 +91,9 @@ def open_partial(
         _files(folder, paths, spec or str(paths[0]), reading, source, scale) for (folder, spec), paths in groups.items()
     ]
     scans = [scan for some, _ in opened for scan in some]
-    twice = [name for name, count in Counter(scan.name for scan in scans).items() if count > 1]
-    if twice:
-        raise InputError(f"two of the scans are called {twice[0]}, and so would be their answers: complete them apart.")
+    duplicates = [name for name, count in Counter(scan.name for scan in scans).items() if count > 1]
+    if duplicates:
+        raise InputError(f"two of the scans would have answers called {duplicates[0]}: complete them apart.")
     return scans, [line for _, lines in opened for line in lines]
 
 
@@ -102,29 +102,29 @@ def _files(
 ) -> Opened:
     """Scan files of one sensor."""
     target, lines = reading.sensor, list[str]()
-    noted = own_reading(folder)
-    source = source or (noted.sensor if noted else None)
+    stored = own_reading(folder)
+    source = source or (stored.sensor if stored else None)
     images = {path for path in paths if path.suffix.lower() == ".npy" and read_numbers(path).ndim == 3}
     read_image: Callable[[Path], Partial] = partial(_read_image, source=source, target=target)
     by_points = read_image
     if points := [path for path in paths if path not in images]:
-        some = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
-        doubt = other_sensor(some, source or target)
-        if source and doubt and not noted:
+        scans = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
+        doubt = other_sensor(scans, source or target)
+        if source and doubt and not stored:
             fits = f"; they fit --from {doubt.name}" if doubt.name else ""
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         if not source and not doubt and target.name in SENSORS and SENSORS[target.name].shape[0] < target.shape[0]:
-            source = SENSORS[target.name]  # its beams are fewer than the rows of the answers
+            source = SENSORS[target.name]  # fewer beams than rows of the completions
         same = _same_view(source, target) if source else doubt is None
         try:
-            fired = sensor_of(some, source or (target if same else None))
+            fired = sensor_of(scans, source or (target if same else None))
         except InputError as error:
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
         if same and fired.columns >= FEWER * target.columns:
-            full = scale or (1.0 if noted else max(usual_scale(spec, source or target), full_reflectance(some) or 0))
+            full = scale or (1.0 if stored else max(usual_scale(spec, source or target), full_reflectance(scans) or 0))
             by_points = partial(_read_points, reading=reading, fired=None, scale=full, strict=True)
         else:
-            full = scale or (1.0 if noted else source and source.reflectance_scale) or full_reflectance(some) or 1.0
+            full = scale or (1.0 if stored else source and source.reflectance_scale) or full_reflectance(scans) or 1.0
             by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines.append(_described(spec, replace(fired, name=name), target, turns=True))
@@ -142,25 +142,25 @@ def _files(
 
 
 def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None) -> Opened:
-    """Simulated and prepared scans, by their numbers in the whole set."""
-    target, how = reading.sensor, own_reading(spec)
-    simulated = how is None
-    how = how or replace(reading, sensor=source or target)
-    scans = open_scans(spec, how, num=(most or FEW) if simulated else None).source
+    """Simulated and prepared scans, named by their number in the whole set."""
+    target, stored = reading.sensor, own_reading(spec)
+    simulated = stored is None
+    stored = stored or replace(reading, sensor=source or target)
+    scans = open_scans(spec, stored, num=(most or FEW) if simulated else None).source
     kind = spec.replace(":", "-") if simulated else Path(spec).name
 
     def opened(number: int) -> PartialScan:
         name = f"{kind}-{number:06d}"
         content = name.encode if simulated else lambda: scans[number].tobytes()
-        return PartialScan(name, ".npy", lambda: _seen(scans[number], how.sensor, target), content)
+        return PartialScan(name, ".npy", lambda: _seen(scans[number], stored.sensor, target), content)
 
-    same = _same_image(how.sensor, target)
-    lines = [] if same else [_described(spec, how.sensor, target)]
+    same = _same_image(stored.sensor, target)
+    lines = [] if same else [_described(spec, stored.sensor, target)]
     return [opened(number) for number in spread(len(scans), most or len(scans))], lines
 
 
 def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -> str:
-    """In a line: the sensor, how many rows it measures, what is left out."""
+    """A line about the sensor, the number of measured rows and the omitted beams."""
     e = source.elevations
     rows = rows_of(np.asarray(e), target)
     beams = f"{source.name} with {len(e)} beams from {e[0]:+.1f} to {e[-1]:+.1f} degrees"
@@ -179,7 +179,7 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
 
 
 def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: float, strict: bool) -> Partial:
-    """Points of the model's sensor or, with `fired`, of another one."""
+    """Read points of the model's sensor or, with `fired`, of another sensor."""
     target, points = reading.sensor, read_points(path, reading.columns)
     if fired is None and reading.projection == "unfolding":
         points = points.with_lost_rays()
@@ -233,7 +233,7 @@ def _same_image(source: Sensor, target: Sensor) -> bool:
 
 
 def _strength(path: Path, points: Points, scale: float, strict: bool) -> np.ndarray | None:
-    """Reflectance of [0, 1]; None where a file has none, or 0 throughout."""
+    """Reflectance in [0, 1]; None if a file has no reflectance, or only 0."""
     if points.reflectance is None or not points.reflectance.any():
         return None
     scaled = scaled_reflectance(path, points, scale) if strict else points.reflectance / np.float32(scale)

@@ -3,8 +3,8 @@
     source = open_scans("prepared/kitti_360").source
     source[0]                       range in metres and reflectance, (2, H, W)
 
-A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, where the scans have any, `reflectance` uint8
-(n, H, W), in the codes of `r2flow.data.quantise`.
+A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, if the scans have it, `reflectance` uint8 (n, H, W),
+in the codes of `r2flow.data.quantise`.
 """
 
 import hashlib
@@ -32,9 +32,9 @@ log = logging.getLogger(__name__)
 
 KIND = "scans"
 CHANNELS = ("range", "reflectance")
-SHARD_SCANS = 64  # 13 MB at 64 x 1024, held in memory while they are made
-PROBED = 8  # scans that tell whether a data set has reflectance, and in which steps
-PROJECTION = 1  # to be raised when the same files give other images, or images other codes
+SHARD_SCANS = 64  # 13 MB at 64 x 1024, held in memory until written
+PROBED = 8  # number of scans read to determine the levels of reflectance
+PROJECTION = 1  # revision; increase it when the same files give different images or codes
 
 
 # Making
@@ -63,7 +63,7 @@ def plan_files(
     reading: Reading,
     shard_scans: int = SHARD_SCANS,
 ) -> Plan:
-    """Scan files in drives below a root; some of them decide the levels of reflectance."""
+    """Plan scan files in drives below a root; some scans are read to determine the levels of reflectance."""
     root = Path(root).expanduser()
     paths = [path for drive in drives for path in drive.scans]
     named = tuple(Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in drives)
@@ -83,15 +83,15 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
     """Levels of reflectance; None if the scans lack reflectance."""
     if lacks_reflectance(paths, "skip", reading.columns) is not None:
         return None
-    found, scale, images = [], reading.reflectance_scale or 1.0, False
+    samples, scale, images = [], reading.reflectance_scale or 1.0, False
     for index in spread(len(paths), PROBED):
-        with suppress(InputError):  # reported when the scan's turn comes
+        with suppress(InputError):  # reported when the scan is prepared
             reflectance = stored_reflectance(paths[index], reading.columns)
             if reflectance is not None:
-                is_image = read_range_image(paths[index]) is not None  # whose reflectance lies in [0, 1]
-                found.append(reflectance / np.float32(1.0 if is_image else scale))
+                is_image = read_range_image(paths[index]) is not None  # with reflectance in [0, 1]
+                samples.append(reflectance / np.float32(1.0 if is_image else scale))
                 images |= is_image
-    values = np.concatenate(found) if found else np.zeros(0)
+    values = np.concatenate(samples) if samples else np.zeros(0)
     if not values.any():
         return OTHER_LEVELS
     levels, highest = find_levels(values), float(values.max())
@@ -104,7 +104,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
 
 
 def _make_shard(store: Store, source: ScanSource, skip: bool, shard: int) -> None:
-    """Project and code the scans of a shard."""
+    """Project and encode the scans of a shard."""
     recipe, numbers, left_out, errors = store.described, _numbers_of(store.described, shard), [], [0.0, 0.0]
     coders = dict(zip(CHANNELS, codes_of(recipe), strict=False))
     shape = (len(numbers), *Reading.of(recipe["reading"]).sensor.shape)
@@ -134,14 +134,14 @@ def prepare(
     checked: Advance = lambda shard: None,
     made: Advance = lambda shard: None,
 ) -> list[dict[str, Any]]:
-    """Check the shards of a folder, and make those that are missing or damaged.
+    """Check the shards of a folder, and make missing or damaged shards.
 
     Args:
-        on_bad_scan: `error`, or `skip` to leave out what cannot be used.
-        checked, made: Called with each shard.
+        on_bad_scan: `error`, or `skip` to leave out unusable scans.
+        checked, made: Callbacks, called with each shard.
 
     Returns:
-        The notes of the shards: numbers of the scans left out, and the largest errors of range and reflectance.
+        The headers of the shards: numbers of the scans left out, and maximum errors of range and reflectance.
     """
     store = plan.store(folder)
     if not store.check() or store.missing(plan.shards):
@@ -162,7 +162,7 @@ def _numbers_of(recipe: Mapping[str, Any], shard: int) -> range:
 
 
 def codes_of(recipe: Mapping[str, Any]) -> list[RangeCodes | ReflectanceCodes]:
-    """The codes of range and, where the scans have it, of reflectance."""
+    """The codes of range and, if the scans have it, of reflectance."""
     sensor, levels = recipe["reading"]["sensor"], recipe["levels"]
     ranges = RangeCodes(sensor["min_range"], sensor["max_range"])
     return [ranges] if levels is None else [ranges, ReflectanceCodes(levels)]
@@ -181,34 +181,34 @@ def read_prepared(folder: Path) -> tuple[dict[str, Any], list[Drive]]:
 
 
 def refuse_other_images(folder: Path, recipe: Mapping[str, Any], reading: Reading) -> None:
-    """Refuse prepared scans of another sensor, size, projection or convention: nothing is projected here."""
-    # An image is the same whatever these are; the order of the lasers matters where rows are found by it.
+    """Refuse prepared scans of another sensor, size, projection or convention, as they cannot be projected again."""
+    # Images do not depend on these fields; the order of the lasers determines the rows in unfolding only.
     irrelevant = {"name", "height"} if reading.projection == "unfolding" else {"name", "height", "firing"}
     images = []
-    for one in (recipe["reading"], reading.described()):
-        sensor = {key: value for key, value in one["sensor"].items() if key not in irrelevant}
-        images.append({**sensor, "projection": one["projection"], "convention": one["convention"]})
-    if found := difference(*images):
-        there = Reading.of(recipe["reading"])
+    for fields in (recipe["reading"], reading.described()):
+        sensor = {key: value for key, value in fields["sensor"].items() if key not in irrelevant}
+        images.append({**sensor, "projection": fields["projection"], "convention": fields["convention"]})
+    if differing := difference(*images):
+        stored = Reading.of(recipe["reading"])
         raise InputError(
-            f"{folder} was prepared for other images (sensor {there.sensor.name}, "
-            f"{there.sensor.shape[0]}x{there.sensor.shape[1]}, {there.projection}, {there.convention}): {found}. Give "
-            "the run the same, or prepare the scans for it."
+            f"{folder} was prepared for other images (sensor {stored.sensor.name}, "
+            f"{stored.sensor.shape[0]}x{stored.sensor.shape[1]}, {stored.projection}, {stored.convention}): "
+            f"{differing}. Give the run the same, or prepare the scans for it."
         )
 
 
 class PreparedScans(ScanSource):
-    """Scans of shards as a source.
+    """A source of prepared scans.
 
     Args:
-        numbers: Of the data set's scans; those that were left out are passed over. None takes all.
+        numbers: Numbers of scans in the data set; scans left out in preparation are skipped. None takes all.
     """
 
     def __init__(self, folder: Path, numbers: Sequence[int] | None = None, reflectance: bool = True) -> None:
         self.folder, self.reflectance = folder, reflectance
         self.recipe, self._drives = read_prepared(folder)
         plan = Plan(self.recipe, tuple(self._drives), self)
-        self.store, held = plan.store(folder), []
+        self.store, entries = plan.store(folder), []
         if reflectance and self.recipe["levels"] is None:
             raise InputError(f"{folder} holds scans without reflectance. Set encoding.reflectance=false.")
         for shard in plan.shards:
@@ -219,9 +219,9 @@ class PreparedScans(ScanSource):
             except Damaged as error:
                 raise self._damaged(shard, error) from None
             rows = [number for number in _numbers_of(self.recipe, shard) if number not in left_out]
-            held += [(number, shard, row) for row, number in enumerate(rows)]
+            entries += [(number, shard, row) for row, number in enumerate(rows)]
         #: Rows of (number in the data set, shard, row of the shard).
-        self.rows = np.array(held, dtype=np.int64).reshape(-1, 3)
+        self.rows = np.array(entries, dtype=np.int64).reshape(-1, 3)
         if numbers is not None:
             place = {int(number): row for row, number in enumerate(self.rows[:, 0])}
             self.rows = self.rows[[place[number] for number in numbers if number in place]]
@@ -229,7 +229,7 @@ class PreparedScans(ScanSource):
         self._shards: dict[int, list[Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_shards": {}}  # memory maps stay in their process
+        return {**self.__dict__, "_shards": {}}  # memory maps are not pickled
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -250,8 +250,8 @@ class PreparedScans(ScanSource):
     @property
     def drives(self) -> dict[str, list[int]]:  # type: ignore[override]
         place = {name: index for index, name in enumerate(self.names)}
-        found = {d.name: [place[n] for n in d.scans if n in place] for d in self._drives}
-        return {drive: numbers for drive, numbers in found.items() if numbers}
+        drives = {d.name: [place[n] for n in d.scans if n in place] for d in self._drives}
+        return {drive: numbers for drive, numbers in drives.items() if numbers}
 
     def about(self) -> dict[str, Any]:
         kind = f"prepared {self.recipe['layout']}"
@@ -263,7 +263,7 @@ class PreparedScans(ScanSource):
 
     @cached_property
     def _contents(self) -> str:
-        """Hash of the heads of all shards, which hold their checksums."""
+        """Hash of the headers of all shards, which contain their checksums."""
         digest = hashlib.sha256(self.store.digest.encode())
         for shard in np.unique(self.rows[:, 1]):
             with open(self.store.files(int(shard))[0], "rb") as file:
@@ -278,13 +278,13 @@ class PreparedScans(ScanSource):
         _, shard, row = map(int, self.rows[index])
         try:
             if shard not in self._shards:
-                self.store.head(shard)  # as long as its head says, and of this recipe
+                self.store.head(shard)  # checks the file's length and recipe
                 file = safe_open(self.store.files(shard)[0], framework="numpy")
                 self._shards[shard] = [file.get_slice(name) for name in CHANNELS[: len(self._values)]]
         except (Damaged, OSError) as error:
             raise self._damaged(shard, error) from None
         codes = [image[row : row + 1][0] for image in self._shards[shard]]
-        # No index is out of bounds; "clip" only skips the check.
+        # No index is out of bounds; mode="clip" only skips the bounds check.
         return np.stack([np.take(values, code, mode="clip") for values, code in zip(self._values, codes, strict=True)])
 
     def _damaged(self, shard: int, error: Exception) -> InputError:

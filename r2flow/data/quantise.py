@@ -1,29 +1,29 @@
-"""Range images as whole numbers: range in uint16, reflectance in uint8, and what is lost by it."""
+"""Quantisation of range images: range as uint16, reflectance as uint8."""
 
 import math
 
 import numpy as np
 
-CODES = 2**16  # code 0 is no return; the others climb from min_range to max_range
-STEP = 1.9e-3  # metres: half of it, and float32's rounding, stay below a millimetre
-KNEE = 65.0  # metres up to which the step is held, where the sensor reaches too far for one step
+CODES = 2**16  # code 0: no return; codes 1 to 65535 increase from min_range to max_range
+STEP = 1.9e-3  # metres: half a step plus float32's rounding is below a millimetre
+KNEE = 65.0  # metres: limit of the fine step, if the sensor's range is too long for a single step
 
-# Levels that scanners and their data sets report: KITTI-360 n / 256, KITTI n / 100, others a byte n / 255.
+# Reflectance levels of data sets: KITTI-360 n / 256, KITTI n / 100, others a byte n / 255.
 KNOWN_LEVELS = (256, 100, 255)
 OTHER_LEVELS = 255
-ROUNDING = 1e-6  # some KITTI files hold n times 0.01 in float32 instead of n / 100: 0.20000002
+ROUNDING = 1e-6  # some KITTI files store n * 0.01 in float32 instead of n / 100: 0.20000002
 
 
 class RangeCodes:
-    """uint16 codes of the ranges [min_range, max_range], finest where it matters.
+    """uint16 codes of ranges in [min_range, max_range], with finer steps at short range.
 
     r(0) = 0, no return;
     r(c) = min_range + (c - 1) fine     for 1 <= c <= knee_code;
     r(c) = knee + (c - knee_code) coarse     for knee_code <= c <= 65535.
 
-    One step, fine = (max_range - min_range) / 65534, where that is at most `STEP` (limits up to 124 m apart); else at
-    most `STEP` as far as 65 m, and what codes are left share the rest. A range is off by at most half a step. `values`
-    is what each code means, (65536,), float32.
+    Single step fine = (max_range - min_range) / 65534 if that is at most `STEP` (max_range - min_range up to 124 m);
+    else fine <= `STEP` up to 65 m, and the remaining codes divide the rest. The error is at most half a step. `values`
+    are the decoded ranges, (65536,), float32.
     """
 
     dtype = np.uint16
@@ -45,9 +45,9 @@ class RangeCodes:
         self.values[0] = 0
 
     def encode(self, r: np.ndarray) -> np.ndarray:
-        """Ranges in metres, 0 where no return, to the codes nearest to them, uint16."""
+        """The nearest codes, uint16, of ranges in metres, 0 for no return."""
         returned = r != 0
-        if not ((r >= self.near) & (r <= self.far) | ~returned).all():  # NaN is refused too
+        if not ((r >= self.near) & (r <= self.far) | ~returned).all():  # refuses NaN, too
             raise ValueError(f"ranges must be 0 or lie in [{self.near:g}, {self.far:g}] m.")
         r = r.astype(np.float64)
         code = 1 + (r - self.min_range) / (self.fine or 1)
@@ -57,9 +57,9 @@ class RangeCodes:
 
 
 class ReflectanceCodes:
-    """uint8 codes of reflectance, n / levels; a value between two levels becomes the nearer one.
+    """uint8 codes of reflectance, n / levels, rounded to the nearest level.
 
-    `values` is what each code means, (256,), float32 in [0, 1].
+    `values` are the decoded reflectances, (256,), float32 in [0, 1].
     """
 
     dtype = np.uint8
@@ -70,14 +70,14 @@ class ReflectanceCodes:
         self.values = np.minimum(np.arange(256, dtype=np.float32) / np.float32(levels), np.float32(1))
 
     def encode(self, reflectance: np.ndarray) -> np.ndarray:
-        """Reflectance in [0, 1] to codes, uint8. With 256 levels the highest is 255 / 256."""
+        """The codes, uint8, of reflectance in [0, 1]. With 256 levels the maximum is 255 / 256."""
         return np.clip(np.rint(reflectance * np.float32(self.levels)), 0, 255).astype(np.uint8)
 
     def fits(self, reflectance: np.ndarray) -> bool:
-        """Whether every value is one of the levels, but for the rounding of whoever wrote it."""
+        """Whether every value is a level, up to rounding."""
         return bool(np.abs(self.values[self.encode(reflectance)] - reflectance).max(initial=0) <= ROUNDING)
 
 
 def find_levels(reflectance: np.ndarray) -> int:
-    """The levels that some values of reflectance are whole multiples of; 255 where they fit none."""
+    """The number of levels n for which all values are multiples of 1 / n; 255 if no known n fits."""
     return next((n for n in KNOWN_LEVELS if ReflectanceCodes(n).fits(reflectance)), OTHER_LEVELS)

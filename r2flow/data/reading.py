@@ -1,4 +1,4 @@
-"""How a scan file, or a range image, becomes an image of one sensor."""
+"""Reading of scan files and range images as images of a sensor."""
 
 import json
 import math
@@ -21,16 +21,16 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Reading:
-    """How scans of any kind become images of one sensor.
+    """How scans become images of a sensor.
 
     Attributes:
         projection, convention: As in `r2flow.lidar.projection.project`.
-        reflectance_scale: The value in the files that means full reflectance; None guesses it from each file, which is
-            good enough for a picture alone.
-        reflectance: Whether images have reflectance: True needs it of every scan; `auto` is `lacks_reflectance`.
-        on_bad_scan: What is done with a scan that cannot be used. `error` stops; `skip` takes the next usable scan;
-            `empty` stops, too, but a scan without a return in the sensor's view is an empty image.
-        within_limits: Whether a range in a range image beyond the sensor's limits is a dropped ray, as among points.
+        reflectance_scale: The value in the files that means full reflectance; None estimates it from each file, which
+            is good enough for pictures only.
+        reflectance: Whether images have reflectance: True requires it of every scan; `auto`: see `lacks_reflectance`.
+        on_bad_scan: Treatment of unusable scans. `error` raises; `skip` takes the next usable scan; `empty` raises,
+            but returns an empty image for a scan without a return in the sensor's view.
+        within_limits: Whether ranges of a range image beyond the sensor's limits are dropped, as those of points are.
         columns: As in `r2flow.lidar.scan_files.read_points`.
     """
 
@@ -44,43 +44,43 @@ class Reading:
     columns: tuple[str, ...] | None = None
 
     def described(self) -> dict[str, Any]:
-        """All of it as plain values, for a manifest or a note."""
-        own = {f.name: getattr(self, f.name) for f in fields(self)} | {"sensor": self.sensor.described()}
-        plain: dict[str, Any] = json.loads(json.dumps(own))  # tuples are lists there
+        """All fields as plain values, for manifests."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)} | {"sensor": self.sensor.described()}
+        plain: dict[str, Any] = json.loads(json.dumps(values))  # turns tuples into lists
         return plain
 
     @classmethod
     def of(cls, described: Mapping[str, Any]) -> "Reading":
-        """The reading that a manifest describes; what it does not say is the default."""
+        """The reading of a manifest; missing fields have their defaults."""
         plain: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in described["sensor"].items()}
         columns = described.get("columns")
         return cls(**{**described, "sensor": Sensor(**plain), "columns": columns and tuple(columns)})
 
 
 class Projected(NamedTuple):
-    """A scan file, and which of its points each pixel has kept."""
+    """A projected scan file, and the point of each pixel."""
 
     image: np.ndarray  # (2 or 1, H, W)
-    points: Points  # all of the file
-    pixels: np.ndarray  # the pixels that keep one, h W + w, (M,)
-    chosen: np.ndarray  # the index of that point, (M,)
+    points: Points  # all points of the file
+    pixels: np.ndarray  # pixels with a point, h W + w, (M,)
+    chosen: np.ndarray  # indices of their points, (M,)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
-        """Values of the kept points, (M, ...), at their pixels, (H, W, ...); 0 elsewhere."""
+        """Scatter values of the pixels' points, (M, ...), to an image, (H, W, ...); 0 elsewhere."""
         shape = self.image.shape[1:]
-        found = np.zeros((math.prod(shape), *values.shape[1:]), values.dtype)
-        found[self.pixels] = values
-        return found.reshape(*shape, *values.shape[1:])
+        image = np.zeros((math.prod(shape), *values.shape[1:]), values.dtype)
+        image[self.pixels] = values
+        return image.reshape(*shape, *values.shape[1:])
 
 
 def read_scan(path: str | Path, sensor: Sensor, **options: Any) -> np.ndarray:
-    """One scan file as a range image, (2, H, W), or (1, H, W) without `reflectance`; the options are `Reading`'s."""
+    """Read a scan file as a range image, (2, H, W), or (1, H, W) without `reflectance`; `options` as in `Reading`."""
     reading = Reading(sensor, **{"reflectance": True, "on_bad_scan": "error", **options})
     return read_projected(path, reading).image
 
 
 def read_projected(path: str | Path, reading: Reading) -> Projected:
-    """A file of points as an image, and the points behind it."""
+    """Read a file of points as an image with the points of its pixels."""
     try:
         return _projected(path, reading)
     except NoPointsError:
@@ -106,7 +106,7 @@ def _projected(path: str | Path, reading: Reading) -> Projected:
 
 
 def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:
-    """That a scan has no return that the sensor's image shows."""
+    """The error for a scan without a return in the sensor's view."""
     r = np.linalg.norm(points.xyz, axis=1)
     return NoPointsError(
         f"{path}: none of its {len(r)} points lies within {sensor.min_range:g}-{sensor.max_range:g} m and the "
@@ -116,16 +116,16 @@ def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPoint
 
 
 def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, np.ndarray | None]:
-    """The image of `read_scan`, and the semantic id of each pixel's return, (H, W) uint16, 0 where none was kept.
+    """The image of `read_scan`, and the semantic id of each pixel's return, (H, W) uint16, 0 for no return.
 
-    The ids are None where no labels lie beside the scan.
+    The ids are None if the scan has no label file.
     """
-    found = read_projected(path, reading)
+    projected = read_projected(path, reading)
     file = labels_beside(path)
     if file is None:
-        return found.image, None
-    labels = read_labels(file, path, found.points)[found.chosen].astype(np.uint16)
-    return found.image, found.spread(labels)
+        return projected.image, None
+    labels = read_labels(file, path, projected.points)[projected.chosen].astype(np.uint16)
+    return projected.image, projected.spread(labels)
 
 
 def _no_reflectance(path: str | Path) -> InputError:
@@ -137,33 +137,33 @@ def _no_reflectance(path: str | Path) -> InputError:
 
 
 def scaled_reflectance(path: str | Path, points: Points, scale: float | None) -> np.ndarray:
-    """The reflectance of points in [0, 1]; the scale is guessed if None."""
+    """The reflectance of points, scaled to [0, 1]; the scale is estimated if None."""
     if points.reflectance is None:
         raise _no_reflectance(path)
     highest = float(np.nan_to_num(points.reflectance).max(initial=0))
     if scale is None:
         scale = 1.0 if highest <= 1 else max(highest, 255.0)
     scaled = points.reflectance / np.float32(scale)
-    # NaN compares false: it is refused like a value out of scale.
+    # NaN compares false and is refused, too.
     if not (float(scaled.max(initial=0)) <= 1 + 1e-3 and float(scaled.min(initial=0)) >= 0):
         raise InputError(
             f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
-            "Say what means full reflectance there, often 255: data.reading.reflectance_scale=255, that of "
+            "Give the value of full reflectance, often 255: data.reading.reflectance_scale=255, that of "
             "its part of data.parts, or --reflectance-scale 255."
         )
     return scaled
 
 
 def read_image(path: Path, reading: Reading) -> np.ndarray:
-    """A scan file or a range image as an image, (2 or 1, H, W)."""
+    """Read a scan file or a range image as an image, (2 or 1, H, W)."""
     channels = 1 + bool(reading.reflectance)
     image = read_range_image(path)
     if image is None:
         return read_projected(path, reading).image
     if image.shape[1:] != reading.sensor.shape:
-        found, wanted = ("x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape))
+        size, expected = ("x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape))
         raise InputError(
-            f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}, or its points "
+            f"{path} is a range image of {size}, the sensor's is {expected}; give --size {size}, or its points "
             "(.bin, .ply, .pcd), which take any size."
         )
     if len(image) < channels:
@@ -176,52 +176,52 @@ def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarra
     nearest, farthest = reading.sensor.min_range, reading.sensor.max_range
     seen = (image[0] >= nearest) & (image[0] <= farthest)
     if not seen.any() and reading.on_bad_scan != "empty":
-        found = image[0][image[0] > 0]
-        ranges = f"; its ranges are {found.min():.4g} to {found.max():.4g}, in metres" if found.size else ""
+        r = image[0][image[0] > 0]
+        ranges = f"; its ranges are {r.min():.4g} to {r.max():.4g}, in metres" if r.size else ""
         raise NoPointsError(f"{path} has no return from {nearest:g} to {farthest:g} m{ranges}.")
     image = np.where(seen, image, np.float32(0))
     highest = image[1:].max(initial=0)
     if highest > 1 + 1e-3:
         raise InputError(
-            f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide it by what means "
-            "full reflectance."
+            f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide it by the value "
+            "of full reflectance."
         )
     image[1:] = image[1:].clip(0, 1)
     return image
 
 
 def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
-    """A file of points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for none."""
-    found = read_projected(path, reading)
-    xyz = found.spread(found.points.xyz[found.chosen].astype(np.float32))
-    return found.image, np.ascontiguousarray(np.moveaxis(xyz, -1, 0))
+    """Read points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for no return."""
+    projected = read_projected(path, reading)
+    xyz = projected.spread(projected.points.xyz[projected.chosen].astype(np.float32))
+    return projected.image, np.ascontiguousarray(np.moveaxis(xyz, -1, 0))
 
 
 def lacks_reflectance(
     paths: Iterable[str | Path], on_bad_scan: str = "error", columns: Sequence[str] | None = None
 ) -> str | None:
-    """Why scan files count as files without reflectance; None where they have it.
+    """Reason why scan files count as files without reflectance; None if they have reflectance.
 
-    The one rule, for training, measuring and pictures: the first scan that has a return decides, and reflectance that
-    is 0 throughout is none, because a KITTI .bin has a column for it whatever the sensor reports. Scans that cannot be
-    read are passed over with `on_bad_scan="skip"`, those without a point also with "empty".
+    Training, metrics and pictures share this rule: the first scan with a return decides, and reflectance of only 0
+    counts as missing, because a KITTI .bin always has a column for it. Unreadable scans are skipped with
+    `on_bad_scan="skip"`, scans without a point also with "empty".
     """
     for path in paths:
         try:
-            found = stored_reflectance(path, columns)
+            reflectance = stored_reflectance(path, columns)
         except InputError as error:
             if on_bad_scan == "error" or (on_bad_scan == "empty" and not isinstance(error, NoPointsError)):
                 raise
             continue
-        if found is None:
+        if reflectance is None:
             return f"{path} has no reflectance"
-        if found.size:
-            return None if found.any() else f"the reflectance in {path} is 0 throughout"
+        if reflectance.size:
+            return None if reflectance.any() else f"the reflectance in {path} is 0 throughout"
     return "no scan has a return"
 
 
 def stored_reflectance(path: str | Path, columns: Sequence[str] | None = None) -> np.ndarray | None:
-    """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none."""
+    """The stored reflectance of all returns of a scan file or a range image; None if the file has none."""
     image = read_range_image(path)
     if image is None:
         return read_points(path, columns).reflectance

@@ -1,4 +1,4 @@
-"""A run's `data` in which every set of scans says all that is left out."""
+"""Fill in the defaults of a run's `data`."""
 
 import logging
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ log = logging.getLogger(__name__)
 
 
 def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping[str, Any] | None = None) -> Data:
-    """A run's `data` in which each set of scans says everything: parts and held-out scans take from the run what they
-    leave out, but for split and drives, and every `reading` has all fields of `ReadingOptions`.
+    """Fill in the defaults of a run's `data`: every `reading` gets all fields of `ReadingOptions`, and parts and
+    held-out scans inherit missing keys of the run, except split and drives.
 
     Args:
-        scale: The value that means full reflectance in files of the sensor.
+        scale: The value of full reflectance in files of the sensor.
         parent: The reading of the run that this run starts from, or of the flow that draws its pairs.
     """
     check_options("data", DataOptions, data)
@@ -40,7 +40,7 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     if other is not None and run.name != PAIRS:
         held = {"name": run.name, "root": run.root, "scenes": run.scenes, **other}
         _check_set("data.validation.data", held, split=False)
-        if held["name"] != run.name:  # other files, with columns and a scale of their own
+        if held["name"] != run.name:  # other files, with other columns and scale
             reading = {key: value for key, value in reading.items() if key not in ("columns", "reflectance_scale")}
             held["root"] = other.get("root")
         data["validation"] = {**data["validation"], "data": whole(held, reading)}
@@ -48,7 +48,7 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
 
 
 def _whole_reading(options: SourceOptions, usual: Mapping[str, Any], scale: float | None) -> Data:
-    """Every field of `ReadingOptions`: what a set of scans says, else `usual`, else what its kind usually has."""
+    """All fields of `ReadingOptions`: of a set of scans, else of `usual`, else the defaults of its kind."""
     name, of_kind = options.name, 1.0
     if name == FOLDER:
         of_kind = scale or 1.0
@@ -61,7 +61,7 @@ def _whole_reading(options: SourceOptions, usual: Mapping[str, Any], scale: floa
 
 
 def _checked_parts(run: DataOptions) -> list[Data]:
-    """The parts of a mixture."""
+    """The parts of a mixture, checked."""
     if not run.parts:
         example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
@@ -75,24 +75,24 @@ def _checked_parts(run: DataOptions) -> list[Data]:
 
 
 def _check_set(what: str, options: Mapping[str, Any], split: bool = True) -> None:
-    """Refuse what names no single set of scans, or, with `split`, does not say whether test drives are meant too."""
+    """Refuse options that do not name a single set of scans or, with `split`, lack the split of a standard data set."""
     check_options(what, SourceOptions, options)
     name = options.get("name")
     if name in (None, MIXED, PAIRS):
         raise InputError(f"{what} needs the name of a data set, found {name!r}.")
-    known = ", ".join(SOURCES[name].splits)
-    if split and known and "split" not in options:
-        raise InputError(f"{what}: {name} has a standard split: give split, one of {known}, or null for all.")
+    splits = ", ".join(SOURCES[name].splits)
+    if split and splits and "split" not in options:
+        raise InputError(f"{what}: {name} has a standard split: give split, one of {splits}, or null for all.")
 
 
 def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
-    """`encoding.reflectance` for a config's `data`: `auto` is true where each of its sets of scans has reflectance."""
+    """`encoding.reflectance` for a config's `data`: `auto` is true if all its sets of scans have reflectance."""
     if isinstance(wanted, bool):
         return wanted
     if wanted != AUTO:
         raise InputError(f"encoding.reflectance must be true, false or auto, found {wanted!r}.")
-    named = DataOptions(**resolve(data))
-    for options in (*named.sets, *([named.held_out] if named.held_out else [])):
+    run = DataOptions(**resolve(data))
+    for options in (*run.sets, *([run.held_out] if run.held_out else [])):
         lacking = SOURCES[options.name].lacks_reflectance(options, options.on_bad_scan)
         if lacking:
             log.info("encoding.reflectance=auto is false here, a flow of range alone: %s", lacking)
@@ -102,6 +102,6 @@ def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
 
 
 def reflectance_levels(data: Mapping[str, Any]) -> int | None:
-    """The levels of reflectance that all sets of a config's `data` share; None if they differ or are not known."""
+    """The levels of reflectance that all sets of a config's `data` share; None if they differ or are unknown."""
     levels = {SOURCES[options.name].levels_of(options) for options in DataOptions(**resolve(data)).sets}
     return levels.pop() if len(levels) == 1 else None

@@ -1,4 +1,4 @@
-"""A set of scans as a verb or a report sees it: numbered range images, and what is known of them."""
+"""A set of scans for commands and reports: numbered range images with their metadata."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,9 +17,9 @@ from r2flow.signals import end_with_parent
 
 
 class ScanSet:
-    """Scans of a sensor; the label is as the user named them.
+    """Scans of a sensor; `label` is the user's name for them.
 
-    `about`, `identity` and `drives` are those of `ScanSource`, and the source's own if left out.
+    `about`, `identity` and `drives` are as in `ScanSource`; None: those of the source.
     """
 
     def __init__(
@@ -47,14 +47,14 @@ class ScanSet:
         return len(self.source)
 
     def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
-        """Some of the scans, in the given order; `name` says which for a reader."""
+        """Some of the scans, in the given order; `name` describes the selection."""
         identity = self.identity
-        if identity is not None:  # a part of a part is told apart from the same numbers of the whole
+        if identity is not None:  # a part of a part differs from the same numbers of the whole
             chosen = str(identity.get("part", "")).encode() + np.asarray(numbers, dtype=np.int64).tobytes()
             identity = {**identity, "part": hashlib.sha256(chosen).hexdigest()[:16]}
         place = {number: i for i, number in enumerate(numbers)}
-        found = {drive: [place[n] for n in held if n in place] for drive, held in self.drives.items()}
-        drives, about = {drive: kept for drive, kept in found.items() if kept}, {**self.about, "part": name}
+        drives = {drive: [place[n] for n in members if n in place] for drive, members in self.drives.items()}
+        drives, about = {drive: kept for drive, kept in drives.items() if kept}, {**self.about, "part": name}
         return ScanSet(self.label, self.source.subset(numbers), self.sensor, about, identity, drives)
 
     def limited(self, most: int | None) -> "ScanSet":
@@ -70,20 +70,20 @@ class ScanSet:
         return self.part(spread(len(self), most), f"{most} of {len(self)}, evenly spread")
 
     def batches(self, numbers: Sequence[int], batch_size: int, workers: int = 0) -> Iterator[Tensor]:
-        """The scans of these numbers in order, each batch (B, 2 or 1, H, W), read by `workers` further processes."""
+        """Batches, (B, 2 or 1, H, W), of these scans in order, read by `workers` further processes."""
         return self._read(self.source.batch, numbers, batch_size, workers)
 
     def batches_with_points(
         self, numbers: Sequence[int], batch_size: int, workers: int = 0
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """The same, and with each batch the measured points of its pixels, (B, 3, H, W): `ScanSource.with_points`."""
+        """As `batches`, with the measured points of the pixels, (B, 3, H, W) (`ScanSource.with_points`)."""
         return self._read(partial(_with_points, self.source), numbers, batch_size, workers)
 
     def _read(
         self, read: Callable[[list[int]], Any], numbers: Sequence[int], batch_size: int, workers: int
     ) -> Iterator[Any]:
         chunks: Any = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
-        # Processes cost seconds to start; and what is drawn is drawn where the network is.
+        # Processes take seconds to start; samples are drawn in the process of the network.
         workers = 0 if self.source.drawn or len(chunks) < 8 else workers
         return iter(
             DataLoader(chunks, batch_size=None, collate_fn=read, num_workers=workers, worker_init_fn=end_with_parent)
@@ -96,5 +96,5 @@ def _with_points(source: ScanSource, numbers: list[int]) -> tuple[Tensor, Tensor
 
 
 def fixed_choice(count: int, most: int) -> list[int]:
-    """`most` of `count` numbers, the first of a fixed shuffle (Philox, seed 0), in rising order."""
+    """`most` of `count` numbers, the first of a fixed shuffle (Philox, seed 0), sorted."""
     return sorted(generator(0, "shuffle", 0).permutation(count)[:most].tolist())

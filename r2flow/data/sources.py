@@ -1,4 +1,4 @@
-"""Range images in metres, by number: from scan files, from the simulator, from memory."""
+"""Sources of numbered range images in metres: scan files, the simulator, memory."""
 
 import hashlib
 import json
@@ -28,21 +28,20 @@ log = logging.getLogger(__name__)
 
 Read = TypeVar("Read")
 
-LOOKED_AT = 3  # scans of a set, whose beams are compared with the sensor's
+LOOKED_AT = 3  # number of scans whose beams are compared with the sensor's
 
 
 class ScanSource(ABC):
-    """Numbered range images, (2 or 1, H, W) float32: range in metres and reflectance of [0, 1], 0 where missing.
+    """Numbered range images, (2 or 1, H, W) float32: range in metres and reflectance in [0, 1], 0 where missing.
 
-    A source of your own needs the four abstract methods; the others say what it can do besides.
+    Subclasses must implement the four abstract methods; the others are optional.
 
     Attributes:
-        slow: Whether an image takes long to get, so that those that fit are kept in memory.
-        drawn: Whether a network draws the images when they are asked for: in this process alone, and no image twice
-            where once will do.
-        measured: Whether the points that the pixels stand for are known: of range images, prepared shards, samples and
-            simulated scans they are not.
-        drives: Numbers of the scans of each recording, by its name, where recordings are known.
+        slow: Whether reading an image is slow, so that images are kept in memory if they fit.
+        drawn: Whether a network draws the images on access: only in this process, and each image once if possible.
+        measured: Whether the measured points of the pixels are available; they are not for range images, prepared
+            shards, samples and simulated scans.
+        drives: Numbers of the scans of each recording, by its name, if known.
     """
 
     slow = False
@@ -59,50 +58,50 @@ class ScanSource(ABC):
     @property
     @abstractmethod
     def names(self) -> Sequence[str]:
-        """What each scan is called, wherever the data set lies."""
+        """Names of the scans, independent of the data set's path."""
 
     @abstractmethod
     def subset(self, indices: Sequence[int]) -> "ScanSource":
-        """Some of the scans as a source of their own, which never reaches for the others."""
+        """A source of some of the scans, which never reads the others."""
 
     def batch(self, indices: Sequence[int]) -> Tensor:
         """Several scans at once, (B, 2 or 1, H, W)."""
         return torch.from_numpy(np.stack([self[index] for index in indices]))
 
     def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """An image, and the measured x, y, z of each pixel's point in metres, (3, H, W) float32, 0 where missing."""
-        raise InputError(f"{self.names[index]} holds ranges alone, not the measured coordinates of its points.")
+        """An image, and the measured x, y, z of its pixels' points in metres, (3, H, W) float32, 0 where missing."""
+        raise InputError(f"{self.names[index]} holds only ranges, not the measured coordinates of its points.")
 
     def about(self) -> dict[str, Any]:
-        """What a reader of a figure must know of the scans, as plain values; no path is among them."""
+        """Metadata to report with metrics of the scans, as plain values without paths."""
         return {}
 
     def identity(self) -> dict[str, Any] | None:
-        """All that decides what the images are; None where nobody knows, and nothing of them is worth keeping."""
+        """All that determines the images, as a cache key; None if unknown, so that nothing is cached."""
         return None
 
     def places(self) -> set[str]:
-        """Where the files of the scans lie: two sources with a common place share scans."""
+        """Paths of the scans' files: two sources with a common path share scans."""
         return set()
 
 
 def made_here(root: str | Path) -> bool:
-    """Whether a folder, or one in it, holds samples or simulated scans of r2flow, or the folder of a file does."""
+    """Whether r2flow wrote the samples or simulated scans in a folder, its subfolders or the folder of a file."""
     folder = Path(root).expanduser()
     if folder.is_file():
         folder = folder.parent
     if not folder.is_dir():
         return False
-    with os.scandir(folder) as entries:  # which knows a folder without asking the disk about each file
+    with os.scandir(folder) as entries:  # knows folders without a system call per file
         places = [folder, *(Path(entry.path) for entry in entries if entry.is_dir())]
     return any((place / MANIFEST).is_file() for place in places)
 
 
 def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:
-    """Say in one line that scan files do not look like a sensor's, and which sensor they fit (`other_sensor`).
+    """Warn if scan files do not match a sensor, and name the sensor that matches (`other_sensor`).
 
-    For bare scan files alone: what r2flow wrote says its sensor, and range images have no beams. Files that cannot be
-    read are reported when their turn comes.
+    Only for plain scan files: files that r2flow wrote store their sensor, and range images have no beams. Unreadable
+    files are reported when they are read as scans.
     """
     if made_here(root):
         return
@@ -110,10 +109,10 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
     for number in spread(len(paths), LOOKED_AT):
         with suppress(InputError):
             scans.append(read_points(paths[number], reading.columns))
-    found = other_sensor(scans, sensor) if scans else None
-    if found is None:
+    mismatch = other_sensor(scans, sensor) if scans else None
+    if mismatch is None:
         return
-    seen, name, hopeless = found
+    seen, name, hopeless = mismatch
     if hopeless and reading.within_limits:
         raise InputError(f"{root}: {seen}.")
     edges = sensor.row_edges
@@ -127,12 +126,12 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
 
 
 class ScanFiles(ScanSource):
-    """Scan files of any format and range images, side by side, each read when it is asked for.
+    """Scan files of any format and range images, read on access.
 
-    With `on_bad_scan="skip"` a file that cannot be used is left out with a warning: the next usable file of this source
-    takes its place, the same one in every process.
+    With `on_bad_scan="skip"`, an unusable file is replaced by the next usable file of this source, with a warning; the
+    replacement is the same in every process.
 
-    A scan is named by its path below the data set's `root`.
+    A scan's name is its path below the data set's `root`.
     """
 
     slow = True
@@ -170,18 +169,18 @@ class ScanFiles(ScanSource):
 
     @cached_property
     def _digest(self) -> str:
-        found = [(name, os.stat(path)) for name, path in zip(self.names, self.paths, strict=True)]
-        stats = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in found]
-        # Some contents, too: unpacked archives have equal names, sizes and times.
-        some = []
+        files = [(name, os.stat(path)) for name, path in zip(self.names, self.paths, strict=True)]
+        stats = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in files]
+        # Hash some contents, too: unpacked archives can have equal names, sizes and times.
+        hashes = []
         for i in spread(len(self.paths), 8):
-            if os.path.isfile(self.paths[i]):  # a pipe would hang, a device never end
+            if os.path.isfile(self.paths[i]):  # a pipe would block, a device never end
                 with open(self.paths[i], "rb") as file:
-                    some.append(hashlib.file_digest(file, "sha256").hexdigest())
-        return hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
+                    hashes.append(hashlib.file_digest(file, "sha256").hexdigest())
+        return hashlib.sha256(json.dumps([stats, hashes]).encode()).hexdigest()
 
     def places(self) -> set[str]:
-        real = os.path.realpath(self.root)  # once for all of them: on a network disk it takes its time
+        real = os.path.realpath(self.root)  # once for all files: slow on network disks
         return {os.path.join(real, name) for name in self.names}
 
     def __len__(self) -> int:
@@ -194,7 +193,7 @@ class ScanFiles(ScanSource):
         return self._first_usable(index, lambda path: read_points_image(path, self.reading))
 
     def _first_usable(self, index: int, read: Callable[[Path], Read]) -> Read:
-        """What is read of a file, or with `on_bad_scan="skip"` of the first usable one from there on."""
+        """Read a file, or with `on_bad_scan="skip"` the first usable file from this index on."""
         if self.reading.on_bad_scan != "skip":
             return read(Path(self.paths[index]))
         for candidate in (*range(index, len(self)), *range(index)):
@@ -209,7 +208,7 @@ class ScanFiles(ScanSource):
 
 
 class SimulatedScans(ScanSource):
-    """Scenes of the simulator under one seed, by their numbers."""
+    """Simulated scenes of one seed, by their numbers."""
 
     slow = True
 
@@ -242,7 +241,7 @@ class SimulatedScans(ScanSource):
 
 
 class InMemory(ScanSource):
-    """Images in memory, (N, 2 or 1, H, W), and their names."""
+    """Named images in memory, (N, 2 or 1, H, W)."""
 
     def __init__(self, images: np.ndarray, names: Sequence[str]) -> None:
         self.images, self._names = images, names
@@ -269,13 +268,12 @@ def spread(count: int, most: int) -> list[int]:
 
 
 def holdout_block(count: int, share: float, starts: Sequence[int] = ()) -> tuple[range, range]:
-    """(training, validation) numbers: about the last `share` of the scans, in one contiguous block.
+    """(training, validation) numbers; the validation scans are one contiguous block, about the last `share`.
 
-    Never a random choice of frames: neighbours in a drive are near-duplicates of each other. Where whole drives, which
-    begin at the numbers `starts`, come within half of the share at the end, they are held out, so that no scan has a
-    neighbour on the other side; else exactly the share is.
+    Frames are not chosen at random, because neighbouring frames of a drive are near-duplicates. Whole drives, which
+    begin at the numbers `starts`, are held out if their size is within half of the share; otherwise the exact share is.
     """
     held = min(math.ceil(count * share), count - 1)
     whole = [count - start for start in starts if start > 0 and abs(count - start - held) <= held / 2]
-    held = min(whole, key=lambda one: abs(one - held), default=held) if held else 0
+    held = min(whole, key=lambda size: abs(size - held), default=held) if held else 0
     return range(count - held), range(count - held, count)

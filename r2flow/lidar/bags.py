@@ -1,7 +1,7 @@
-"""Point clouds in recordings of ROS: ROS 2 bags (.mcap, .db3 or their folder) and ROS 1 bags (.bag), by rosbags.
+"""Point clouds in ROS recordings, read with rosbags: ROS 2 bags (.mcap, .db3 or their folder) and ROS 1 bags (.bag).
 
-Types that a recording defines itself are not used, since they would become code: messages are read by the standard's
-definition of a PointCloud2.
+Type definitions of the recording are not used, since rosbags would turn them into code: messages are read by the
+standard definition of PointCloud2.
 """
 
 from collections.abc import Iterator
@@ -20,10 +20,10 @@ TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points | InputError]]:
     """Time in nanoseconds and points of each PointCloud2 of a topic, in the order of recording.
 
-    A message that is no scan comes as what is wrong with it.
+    A message that is not a valid scan is yielded as an `InputError`.
 
     Args:
-        topic: Its name; may be left out where there is one topic of point clouds.
+        topic: Name of the topic; None: the only topic of point clouds.
     """
     require(str(path), "formats", "rosbags")
     from rosbags.rosbag1 import Reader as Reader1
@@ -32,12 +32,12 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points
 
     old, folder = path.suffix.lower() == ".bag" and path.is_file(), path
     check(path.is_dir() or path.is_file(), f"{path} is not a .mcap, .db3 or .bag file, nor the folder of a ROS 2 bag.")
-    if path.suffix.lower() == ".db3" and path.is_file():  # a part of a bag, whose folder says its topics
+    if path.suffix.lower() == ".db3" and path.is_file():  # a part of a bag; the topics are in its folder
         folder = path.parent
     if folder.is_dir():
         whole = (folder / "metadata.yaml").is_file()
         check(whole, f"{folder} has no metadata.yaml: give a .mcap, or make it by ros2 bag reindex {folder}")
-        # A pipe would be waited for without end.
+        # Reading a pipe would block.
         odd = next((file for file in folder.iterdir() if not (file.is_file() or file.is_dir())), None)
         check(odd is None, f"{odd} is not a regular file.")
     store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
@@ -63,15 +63,15 @@ def _choose(path: Path, connections: list[Any], topic: str | None) -> list[Any]:
     clouds = [connection for connection in connections if connection.msgtype == CLOUD]
     topics = sorted({connection.topic for connection in clouds})
     types = ", ".join(sorted({connection.msgtype for connection in connections}))[:160]
-    known = ", ".join(topics)
+    listed = ", ".join(topics)
     check(topics, f"{path} has no topic of point clouds ({CLOUD}), but {types}: a ROS driver makes clouds of packets.")
-    check(topic or len(topics) == 1, f"{path} holds several topics of point clouds; give one by --topic: {known}.")
-    check(topic in (None, *topics), f"{path} holds no topic {topic!r} of point clouds; known: {known}.")
+    check(topic or len(topics) == 1, f"{path} holds several topics of point clouds; give one by --topic: {listed}.")
+    check(topic in (None, *topics), f"{path} holds no topic {topic!r} of point clouds; known: {listed}.")
     return [connection for connection in clouds if connection.topic == (topic or topics[0])]
 
 
 def cloud_points(message: Any) -> Points:
-    """The points of a PointCloud2 message, checked as those of a scan file."""
+    """The points of a PointCloud2 message, checked like points of a scan file."""
     order, step = ">" if message.is_bigendian else "<", message.point_step
     fields = [field for field in message.fields if field.datatype in TYPES]
     kinds = [np.dtype((order + TYPES[field.datatype], (field.count,) if field.count > 1 else ())) for field in fields]

@@ -1,4 +1,4 @@
-"""A sensor told by its scans: beams, azimuth steps, limits, height, reflectance, and which of `SENSORS` it is."""
+"""Estimate a sensor from its scans: beams, azimuth steps, limits, height, reflectance, and the nearest of `SENSORS`."""
 
 import math
 from collections.abc import Sequence
@@ -13,43 +13,43 @@ from r2flow.lidar.scan_files import Points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of, median_of_seen, rings_from_order, scatter_of
 
-FEWEST, MOST = 4, 256  # beams of a sensor
-FEWEST_RETURNS = 200  # of an estimate
+FEWEST, MOST = 4, 256  # limits of the number of beams
+FEWEST_RETURNS = 200  # minimum for an estimate
 TIGHT = 0.1  # scatter (`scatter_of`) below which each column is one laser
 BANDWIDTHS = np.geomspace(0.015, 2.0, 50)  # degrees
 BIN = 0.005  # degrees
-FAINT = 0.02  # share of the median peak's height below which a peak is no beam
+FAINT = 0.02  # share of the median peak's height below which a peak is not a beam
 STABLE = 1.5  # range of bandwidths, as a factor, over which the number of peaks must be constant
-SCATTERED = 0.3  # median gap between elevations over their mean gap, above which no beams are there: `_is_scattered`
-CROWDED = 20  # mean number of points in a sector from which its gaps are compared
-COLUMNS = 64  # an image's width is a multiple of it, so that every backbone can halve it
-FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # values in use for it
-IN_VIEW = 0.9  # share of the returns in a sensor's own view; the real scans at hand have 0.967 or more
-OFF = 1.5  # degrees by `_distance`, above which beams are those of another sensor
-BEATEN = 0.5  # degrees from which on a sensor does not fit if another one is twice as near
+SCATTERED = 0.3  # median gap between elevations over their mean gap, above which a scan has no beams: `_is_scattered`
+CROWDED = 20  # minimum mean number of points per sector for a comparison of gaps
+COLUMNS = 64  # image widths are multiples of it, so that every backbone can halve them
+FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full reflectance
+IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
+OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
+BEATEN = 0.5  # degrees: beyond it, a sensor does not match if another sensor is twice as near
 
 RINGS = "a ring number at each point"
 FIRINGS = "firing after firing, rays without return kept"
 RING_AFTER_RING = "ring after ring"
-UNORDERED = "beams told by elevation alone"
+UNORDERED = "beams found by elevation only"
 
 
 class NoBeamsError(InputError):
-    """Scans of a sensor without beams."""
+    """The scans are of a sensor without beams."""
 
 
 @dataclass(frozen=True)
 class Beams:
     """The beams of a sensor."""
 
-    elevations: np.ndarray  # median elevation of each in degrees, the top one first, (H,)
+    elevations: np.ndarray  # median elevation of each beam in degrees, from the top, (H,)
     of_point: list[np.ndarray]  # row of each point of each scan; -1 for a ray without return
-    order: str = UNORDERED  # how the scans are stored: `RINGS`, `FIRINGS`, ...
-    firing: tuple[int, ...] | None = None  # row of laser 0, 1, ... where lasers are not counted from one end
+    order: str = UNORDERED  # storage order of the scans: `RINGS`, `FIRINGS`, ...
+    firing: tuple[int, ...] | None = None  # row of laser 0, 1, ...; None if lasers are numbered by elevation
 
 
 class Estimate(NamedTuple):
-    """A sensor estimated from its scans, its beams, and its azimuth steps of a full turn, not rounded."""
+    """A sensor estimated from its scans, its beams, and its azimuth steps per full turn, not rounded."""
 
     sensor: Sensor
     beams: Beams
@@ -57,7 +57,7 @@ class Estimate(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """What speaks against a sensor, in words; the built-in sensor that the scans fit; whether they have no beams."""
+    """A mismatch of scans and sensor: description, matching built-in sensor, whether the scans have no beams."""
 
     seen: str
     name: str | None
@@ -65,10 +65,10 @@ class Doubt(NamedTuple):
 
 
 def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
-    """What in some scans speaks against a sensor; None where they may be of it, or are too few to tell.
+    """The mismatch of some scans and a sensor; None if they match, or if there are too few returns.
 
-    The beams of the scans are compared with the sensor's. Where there are none, or where a user's own sensor has
-    another number of rows (which may be a choice), the share of the returns in its view decides.
+    The beams of the scans are compared with the sensor's. Without beams, or if a custom sensor has another number of
+    rows (which may be intended), the share of returns in the sensor's view decides.
     """
     elevation = np.concatenate([elevations_of(scan.xyz) for scan in scans])
     elevation = elevation[np.isfinite(elevation)]
@@ -89,7 +89,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     distance = 0.0
     if sensor.name in SENSORS or len(beams) == len(sensor.elevations):
         tables = [sensor.elevations]  # a built-in sensor at another size is the same sensor
-        tables += [known.elevations for other, known in SENSORS.items() if _family(other) == _family(sensor.name)]
+        tables += [other.elevations for name, other in SENSORS.items() if _family(name) == _family(sensor.name)]
         distance = min(_distance(beams, np.asarray(table)) for table in tables)
     if share >= IN_VIEW and distance < OFF and not (distance > BEATEN and near < distance / 2):
         return None
@@ -97,7 +97,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
 
 
 def nearest_sensor(elevations: np.ndarray) -> tuple[str | None, float]:
-    """The built-in sensor of beams at these elevations in degrees, and their distance; None where none is near."""
+    """The built-in sensor nearest to beam elevations in degrees, or None beyond `OFF`, and the distance."""
     distance, name = min((_distance(elevations, np.asarray(s.elevations)), name) for name, s in SENSORS.items())
     return (_family(name) if distance < OFF else None), distance
 
@@ -107,11 +107,11 @@ def _family(name: str) -> str:
 
 
 def _distance(beams: np.ndarray, table: np.ndarray) -> float:
-    """Distance of beams from those of a table in degrees: the 80th percentile over the beams, paired in their order.
+    """Distance between beams and a table in degrees: the 80th percentile over beams, paired in order.
 
-    The first pair is the one that gives the smallest result, since a scan may be cut and rings above the horizon may
-    see only sky. Where beams are missing in between, later pairs are wrong: there the median distance from the nearest
-    beam decides, for tables whose beams are far apart.
+    The offset of the pairing minimises the distance, since a scan may be cropped and rings above the horizon may see
+    only sky. If beams are missing in between, later pairs are wrong: for tables with widely spaced beams, the median
+    distance to the nearest beam is used instead.
     """
     longer, shorter = (table, beams) if len(table) >= len(beams) else (beams, table)
     if len(longer) > 1.05 * len(table) + 1:
@@ -125,7 +125,7 @@ def _distance(beams: np.ndarray, table: np.ndarray) -> float:
 
 
 def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
-    """A sensor by its scans, which are in its own frame; range limits without one return in ten thousand, rounded."""
+    """Estimate a sensor from scans in its frame; the range limits exclude one return in 10,000, and are rounded."""
     xyz = np.concatenate([scan.xyz[scan.xyz.any(axis=1)] for scan in scans])
     if len(xyz) < FEWEST_RETURNS:
         raise InputError(f"{len(xyz)} returns are too few for an estimate: give scans with at least {FEWEST_RETURNS}.")
@@ -150,25 +150,25 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
 
 
 def _height(xyz: np.ndarray) -> float:
-    """Height above the ground: the lowest frequent height of returns 3 to 20 m away; the default where there is none.
+    """Height above the ground: the lowest frequent height of returns 3 to 20 m away, or the default.
 
-    The most frequent height may be that of hedges and cars, where beams are close to the horizon.
+    If the beams are close to the horizon, the most frequent height may be that of hedges and cars.
     """
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
     z = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2), 2]
     counts, edges = np.histogram(z, np.arange(-6, -0.1, 0.1))
-    often = np.convolve(counts, np.ones(3), "same")
-    if often.max() < FEWEST_RETURNS / 4:
+    smooth = np.convolve(counts, np.ones(3), "same")
+    if smooth.max() < FEWEST_RETURNS / 4:
         return Sensor.height
-    ground = edges[np.argmax(often > 0.7 * often.max())] + 0.05
+    ground = edges[np.argmax(smooth > 0.7 * smooth.max())] + 0.05
     return round(-float(np.median(z[np.abs(z - ground) < 0.3])), 2)
 
 
 def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> float:
-    """Azimuth steps of a full turn, 360 / step, by the row of each point of each scan.
+    """Azimuth steps per full turn, 360 / step, from the row of each point of each scan.
 
-    The first estimate is the 30th percentile of the gaps between neighbouring returns of one beam, since most rays next
-    to a return have one too; then the sum of all gaps of up to three steps divided by the number of steps in them.
+    The first estimate of the step is the 30th percentile of the gaps between neighbouring returns of a beam, since most
+    neighbours of a return are returns. It is refined as the sum of all gaps up to three steps over their steps.
     """
     gaps = []
     for scan, row in zip(scans, rows, strict=True):
@@ -177,7 +177,7 @@ def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> floa
         order = order[row[order] >= 0]
         gaps.append(np.diff(azimuth[order])[np.diff(row[order]) == 0])
     gap = np.concatenate(gaps)
-    apart = gap[gap > 1e-2]  # two returns of one ray lie at one azimuth
+    apart = gap[gap > 1e-2]  # two returns of a ray have the same azimuth
     if not len(apart):
         raise InputError("no beam returned at two azimuths in these scans. Are they whole?")
     step = float(np.quantile(apart, 0.3))
@@ -188,7 +188,7 @@ def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> floa
 
 
 def full_reflectance(scans: Sequence[Points]) -> float | None:
-    """The value of full reflectance; None where a file has no reflectance, or only one value."""
+    """Estimate the value of full reflectance; None if a file has no reflectance, or only one value."""
     if any(scan.reflectance is None for scan in scans):
         return None
     values = np.concatenate([scan.reflectance for scan in scans])
@@ -201,14 +201,14 @@ def full_reflectance(scans: Sequence[Points]) -> float | None:
 
 
 def find_beams(scans: Sequence[Points]) -> Beams:
-    """The beams by ring numbers, else by the order of the points, else by their elevations alone."""
+    """Find beams by ring numbers, else by the order of the points, else by their elevations only."""
     beams = _beams([scan.with_lost_rays() for scan in scans])
     pairs = zip(beams.of_point, scans, strict=True)
     return replace(beams, of_point=[row if len(row) == len(scan.xyz) else row[scan.kept] for row, scan in pairs])
 
 
 def _beams(scans: Sequence[Points]) -> Beams:
-    """`find_beams` with all rows of the files, lost rays at the origin."""
+    """`find_beams` for all rows of the files, with lost rays at the origin."""
     elevations = [elevations_of(scan.xyz) for scan in scans]
     if all(scan.ring is not None for scan in scans):
         return _by_laser(elevations, [np.asarray(scan.ring, dtype=np.int64) for scan in scans], RINGS)
@@ -217,7 +217,7 @@ def _beams(scans: Sequence[Points]) -> Beams:
     peaks = _by_elevation(elevations)
     if (rings := _rings(scans, elevations)) is not None:
         beams = _by_laser(elevations, rings, RING_AFTER_RING)
-        # A ring with few returns may be taken as part of the next; exact elevations separate the two.
+        # A ring with few returns may be merged with the next; elevation peaks separate them.
         more = peaks is not None and len(peaks.elevations) > len(beams.elevations)
         return replace(peaks, order=RING_AFTER_RING) if more and peaks is not None else beams
     if peaks is None and all(map(_is_scattered, scans)):
@@ -249,28 +249,28 @@ def _is_scattered(scan: Points) -> bool:
 
 
 def _by_laser(elevations: list[np.ndarray], lasers: list[np.ndarray], order: str) -> Beams:
-    """Beams where the laser of each point is known."""
+    """Beams from the laser of each point."""
     together, laser = np.concatenate(elevations), np.concatenate(lasers)
     seen = np.flatnonzero(np.isfinite(together) & (laser >= 0))
     seen = seen[np.argsort(laser[seen], kind="stable")]
-    known, starts = np.unique(laser[seen], return_index=True)
-    if not FEWEST <= len(known) <= MOST:
-        raise InputError(f"the scans name {len(known)} lasers, not {FEWEST} to {MOST}. Are they of a spinning LiDAR?")
+    names, starts = np.unique(laser[seen], return_index=True)
+    if not FEWEST <= len(names) <= MOST:
+        raise InputError(f"the scans name {len(names)} lasers, not {FEWEST} to {MOST}. Are they of a spinning LiDAR?")
     middles = np.array([np.median(together[part]) for part in np.split(seen, starts[1:])])
     row = np.argsort(np.argsort(-middles, kind="stable"), kind="stable")
     table = np.full(int(laser.max()) + 1, -1)
-    table[known] = row
+    table[names] = row
     sorted_rows = len(set(np.diff(row))) == 1  # from the top or from the bottom
-    first = min(known[0], 1) if order == RINGS else 0  # files count their rings from 0 or from 1
-    whole = order != RING_AFTER_RING and len(known) == laser.max() - first + 1
+    first = min(names[0], 1) if order == RINGS else 0  # files number rings from 0 or 1
+    whole = order != RING_AFTER_RING and len(names) == laser.max() - first + 1
     pairs = zip(elevations, lasers, strict=True)
-    of_point = [np.where(np.isfinite(e) & (one >= 0), table[np.maximum(one, 0)], -1) for e, one in pairs]
+    of_point = [np.where(np.isfinite(e) & (n >= 0), table[np.maximum(n, 0)], -1) for e, n in pairs]
     firing = tuple(row.tolist()) if whole and not sorted_rows else None
     return Beams(np.sort(middles)[::-1], of_point, order, firing)
 
 
 def _lasers_of_firings(elevations: list[np.ndarray]) -> int | None:
-    """Lasers of files that hold whole firings: the smallest period of the elevations; None where there is none."""
+    """Number of lasers of files with whole firings, the smallest period of the elevations; None for other files."""
     points, distances = math.gcd(*(len(e) for e in elevations)), {}
     for count in range(FEWEST, MOST + 1):
         if points % count or points // count < 8:
@@ -280,12 +280,12 @@ def _lasers_of_firings(elevations: list[np.ndarray]) -> int | None:
         if all(scatter_of(table)[1] < TIGHT for table in tables):
             together = np.concatenate(tables)
             distances[count] = float(np.nanmean(np.abs(together - median_of_seen(together))))
-    # Half the lasers fit too where the others see only sky, but then a few returns are far from the medians.
+    # Half the lasers also match if the others see only sky, but then a few returns are far from the medians.
     return next((count for count, d in distances.items() if d <= 1.5 * min(distances.values()) + 1e-3), None)
 
 
 def _rings(scans: Sequence[Points], elevations: list[np.ndarray]) -> list[np.ndarray] | None:
-    """Ring of each point, counted from the bottom, where files are stored ring after ring; else None."""
+    """Ring of each point, counted from the bottom, of files stored ring after ring; None for other files."""
     rings = []
     for scan, elevation in zip(scans, elevations, strict=True):
         ring = rings_from_order(scan.xyz)
@@ -305,12 +305,12 @@ def _rings(scans: Sequence[Points], elevations: list[np.ndarray]) -> list[np.nda
 
 
 def _by_elevation(elevations: list[np.ndarray]) -> Beams | None:
-    """Beams as peaks of the density of elevations, at bandwidths where their number is most stable; None without."""
+    """Beams as peaks of the density of elevations, at the bandwidth where their number is most stable, or None."""
     seen = np.concatenate(elevations)
     seen = seen[np.isfinite(seen)]
     low, high = np.quantile(seen, [1e-4, 1 - 1e-4])
     edges = np.arange(low - 3, high + 3 + BIN, BIN)
-    size = 2 << len(edges).bit_length()  # other sizes can take many times as long to transform
+    size = 2 << len(edges).bit_length()  # the FFT of other sizes can be many times slower
     density = np.fft.rfft(np.histogram(seen, edges)[0], size)
     frequency = np.fft.rfftfreq(size, BIN)
     peaks_of = []
@@ -318,7 +318,7 @@ def _by_elevation(elevations: list[np.ndarray]) -> Beams | None:
         smooth = np.fft.irfft(density * np.exp(-2 * (np.pi * bandwidth * frequency) ** 2))[: len(edges) - 1]
         peaks = np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:])) + 1
         heights = smooth[peaks]
-        # Returns from the vehicle itself have any elevation, few of each.
+        # Returns from the vehicle itself have scattered elevations.
         peaks = peaks[heights > FAINT * np.median(heights[heights > 0.01 * heights.max()])]
         peaks_of.append(edges[peaks] + BIN / 2)
     numbers = np.array([len(peaks) for peaks in peaks_of])

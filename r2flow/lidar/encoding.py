@@ -1,4 +1,4 @@
-"""Range images between metres and model space, [-1, 1]."""
+"""Encoding of range images: metres to model space, [-1, 1], and back."""
 
 import math
 from collections.abc import Callable
@@ -13,12 +13,12 @@ from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Positive, Registry
 
-# Decoding may miss a range limit by float32's rounding: within this relative distance a range is the limit.
+# Relative tolerance of range limits in decoding, for float32's rounding.
 LIMIT_TOLERANCE = 1e-5
 
 
 class RangeFormat:
-    """A range r in metres as `channels` values y of [0, 1]: (..., 1, H, W) to (..., channels, H, W), and back."""
+    """Maps ranges r in metres, (..., 1, H, W), to values y in [0, 1], (..., channels, H, W), and back."""
 
     channels = 1
 
@@ -48,8 +48,8 @@ class LogScale(RangeFormat):
 class ShiftedLog(RangeFormat):
     """log2(r + 1.0001) / scale, clipped to [0, 1], with scale = log2(r_max + 1) rounded up to hundredths.
 
-    LiDARGen's (r_max 63 m, scale 6) and LiDM's (56 m, 5.84). A ray without return is log2(1.0001) / scale and not
-    quite 0; the way back, 2^(scale y) - 1, leaves the 0.1 mm in.
+    Used by LiDARGen (r_max 63 m, scale 6) and LiDM (56 m, 5.84). A ray without return is log2(1.0001) / scale, not
+    exactly 0; the inverse, 2^(scale y) - 1, keeps the offset of 0.1 mm.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -63,7 +63,7 @@ class ShiftedLog(RangeFormat):
 
 
 class Inverse(RangeFormat):
-    """r_min / r, 0 where there is no return; float32 holds r to within r^2 / r_min 2^-26, 2 mm of 0.3 to 200 m."""
+    """r_min / r, 0 for no return; float32 resolves r to r^2 / r_min 2^-26, 2 mm for limits of 0.3 and 200 m."""
 
     def forward(self, r: Tensor) -> Tensor:
         return torch.where(r > 0, self.min_range / r.clamp(min=1e-12), 0.0)
@@ -72,16 +72,16 @@ class Inverse(RangeFormat):
 
 
 class InverseDepth(Inverse):
-    """r_min / r within the range limits and 0 beyond them, both ways and without tolerance, as DUSty has it."""
+    """r_min / r within the range limits, else 0, in both directions and without tolerance, as in DUSty."""
 
     def forward(self, r: Tensor) -> Tensor:
-        held = (r >= self.min_range) & (r <= self.max_range)
-        return torch.where(held, super().forward(r), 0.0)
+        inside = (r >= self.min_range) & (r <= self.max_range)
+        return torch.where(inside, super().forward(r), 0.0)
 
     def inverse(self, y: Tensor) -> Tensor:
         inverse = y / self.min_range
-        held = (inverse >= 1 / self.max_range) & (inverse <= 1 / self.min_range)
-        return torch.where(held, super().inverse(y), 0.0)
+        inside = (inverse >= 1 / self.max_range) & (inverse <= 1 / self.min_range)
+        return torch.where(inside, super().inverse(y), 0.0)
 
 
 class Metric(RangeFormat):
@@ -95,7 +95,7 @@ class Metric(RangeFormat):
 
 
 class Cartesian(RangeFormat):
-    """(x, y, z) / r_max, shifted from [-1, 1] to [0, 1]; a ray without return is the sensor's origin."""
+    """(x, y, z) / r_max, mapped from [-1, 1] to [0, 1]; a ray without return is at the origin."""
 
     channels = 3
 
@@ -125,13 +125,13 @@ class Encoding:
     """Range images in metres to model space, [-1, 1] in every channel, and back.
 
     Args:
-        sensor: Its range limits say which ranges are returns.
+        sensor: Sensor of the images; ranges within its limits are returns.
         format: `logscale` (the paper's), `shifted_log` (LiDARGen's and LiDM's), `inverse`, `inverse_depth` (DUSty's),
             `metric`, or `cartesian` (three channels).
-        reflectance: Whether reflectance is a channel; without it a model is of range alone.
-        limits: `closed`: ranges of exactly the sensor's limits are returns. `open`, as R2DM has it: they are not, and
-            none is encoded that does not lie between them.
-        levels: Decoded reflectance is rounded to n / levels, as the sensor reports it; None leaves it continuous.
+        reflectance: Whether reflectance is a channel, in addition to range.
+        limits: `closed`: ranges equal to the sensor's limits are returns. `open`, as in R2DM: they are not, and ranges
+            outside the limits are encoded as dropped rays.
+        levels: Decoded reflectance is rounded to n / levels, as the sensor reports it; None: it is not rounded.
     """
 
     def __init__(
@@ -163,12 +163,12 @@ class Encoding:
         return self.channels, *self.sensor.shape
 
     def encode(self, image: Tensor) -> Tensor:
-        """(..., 2 or 1, H, W) in metres and reflectance of [0, 1] -> (..., channels, H, W).
+        """Map range in metres and reflectance in [0, 1], (..., 2 or 1, H, W), to (..., channels, H, W).
 
         A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`; nearly -1 under `shifted_log`).
 
         Raises:
-            InputError: reflectance is a channel of the model and the image has none.
+            InputError: reflectance is a channel of the model, and the image has no reflectance.
         """
         r = image[..., :1, :, :]
         if self.limits == "open":
@@ -183,9 +183,9 @@ class Encoding:
         return 2 * y - 1
 
     def decode(self, x: Tensor) -> Tensor:
-        """(..., channels, H, W) -> range in metres and reflectance, (..., 2 or 1, H, W).
+        """Map (..., channels, H, W) to range in metres and reflectance, (..., 2 or 1, H, W).
 
-        A range outside the limits is a dropped ray, 0 in both; reflectance is clamped to [0, 1], rounded to `levels`.
+        Ranges outside the limits are dropped rays, 0 in both; reflectance is clamped to [0, 1] and rounded to `levels`.
         """
         y = (x + 1) / 2
         ranges = self.format.channels

@@ -1,7 +1,7 @@
-"""Scans completed by interpolation: the baselines of every model that completes scans.
+"""Completion of scans by interpolation: baselines for completion models.
 
-An unknown ray lies between known ones of its column, or, where these are not on both sides, of its row, whose ring is
-closed. Whether it returned is that of the nearest known ray there; its range is interpolated between the known returns.
+An unknown ray is interpolated between known rays of its column or, without known rays on both sides, of its row, which
+is periodic. It returns if the nearest known ray does; its range is interpolated between known returns.
 """
 
 from collections.abc import Callable
@@ -14,14 +14,14 @@ Rule = Literal["nearest", "linear", "inverse"]  # inverse: linear in 1 / range
 
 
 def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse") -> np.ndarray:
-    """The image with its unknown rays filled, float32; 0 where nothing at all is known.
+    """Fill the unknown rays of an image, float32; an image without known rays is 0.
 
-    Along a column that meets a plane, such as the ground, 1 / range is nearly linear in elevation.
+    Along a column on a plane, such as the ground, 1 / range is nearly linear in elevation.
 
     Args:
-        image: Range in metres and reflectance, (2 or 1, H, W); 0 without a return. Unknown rays are not read.
-        measured: Which rays are known, (H, W) bool.
-        rule: How ranges are interpolated; reflectance is nearest or linear.
+        image: Range in metres and reflectance, (2 or 1, H, W); 0 without a return. Unknown rays are ignored.
+        measured: True for known rays, (H, W) bool.
+        rule: Interpolation of ranges; reflectance is nearest or linear.
     """
     if measured.all() or not measured.any():
         return image * measured
@@ -42,7 +42,7 @@ INTERPOLATIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 
 
 def _rows_beyond(image: np.ndarray, done: np.ndarray) -> np.ndarray:
-    """The image with the nearest filled row in the place of each row of which nothing is known."""
+    """Replace each row without known rays by the nearest filled row."""
     empty = ~done.any(1)
     if empty.any() and done.any():
         rows = np.flatnonzero(~empty)
@@ -51,15 +51,15 @@ def _rows_beyond(image: np.ndarray, done: np.ndarray) -> np.ndarray:
 
 
 def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Fill between the known places of each line, (C, lines, places); and which places are known then.
+    """Interpolate between the known positions of each line, (C, lines, positions); returns values and known mask.
 
-    With `extend` a line with one known place has its values everywhere.
+    With `extend`, values are also extended beyond the known positions.
     """
     count = known.shape[1]
     at, lines = np.arange(count), np.arange(len(known))[:, None]
     left, right = _neighbours(known, at)
     inside = (left >= 0) & (right < count)
-    held = (left >= 0) | (right < count) if extend else inside & (known.sum(1, keepdims=True) > 1)
+    fillable = (left >= 0) | (right < count) if extend else inside & (known.sum(1, keepdims=True) > 1)
     nearest = np.where((left < 0) | ((right < count) & (right - at < at - left)), right, left).clip(0, count - 1)
     returned = known & (values[0] > 0)
     back = returned[lines, nearest]
@@ -67,18 +67,18 @@ def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = Fal
         filled = values[:, lines, nearest]
     else:
         a, b = _neighbours(returned, at)
-        one, other = np.where(a < 0, b, a).clip(0, count - 1), np.where(b >= count, a, b).clip(0, count - 1)
-        share = np.where(other > one, (at - one) / np.maximum(other - one, 1), 0.0)
+        low, high = np.where(a < 0, b, a).clip(0, count - 1), np.where(b >= count, a, b).clip(0, count - 1)
+        share = np.where(high > low, (at - low) / np.maximum(high - low, 1), 0.0)
         invert = rule == "inverse"
         with np.errstate(divide="ignore", invalid="ignore"):
             source = np.concatenate([1 / values[:1].astype(np.float64) if invert else values[:1], values[1:]])
-            filled = (1 - share) * source[:, lines, one] + share * source[:, lines, other]
+            filled = (1 - share) * source[:, lines, low] + share * source[:, lines, high]
             filled[0] = 1 / filled[0] if invert else filled[0]
-    return np.where(known, values, np.where(back & held, filled, 0)), known | held
+    return np.where(known, values, np.where(back & fillable, filled, 0)), known | fillable
 
 
 def _neighbours(known: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The known place at or before each place of a line, -1 where there is none, and the one at or after, or L."""
+    """The nearest known positions at or before each position of a line (or -1), and at or after it (or L)."""
     count = len(at)
     left = np.maximum.accumulate(np.where(known, at, -1), axis=1)
     right = np.minimum.accumulate(np.where(known, at, count)[:, ::-1], axis=1)[:, ::-1]

@@ -1,4 +1,4 @@
-"""What is known of a scan: a state of each ray, and masks that say which rays are measured.
+"""Partially measured scans: the state of each ray, and masks of measured rays.
 
 measured = parse_mask("rows:4")(images.shape[-2:], numpy.random.default_rng(0))
 state = ray_states(images, torch.from_numpy(measured))
@@ -22,19 +22,19 @@ from r2flow.registry import Count, Natural, Registry, Share, check_options
 
 
 class Ray(IntEnum):
-    """What is known of a ray. "Nothing came back" is a measurement too, and never the same as "not measured"."""
+    """State of a ray. A ray measured without return differs from a ray that was not measured."""
 
     UNKNOWN = 0  # not measured
     RETURN = 1  # measured, with a return
-    EMPTY = 2  # measured, and nothing came back
+    EMPTY = 2  # measured, without a return
 
 
 def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
-    """The state of each ray, (B, H, W) uint8, of range images whose measured rays are known.
+    """The state of each ray of range images, (B, H, W) uint8.
 
     Args:
-        images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W); 0 without a return.
-        measured: Which rays are, (H, W) or (B, H, W) bool; None for all.
+        images: Range in metres and, optionally, reflectance, (B, 2 or 1, H, W); 0 without a return.
+        measured: True for measured rays, (H, W) or (B, H, W) bool; None: all rays are measured.
     """
     returned = images[:, 0] > 0
     state = torch.full(returned.shape, int(Ray.EMPTY), dtype=torch.uint8, device=images.device)
@@ -45,7 +45,7 @@ def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
 
 
 def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
-    """Of the unknown rays the share that lies in sectors of `least` degrees and more of which nothing is known.
+    """Share of the unknown rays in sectors of at least `least` degrees without any known ray.
 
     Args:
         state: `Ray` of each ray, (H, W).
@@ -55,17 +55,17 @@ def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
     width = math.ceil(least / 360 * len(empty))
     if empty.all():
         return 1.0
-    begins = np.roll(empty, -int(np.flatnonzero(~empty)[0]))  # from a column of which something is known
-    runs = np.split(begins, np.flatnonzero(np.diff(begins)) + 1)
+    rolled = np.roll(empty, -int(np.flatnonzero(~empty)[0]))  # start at a column with a known ray
+    runs = np.split(rolled, np.flatnonzero(np.diff(rolled)) + 1)
     wide = sum(len(run) for run in runs if run[0] and len(run) >= width)
     return float(wide * len(state) / max(unknown.sum(), 1))
 
 
-Mask = Callable[[tuple[int, int], np.random.Generator], np.ndarray]  # (H, W) and draws to measured rays, (H, W) bool
+Mask = Callable[[tuple[int, int], np.random.Generator], np.ndarray]  # (shape, generator) -> measured rays, (H, W) bool
 
 
 def every_row(step: Count, first: Natural = 0) -> Mask:
-    """Rows first, first + step, first + 2 step, ...: a sensor with fewer beams."""
+    """Rows first, first + step, first + 2 step, ..., as of a sensor with fewer beams."""
 
     def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
         measured = np.zeros(shape, dtype=bool)
@@ -86,7 +86,7 @@ def random_points(share: Share) -> Mask:
 
 
 def without_sector(first: float, last: float) -> Mask:
-    """All rays but those of a sector, from azimuth `first` counter-clockwise to `last`, in degrees."""
+    """All rays except a sector from azimuth `first` counter-clockwise to `last`, in degrees."""
 
     def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
         measured = np.ones(shape, dtype=bool)
@@ -103,13 +103,13 @@ FORMS = "rows:4, rows:4,FIRST, random:0.5, points:0.1, sector:-30,30 or a .npy o
 
 
 def parse_mask(text: str) -> Mask:
-    """A mask by its text: `NAME:NUMBERS` of `MASKS`, a .npy file, or several joined by +: all measure a ray."""
+    """Parse a mask: `NAME:NUMBERS` of `MASKS`, a .npy file, or the intersection of several masks joined by +."""
     parts = [_one_mask(part.strip()) for part in text.split("+")]
     return lambda shape, draws: np.logical_and.reduce([part(shape, draws) for part in parts])
 
 
 def mask_identity(text: str) -> str:
-    """A mask's text with a hash of each file that it names."""
+    """A mask's text with a hash of each file in it."""
     parts = [part.strip() for part in text.split("+")]
     return "+".join(
         f"{part} ({hashlib.sha256(Path(part).read_bytes()).hexdigest()[:16]})" if part.endswith(".npy") else part

@@ -1,4 +1,4 @@
-"""Semantic labels beside scans: SemanticKITTI's `.label` files and the names of their ids."""
+"""Semantic labels of scans: SemanticKITTI's `.label` files and the names of their ids."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points, read_points
 
 # SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue, people red, plants green,
-# buildings and fences brown; moving things have the colour of standing ones).
+# buildings and fences brown; moving objects have the colour of static ones).
 CLASSES = {
     0: ("unlabeled", "#6b727c"), 1: ("outlier", "#454b54"),
     10: ("car", "#3f8efc"), 11: ("bicycle", "#7fd1ff"), 13: ("bus", "#2a5bd7"), 15: ("motorcycle", "#58b4e8"),
@@ -24,39 +24,39 @@ CLASSES = {
     258: ("moving truck", "#5c7cfa"), 259: ("moving other vehicle", "#8aa2ff"),
 }  # fmt: skip
 
-# Ids by SemanticKITTI's own spelling of the names.
+# Ids by SemanticKITTI's spelling of the names.
 LABELS = {name.replace(" ", "-"): label for label, (name, _) in CLASSES.items()}
 
-# No data set in use has larger ids (SemanticKITTI: 259); other bytes read as labels do.
+# Common data sets have no larger ids (SemanticKITTI: 259); larger ids are a sign of other data.
 LARGEST_CLASS = 1023
 
 LAYOUT = "labels of little-endian uint32, one a point"
 
 
 def labels_beside(scan: str | Path) -> Path | None:
-    """The label file of a scan: `labels/000000.label` for `velodyne/000000.bin`, or `000000.label` beside it."""
+    """The label file of a scan: `labels/000000.label` for `velodyne/000000.bin`, or `000000.label` next to it."""
     scan = Path(scan)
     name = f"{scan.stem}.label"
     for path in (scan.parent.parent / "labels" / name, scan.with_name(name)):
-        if path.exists() or path.is_symlink():  # a link to nothing is found too: reading it says so
+        if path.exists() or path.is_symlink():  # returns broken links, too: reading them raises
             return path
     return None
 
 
 def read_labels(path: str | Path, scan: str | Path, points: Points | None = None) -> np.ndarray:
-    """The semantic id of each point of a scan, (N,) uint16, in the order of `read_points`, also where it drops rows.
+    """The semantic id of each point of a scan, (N,) uint16, in the order of `read_points`, without dropped rows.
 
     Args:
-        path: A `.label` file: uint32 for each row of the scan's file, the id in its low 16 bits, an instance above.
-        scan: The scan that it belongs to.
-        points: That scan, where it has been read already.
+        path: A `.label` file: a uint32 per row of the scan's file, class id in the low 16 bits, instance in the high.
+        scan: The scan of the labels.
+        points: The points of the scan, if already read.
     """
     path = Path(path)
     points = read_points(scan) if points is None else points
     rows = len(points.xyz) + points.dropped
     if not path.is_file():
         raise InputError(f"{path} is not a file of labels, or a link to a file that does not exist.")
-    size = path.stat().st_size  # looked at first: a file of the wrong length is never loaded
+    size = path.stat().st_size  # checked first: a file of the wrong size is not loaded
     if size != 4 * rows:
         raise InputError(f"{path} holds {size} bytes, but {scan} has {rows} points, which need {4 * rows}: {LAYOUT}.")
     try:
@@ -64,7 +64,7 @@ def read_labels(path: str | Path, scan: str | Path, points: Points | None = None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
     ids = (labels & 0xFFFF).astype(np.uint16)
-    # Big-endian integers and floats keep their digits in the high bits: instances, without a class, everywhere.
+    # Big-endian integers and floats have their digits in the high bits: instances without a class.
     instances = int(np.count_nonzero((ids == 0) & (labels > 0)))
     if ids.max(initial=0) > LARGEST_CLASS or instances > rows / 2:
         raise InputError(f"{path} does not look like {LAYOUT}. Is it damaged, big-endian or of floats?")

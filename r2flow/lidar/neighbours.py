@@ -1,4 +1,4 @@
-"""The known returns next to each ray."""
+"""The nearest known returns of each ray."""
 
 import math
 
@@ -7,44 +7,44 @@ from torch import Tensor
 
 
 def nearest_returns(returned: Tensor, steps: Tensor, ring: bool = True) -> Tensor:
-    """Offsets from each ray to the nearest return above, below, left and right of it.
+    """Offsets from each ray to the nearest returns above, below, left and right.
 
-    `Above` is the quarter of the image whose rows lie before the ray's, and no further from it in columns than in rows;
-    the other three alike. The nearest return is that of the least angle.
+    `Above` is the quadrant of previous rows whose distance in columns is at most the distance in rows; the others are
+    alike. The nearest return has the smallest angle.
 
     Args:
-        returned: Which rays are known to have returned, (B, H, W) bool.
+        returned: True for known returns, (B, H, W) bool.
         steps: Angle between two rows and between two columns, (B, 2).
         ring: Whether the columns are a full turn.
 
     Returns:
-        Rows and columns from the ray to the return, (4, 2, B, H, W) float32; infinite where there is none.
+        Rows and columns from the ray to the return, (4, 2, B, H, W) float32; infinite without a return.
     """
     twice = steps.repeat(2, 1).mT[..., None]  # (2, 2 B, 1)
     upright = torch.stack([returned, returned.flip(1)]).flatten(0, 1)
     above, below = _before(upright, twice, ring).unflatten(1, (2, -1)).unbind(1)
     level = torch.stack([returned, returned.flip(2)]).flatten(0, 1).mT
     turn = level.shape[1]
-    if ring:  # twice around: what lies before the first column are the last ones
+    if ring:  # two turns: the last columns precede the first
         level = torch.cat([level, level], dim=1)
     left, right = _before(level, twice.flip(0), False)[:, :, -turn:].mT.flip(0).unflatten(1, (2, -1)).unbind(1)
-    upward = steps.new_tensor([-1, 1])[:, None, None, None]  # rows are counted the other way
+    upward = steps.new_tensor([-1, 1])[:, None, None, None]  # the opposite direction of rows
     return torch.stack([above, below.flip(2) * upward, left, right.flip(3) * -upward])
 
 
 def _before(returned: Tensor, steps: Tensor, ring: bool) -> Tensor:
-    """Offsets to the nearest return in the quarter of the rows before, (2, B, H, W), row by row."""
+    """Offsets to the nearest return in the quadrant of previous rows, (2, B, H, W), row by row."""
     batch, rows, columns = returned.shape
-    none = torch.full((2, batch, columns), math.inf, device=returned.device)
+    missing = torch.full((2, batch, columns), math.inf, device=returned.device)
     move = torch.tensor([[-1.0, -1.0], [-1.0, 0.0], [-1.0, 1.0]], device=returned.device)[..., None, None]
-    found, state = [none], torch.where(returned[:, 0], 0.0, none)
+    offsets, state = [missing], torch.where(returned[:, 0], 0.0, missing)
     for row in range(1, rows):
         wide = torch.cat(
-            [state[..., -1:], state, state[..., :1]] if ring else [none[..., :1], state, none[..., :1]], -1
+            [state[..., -1:], state, state[..., :1]] if ring else [missing[..., :1], state, missing[..., :1]], -1
         )
         candidates = wide.unfold(-1, columns, 1).permute(2, 0, 1, 3) + move
         best = (candidates * steps).square().sum(1).argmin(0)
         nearest = candidates.gather(0, best.expand(1, 2, *best.shape))[0]
-        found.append(nearest)
+        offsets.append(nearest)
         state = torch.where(returned[:, row], 0.0, nearest)
-    return torch.stack(found, dim=2)
+    return torch.stack(offsets, dim=2)

@@ -1,4 +1,4 @@
-"""Points to a range image and back."""
+"""Projection of points to range images, and back."""
 
 import math
 from collections.abc import Sequence
@@ -22,37 +22,36 @@ def project(
     convention: Convention = "centre",
     ring: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The range image of a scan: in every pixel the nearest return that falls into it.
+    """The range image of a scan: every pixel has its nearest return.
 
-    `spherical` chooses the row by elevation asin(z / r); `unfolding` by the laser that fired, where `ring` or
-    the order of the points tells it (`unfolded_rows`). The column is floor(W (1 - a / pi) / 2)
-    of the azimuth a = atan2(y, x): column 0 begins at +180 degrees and azimuth falls with w.
+    The row is that of the elevation asin(z / r) in `spherical`, and that of the laser in `unfolding`, from `ring` or
+    the order of the points (`unfolded_rows`). The column is floor(W (1 - a / pi) / 2) with azimuth a = atan2(y, x):
+    column 0 begins at +180 degrees and azimuth decreases with w.
 
-    `centre` keeps a return only where min_range <= r <= max_range and the field of view holds it.
-    `reference` is the published R2Flow's: elevations outside the view are clamped into the edge rows, and
-    the nearest return is chosen before the range limits are applied, so that a return nearer than
-    min_range punches a hole into the pixel behind it.
+    `centre` keeps returns with min_range <= r <= max_range in the field of view. `reference` is the convention of the
+    published R2Flow: elevations outside the view are clamped to the edge rows, and the range limits are applied after
+    the nearest return is chosen, so that a return nearer than min_range empties its pixel.
 
     Args:
-        xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. One that is not finite is a ray without
+        xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. Points that are not finite are rays without
             return.
-        reflectance: (N,), or None where the scan has none.
+        reflectance: (N,), or None.
         sensor: Rows, columns and range limits.
-        ring: Ring number of each point, (N,), counted from 0 or 1, that rises or falls with elevation or is the
-            laser's in the sensor's firing order.
+        ring: Ring number of each point, (N,), counted from 0 or 1, monotonic in elevation or in the sensor's firing
+            order.
 
     Returns:
-        Range in metres and reflectance, (2, H, W) float32; 0 where no return was kept.
+        Range in metres and reflectance, (2, H, W) float32; 0 without a return.
 
     Raises:
-        InputError: a scan that does not unfold into the sensor's rings.
+        InputError: the scan does not unfold into the sensor's rings.
     """
     hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
     return scatter(sensor, hit, [r, np.zeros_like(r) if reflectance is None else reflectance[chosen]])
 
 
 def scatter(sensor: Sensor, pixel: np.ndarray, values: Sequence[np.ndarray]) -> np.ndarray:
-    """An image of C channels, (C, H, W) float32, of the values, (M,) each, at pixels h W + w; 0 elsewhere."""
+    """Scatter C channels of values, (M,) each, to pixels h W + w of an image, (C, H, W) float32; 0 elsewhere."""
     image = np.zeros((len(values), math.prod(sensor.shape)), dtype=np.float32)
     image[:, pixel] = values
     return image.reshape(-1, *sensor.shape)
@@ -65,10 +64,10 @@ def project_indices(
     convention: Convention = "centre",
     ring: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which return each pixel keeps, see `project`.
+    """The return of each pixel, see `project`.
 
     Returns:
-        The pixels that keep one, h W + w, ascending; the index of its point in `xyz`; its range in metres: (M,) each.
+        Pixels with a return, h W + w, ascending; indices of their points in `xyz`; their ranges in metres: (M,) each.
     """
     assert convention in get_args(Convention), convention
     assert projection in get_args(Projection), projection
@@ -76,19 +75,19 @@ def project_indices(
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     finite = np.isfinite(r)
-    known = xyz
-    if not finite.all():  # rays without a return, which unfolding counts as fired and no pixel keeps
-        known, r = np.where(finite[:, None], xyz, np.float32(0)), np.where(finite, r, np.float32(0))
-    row = _rows(xyz if projection == "unfolding" else known, r, sensor, projection, convention, ring)
+    points = xyz
+    if not finite.all():  # rays without a return: fired in unfolding, but not in any pixel
+        points, r = np.where(finite[:, None], xyz, np.float32(0)), np.where(finite, r, np.float32(0))
+    row = _rows(xyz if projection == "unfolding" else points, r, sensor, projection, convention, ring)
     pixel = row * columns
-    pixel += _columns(known, columns)
+    pixel += _columns(points, columns)
     within = finite & (r >= sensor.min_range) & (r <= sensor.max_range)
     if convention == "reference":
         pixel[~finite] = rows * columns
         hit, chosen = _nearest_by_sorting(pixel, r)
         hit, chosen = hit[within[chosen]], chosen[within[chosen]]
     else:
-        # Points that are left out share one pixel behind the last: faster than removing them from every array.
+        # Omitted points share an extra pixel after the last: faster than removing them from every array.
         pixel[(row < 0) | (row >= rows) | ~within] = rows * columns
         hit, chosen = _nearest(pixel, r, rows * columns)
     return hit, chosen, r[chosen]
@@ -102,7 +101,7 @@ def _rows(
     convention: Convention,
     ring: np.ndarray | None,
 ) -> np.ndarray:
-    """Row of every point, (N,) int64; outside [0, H) where the view does not hold it."""
+    """Row of every point, (N,) int64; outside [0, H) for points outside the view."""
     if projection == "unfolding":
         return unfolded_rows(xyz, sensor, convention, ring)
     rows = sensor.shape[0]
@@ -129,9 +128,9 @@ def _columns(xyz: np.ndarray, columns: int) -> np.ndarray:
 
 
 def _nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """The occupied ones of the first `pixels` and the index of the nearest point in each; of equals, the first."""
-    # A positive float32 orders like its bits: with (bits of r, index) in one integer the nearest point
-    # is the minimum, found in one pass without sorting 120,000 points.
+    """The occupied pixels below `pixels`, and the index of the nearest point in each; of equals, the first."""
+    # Positive float32 values order like their bits: with (bits of r, index) in one integer, the nearest point is the
+    # minimum, found in one pass without sorting 120,000 points.
     key = r.view(np.uint32).astype(np.uint64)
     key <<= np.uint64(32)
     key |= np.arange(len(r), dtype=np.uint64)
@@ -143,10 +142,10 @@ def _nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray,
 
 
 def _nearest_by_sorting(pixel: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same in the way of the reference: written from far to near, so that the nearest is written last.
+    """As `_nearest`, but like the reference: points are written from far to near, so that the nearest is written last.
 
-    KITTI stores coordinates in millimetres, and under 1 % of the pixels hold two points of one range; which of them
-    the reference keeps is decided by numpy's unstable sort, so the same sort is used here.
+    KITTI stores coordinates in millimetres, and under 1 % of the pixels hold two points of equal range. Which one the
+    reference keeps depends on NumPy's unstable sort, so the same sort is used.
     """
     order = np.argsort(-r)
     owner = np.full(int(pixel.max(initial=0)) + 1, -1, dtype=np.int64)
@@ -156,7 +155,7 @@ def _nearest_by_sorting(pixel: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, n
 
 
 def unproject(r: Tensor, rays: Tensor) -> Tensor:
-    """Points seen along each ray, p = r (cos e cos a, cos e sin a, sin e).
+    """Points along rays, p = r (cos e cos a, cos e sin a, sin e).
 
     Args:
         r: Ranges in metres, (B, 1, H, W); 0 marks a ray without return.
@@ -173,12 +172,12 @@ def unproject(r: Tensor, rays: Tensor) -> Tensor:
 def image_to_points(
     image: np.ndarray, rays: Tensor, measured: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The returns of one image as a cloud, in firing order: ring after ring from the top, azimuth rising from 0.
+    """The returns of an image as a point cloud, ring after ring from the top, with azimuth increasing from 0.
 
     Args:
         image: Range in metres and reflectance, (2, H, W); reflectance may be missing, (1, H, W).
         rays: (2, H, W) radians.
-        measured: Points of the pixels in metres, (3, H, W), to be taken where they are not the origin.
+        measured: Points of the pixels in metres, (3, H, W), used except at the origin.
 
     Returns:
         Points in metres, (N, 3), and reflectance, (N,), float32; N is the number of returns.
@@ -189,7 +188,7 @@ def image_to_points(
         xyz = np.where(measured.any(axis=0), measured, xyz)
     reflectance = image[1] if len(image) > 1 else np.zeros_like(image[0])
     columns = image.shape[-1]
-    # Azimuth falls with w from +180 degrees: read backwards from the middle, it rises from 0.
+    # Azimuth decreases with w from +180 degrees: backwards from the middle, it increases from 0.
     order = np.roll(np.arange(columns)[::-1], (columns + 1) // 2)
     xyz, reflectance, returned = xyz[..., order], reflectance[..., order], image[0][..., order] > 0
     return np.ascontiguousarray(xyz[:, returned].T), np.ascontiguousarray(reflectance[returned])

@@ -1,4 +1,4 @@
-"""A part of the image: an azimuth sector, a block of rows."""
+"""Regions of an image: an azimuth sector, a block of rows."""
 
 import math
 from dataclasses import dataclass
@@ -8,21 +8,21 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 
-# Degrees beside a sector that `r2flow sample` generates with it. On the demo's 1-RF a sector of 90 degrees is 0.065
-# from the whole scan in model space without a margin, 0.015 with this one, 0.006 with 45 degrees.
+# Degrees next to a sector that `r2flow sample` generates and crops. With the demo's 1-RF, the distance of a 90-degree
+# sector from the whole scan in model space is 0.065 without margin, 0.015 with this margin, 0.006 with 45 degrees.
 MARGIN = 11.25
 
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle of an image whose columns are a full turn."""
+    """A rectangle of an image whose columns cover a full turn."""
 
     shape: tuple[int, int]  # rows and columns (H, W) of the whole image
     top: int
     height: int
     left: int
-    width: int  # columns, which go on at column 0 behind the last
-    margin: int = 0  # columns on either side that are generated with it and cut off
+    width: int  # number of columns, which wrap around from the last to column 0
+    margin: int = 0  # columns on either side that are generated and cropped
 
     @property
     def rows(self) -> Tensor:
@@ -36,30 +36,30 @@ class Region:
 
     @property
     def share(self) -> float:
-        """Part of the image's pixels, 0 to 1."""
+        """Share of the image's pixels."""
         return self.height * self.width / math.prod(self.shape)
 
     def crop(self, image: Tensor) -> Tensor:
-        """(..., H, W) to (..., height, width)."""
+        """Crop an image, (..., H, W), to (..., height, width)."""
         rows, columns = self.rows.to(image.device), self.columns.to(image.device)
         return image.index_select(-2, rows).index_select(-1, columns)
 
     def place(self, part: Tensor) -> Tensor:
-        """(..., height, width) in an image of zeros, (..., H, W)."""
+        """Insert a part, (..., height, width), into an image of zeros, (..., H, W)."""
         image = part.new_zeros(*part.shape[:-2], *self.shape)
         rows, columns = self.rows.to(part.device), self.columns.to(part.device)
         image[..., rows[:, None], columns] = part
         return image
 
     def widened(self) -> "Region":
-        """The region and its margin."""
+        """The region with its margin."""
         left, width = self.left - self.margin, self.width + 2 * self.margin
         if width >= self.shape[1]:
             left, width = 0, self.shape[1]
         return Region(self.shape, self.top, self.height, left % self.shape[1], width)
 
     def rounded(self, unit: tuple[int, int]) -> "Region":
-        """The smallest region around this one of whole units of rows and columns, of which the image is made."""
+        """The smallest region that contains this one and consists of whole units (rows, columns) of the image."""
         assert not any(size % step for size, step in zip(self.shape, unit, strict=True)), unit
         top, height = _outward(self.top, self.height, unit[0])
         left, width = _outward(self.left, self.width, unit[1])
@@ -83,16 +83,16 @@ def region(
     rows: tuple[int, int] | None = None,
     margin: float = 0.0,
 ) -> Region:
-    """The pixels that look into an azimuth sector and belong to a block of rows.
+    """The pixels of an azimuth sector and a block of rows.
 
     Args:
-        shape: Rows and columns (H, W) of the image; column 0 begins at +180 degrees and azimuth falls with w.
+        shape: Rows and columns (H, W) of the image; column 0 begins at +180 degrees and azimuth decreases with w.
         sector: Azimuths in degrees, counter-clockwise from the first to the second: (-45, 45) is the quarter ahead,
-            (135, -135) the one behind. Pixels that are partly inside belong to it. Two azimuths a whole turn apart,
-            such as (180, -180), are the full turn. None for all.
-        rows: First and last row, both included, 0 at the top. None for all.
-        margin: Degrees on either side of the sector that are generated with it and cut off, as what is next to a cut is
-            not what it is in the whole scan.
+            (135, -135) the quarter behind. Pixels partly inside are included. Azimuths a full turn apart, such as
+            (-180, 180), are the full turn. None: all columns.
+        rows: First and last row, both included, 0 at the top. None: all rows.
+        margin: Degrees on either side of the sector that are generated and cropped, because a crop changes the
+            generated scan near its edges.
     """
     height, width = shape
     first_row, last_row = rows or (0, height - 1)
@@ -114,7 +114,7 @@ def _columns(width: int, sector: tuple[float, float]) -> tuple[int, int]:
         raise InputError(
             f"the sector {begin:.15g},{end:.15g} is narrower than a column, {360 / width:g} degrees; make it wider."
         )
-    fuzz = 1e-9 * width  # rounding must not add a pixel where the sector ends between two
+    fuzz = 1e-9 * width  # rounding must not add a pixel if the sector ends between two
     left = math.floor((180 - (begin + turn)) / 360 * width + fuzz)
     right = math.ceil((180 - begin) / 360 * width - fuzz)
     return (0, width) if right - left >= width else (left % width, right - left)

@@ -1,4 +1,4 @@
-"""Your own sensor as a dozen lines of YAML, for the verbs and, in conf/sensor/, for training."""
+"""Custom sensors as YAML files, for commands and, in conf/sensor/, for training."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -15,10 +15,10 @@ LARGEST_FILE = 1 << 20  # bytes; a sensor is a dozen lines
 
 
 def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
-    """A sensor from a YAML file with the options of `build_sensor`.
+    """Read a sensor from a YAML file with the options of `build_sensor`.
 
     Args:
-        rows, columns: Image size, if not the file's.
+        rows, columns: Image size; None: as in the file.
     """
     path = Path(path)
     refuse_unreadable(path, LARGEST_FILE, "sensor's YAML")
@@ -39,7 +39,7 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
 
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
-    """Write a sensor as a YAML file, whose first lines say where the numbers come from."""
+    """Write a sensor as a YAML file that begins with a comment, such as the source of the numbers."""
     options = {key: value for key, value in asdict(sensor).items() if value is not None}
     options |= {key: list(value) for key, value in options.items() if isinstance(value, tuple)}
     options |= {"rows": None, "rays": "centre"}

@@ -1,4 +1,4 @@
-"""Sensors: spinning LiDARs, each described by its rays."""
+"""Sensors: spinning LiDARs, described by their rays."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from r2flow.registry import Registry
 
 Convention = Literal["centre", "reference"]
 
-MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, and it still fits into memory
+MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, but within memory
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Sensor:
     """A spinning LiDAR as an image of H beams by W azimuth bins."""
 
     name: str
-    elevations: tuple[float, ...]  # of each row in degrees, the top row first, strictly falling
-    columns: int = 1024  # azimuth bins W of a full turn; column 0 begins at +180 degrees and azimuth falls with w
+    elevations: tuple[float, ...]  # of each row in degrees, the top row first, strictly decreasing
+    columns: int = 1024  # azimuth bins W of a full turn; column 0 begins at +180 degrees, azimuth decreases with w
     min_range: float = 1.45  # valid ranges, in metres
     max_range: float = 80.0
-    height: float = 1.73  # usual height of the sensor above the ground in metres
-    #: Row of laser 0, 1, ... in the order of the sensor's packets; None where that is from the top down or bottom up.
+    height: float = 1.73  # typical height of the sensor above the ground in metres
+    #: Row of laser 0, 1, ... in the order of the sensor's packets; None if the order is top-down or bottom-up.
     firing: tuple[int, ...] | None = None
-    reflectance_scale: float | None = None  # what means full reflectance in its scan files; None where not known
+    reflectance_scale: float | None = None  # value of full reflectance in its scan files; None if unknown
 
     def __post_init__(self) -> None:
         e, near, far, scale = self.elevations, self.min_range, self.max_range, self.reflectance_scale
@@ -53,19 +53,19 @@ class Sensor:
                 raise InputError(f"sensor {self.name!r}: {rule}; found {str(value)[:80]}.")
 
     def described(self) -> dict[str, Any]:
-        """What its images depend on, as plain values: all fields but the scale of the files' reflectance."""
+        """All fields that images depend on, as plain values: all except `reflectance_scale`."""
         return {key: value for key, value in asdict(self).items() if key != "reflectance_scale"}
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(H, W)."""
+        """Image size (H, W)."""
         return len(self.elevations), self.columns
 
     @property
     def row_edges(self) -> np.ndarray:
-        """Elevations in degrees between the rows, (H + 1,), falling; float64.
+        """Elevations in degrees of the edges of the rows, (H + 1,), decreasing; float64.
 
-        Half-way between neighbouring beams; the outer two are as far from the first and last beam as the inner ones.
+        Inner edges are half-way between neighbouring beams; outer edges are as far from their beam as its inner edge.
         """
         e = np.asarray(self.elevations, dtype=np.float64)
         inner = (e[:-1] + e[1:]) / 2
@@ -74,8 +74,8 @@ class Sensor:
     def rays(self, convention: Convention = "centre") -> Tensor:
         """Elevation e and azimuth a of every pixel in radians, (2, H, W), float32.
 
-        `centre` is the middle of each bin: e is the beam's elevation and a = pi - 2 pi (w + 1/2) / W. `reference` is
-        the bin's upper left corner, a = pi - 2 pi w / W, half a bin off, as the published R2Flow weights need.
+        `centre` is the centre of each bin: e is the beam's elevation, a = pi - 2 pi (w + 1/2) / W. `reference` is the
+        upper left corner of the bin, a = pi - 2 pi w / W, an offset of half a bin that published R2Flow weights need.
         """
         if convention == "centre":
             elevation, shift = np.asarray(self.elevations, dtype=np.float64), 0.5
@@ -87,10 +87,9 @@ class Sensor:
         return torch.from_numpy(grid.astype(np.float32))
 
     def resized(self, rows: int | None = None, columns: int | None = None) -> "Sensor":
-        """The same field of view in another number of rows and columns.
+        """The sensor with the same field of view and another number of rows and columns.
 
-        New row edges are interpolated between the old ones: each new row covers an equal share of the old rows, whether
-        these are evenly spaced or not.
+        Row edges are interpolated: each new row covers an equal share of the old rows, evenly spaced or not.
         """
         sensor = self if columns is None else replace(self, columns=columns)
         old = len(self.elevations)
@@ -116,13 +115,13 @@ def _halves_in_turn(rows: int) -> tuple[int, ...]:
 
 
 def _by_laser(elevations: Sequence[float]) -> dict[str, Any]:
-    """Elevations and firing order of a sensor from the elevations of its lasers in the manual's order."""
+    """Elevations and firing order of a sensor, from the elevations of its lasers in the order of the manual."""
     order = sorted(range(len(elevations)), key=lambda laser: -elevations[laser])
     return {"elevations": tuple(elevations[laser] for laser in order), "firing": tuple(np.argsort(order).tolist())}
 
 
-# Median elevations of the 64 rings of an HDL-64E, measured on unfolded KITTI scans; another car's lie within 0.2
-# degrees. Rings are not evenly spaced, which matters wherever a row is a ring: under scan unfolding.
+# Median elevations of the 64 rings of an HDL-64E, measured on unfolded KITTI scans; another car's are within 0.2
+# degrees. Rings are not evenly spaced, which matters for scan unfolding, where each row is a ring.
 HDL64E_RINGS = (
     2.45, 2.06, 1.80, 1.34, 1.06, 0.64, 0.37, 0.00, -0.34, -0.74, -1.02,
     -1.35, -1.72, -2.05, -2.37, -2.71, -3.00, -3.36, -3.63, -3.99, -4.28, -4.61,
@@ -139,8 +138,8 @@ VLP32C_LASERS = (
     2.333, -2.667, -3.0, 7.0, 4.667, -2.333, -2.0, 15.0, 10.333, -1.333,
 )  # fmt: skip
 
-# Pandar64, from the correction table of the maker's open driver (Hesai): elevation of channel 1, 2, ..., 64, the top
-# one first. A unit's own calibration file differs from it by some hundredths of a degree.
+# Pandar64, from the correction table of the manufacturer's open driver (Hesai): elevation of channel 1, 2, ..., 64 from
+# the top. Calibration files of single units differ by some hundredths of a degree.
 PANDAR64_CHANNELS = (
     14.882, 11.032, 8.059, 5.057, 3.04, 2.028, 1.86, 1.688, 1.522, 1.351, 1.184,
     1.013, 0.846, 0.675, 0.508, 0.337, 0.169, 0.0, -0.169, -0.337, -0.508, -0.675,
@@ -150,11 +149,11 @@ PANDAR64_CHANNELS = (
     -8.059, -9.06, -9.885, -11.032, -12.006, -12.974, -13.93, -18.889, -24.897,
 )  # fmt: skip
 
-# Ranges and beams by the manuals: HDL-32E 63-9113, VLP-16 63-9243, VLP-32C 63-9325 (Velodyne); OS1 datasheet of its
+# Ranges and beams from the manuals: HDL-32E 63-9113, VLP-16 63-9243, VLP-32C 63-9325 (Velodyne); OS1 datasheet of its
 # first generation, whose 64 beams span +-16.6 degrees and whose 128 span +-22.5 (Ouster); Pandar64 640-en (Hesai).
-# An OS1's beams are calibrated unit by unit, up to half a degree off these: `r2flow sensor` finds a unit's own.
+# OS1 beams are calibrated per unit and differ by up to half a degree: `r2flow sensor` estimates them from scans.
 # hdl64e is the image of the paper: 64 equal bins between +3 and -25 degrees, 1.45 to 80 m. It has no firing order:
-# packets list its lasers by number, and every unit has its own calibration of their elevations.
+# packets list the lasers by number, and the calibrated elevations differ between units.
 SENSORS: Registry[Sensor] = Registry(
     "sensor",
     hdl64e=Sensor("hdl64e", _beams(3 - 7 / 32, 7 / 16, 64)),
@@ -186,7 +185,7 @@ def build_sensor(
     firing: Sequence[int] | None = None,
     reflectance_scale: float | None = None,
 ) -> Sensor:
-    """A built-in sensor by its name, or your own by `elevations`, with the size and limits that are given."""
+    """A built-in sensor by name, or a custom sensor by `elevations`, with the given size and limits."""
     if elevations is not None and name in SENSORS:
         raise InputError(f"{name!r} is the name of a built-in sensor; give your own sensor another one.")
     limits = {"min_range": min_range, "max_range": max_range, "height": height, "reflectance_scale": reflectance_scale}
@@ -195,6 +194,6 @@ def build_sensor(
         sensor = SENSORS[name] if elevations is None else Sensor(name, tuple(e + 0.0 for e in elevations))
         if firing is not None:
             sensor = replace(sensor, firing=tuple(map(index, firing)))
-    except (OverflowError, TypeError) as error:  # a whole number of YAML has any number of digits, a list any values
+    except (OverflowError, TypeError) as error:  # YAML integers can have any number of digits, lists any values
         raise InputError(f"sensor {name!r}: elevations, firing and limits must be numbers; {error}.") from None
     return replace(sensor.resized(rows, columns), **given)  # type: ignore[arg-type]

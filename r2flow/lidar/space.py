@@ -1,4 +1,4 @@
-"""Model space: what a network sees of a scan, and the way back to metres."""
+"""Model space: encoded images of a sensor, and decoding to metres and points."""
 
 import copy
 from collections.abc import Mapping
@@ -24,28 +24,28 @@ class ModelSpace:
 
     sensor: Sensor
     encoding: Encoding
-    rays: Tensor  # elevation and azimuth of every pixel in radians, (2, H, W), as networks are told
+    rays: Tensor  # elevation and azimuth of every pixel in radians, (2, H, W), an input of networks
 
     def through(self, sensor: Sensor) -> "ModelSpace":
-        """The images of another sensor in the same encoding."""
+        """The model space of another sensor with the same encoding."""
         return ModelSpace(sensor, self.encoding.through(sensor), sensor.rays())
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """C, H and W of one image."""
+        """(C, H, W) of an image."""
         return self.encoding.shape
 
     def check_channels(self, channels: str) -> None:
-        """Refuse channels that an image of this space cannot give."""
+        """Refuse channels that images of this space do not have."""
         if channels not in CHANNELS:
             raise InputError(f"channels must be {', '.join(CHANNELS[:-1])} or {CHANNELS[-1]}, found {channels!r}.")
         if channels == "reflectance" and not self.encoding.reflectance:
-            raise InputError("this model was trained on range alone and has no reflectance to give.")
+            raise InputError("this model was trained on range alone and has no reflectance.")
 
     def decode(self, x: Tensor, channels: str = "both") -> Tensor:
-        """Model space to metres and reflectance: (B, C, h, w) to (B, 2 or 1, h, w).
+        """Decode model space, (B, C, h, w), to metres and reflectance, (B, 2 or 1, h, w).
 
-        `reflectance` still decodes the range, which says where a ray was dropped; `range` skips the reflectance.
+        `reflectance` also decodes the range, to find dropped rays; `range` skips the reflectance.
         """
         encoding = self.encoding
         if channels == "range" and encoding.reflectance:
@@ -56,14 +56,14 @@ class ModelSpace:
         return image[:, 1:] if channels == "reflectance" else image
 
     def points(self, images: Tensor) -> list[np.ndarray]:
-        """The returns of each range image as a point cloud, along rays through the middles of the pixels.
+        """The returns of each range image as a point cloud, along rays through the pixels' centres.
 
         Args:
-            images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W); 0 where a ray was dropped.
+            images: Range in metres and, optionally, reflectance, (B, 2 or 1, H, W); 0 for dropped rays.
 
         Returns:
-            For each image x, y, z in metres (x ahead, y left, z up) and reflectance, (N, 4) float32; N differs from
-            scan to scan. Reflectance is 0 where it is not known.
+            For each image x, y, z in metres (x ahead, y left, z up) and reflectance, (N, 4) float32; N differs between
+            scans. Reflectance is 0 if the images have none.
         """
         images = torch.as_tensor(images)
         if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != self.sensor.shape:

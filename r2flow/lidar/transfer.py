@@ -1,7 +1,7 @@
-"""A scan of one sensor as what is known of another sensor's image.
+"""Transfer of a scan to a partially measured image of another sensor.
 
-A row of the image is measured where a beam of the scan's sensor looks into it. A pixel of such a row is known to be
-empty only where a ray was fired into it and did not come back.
+A row of the image is measured if it contains a beam of the scan's sensor. A pixel of such a row is known to be empty
+only if a ray was fired into it and did not return.
 """
 
 import math
@@ -18,56 +18,56 @@ from r2flow.lidar.scan_files.points import NEAREST
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.unfolding import elevations_of
 
-BLIND = 5.0  # degrees: in a wider sector without any return nothing was measured, as in a scan that was cut
+BLIND = 5.0  # degrees: a wider sector without any return counts as not measured, as in a cropped scan
 
 
 @dataclass(frozen=True)
 class Partial:
-    """What is known of an image."""
+    """A partially measured image."""
 
-    image: np.ndarray  # range in metres and, where known, reflectance, (2 or 1, H, W) float32; 0 without a return
+    image: np.ndarray  # range in metres and, if measured, reflectance, (2 or 1, H, W) float32; 0 without a return
     state: np.ndarray  # `Ray` of each ray, (H, W) uint8
-    xyz: np.ndarray | None = None  # the measured points of the returns in metres, (3, H, W) float32, where known
+    xyz: np.ndarray | None = None  # the measured points of the returns in metres, (3, H, W) float32, or None
 
 
 def sensor_of(scans: list[Points], named: Sensor | None = None) -> Sensor:
-    """The sensor of some scans, named or estimated, with as many columns as it fires rays in a turn."""
+    """The sensor of some scans, named or estimated, with as many columns as rays per turn."""
     if named is None:
         estimate = estimate_sensor(scans)
         return replace(estimate.sensor, columns=round(estimate.steps))
     rows = [rows_of(elevations_of(scan.xyz), named) for scan in scans]
     try:
         return replace(named, columns=round(steps_of_a_turn(scans, rows)))
-    except InputError:  # too few points to tell
+    except InputError:  # too few points
         return named
 
 
 def rows_of(elevations: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """The row of a sensor's image that each elevation in degrees falls into; -1 for none."""
+    """The row of a sensor's image for each elevation in degrees; -1 outside the view."""
     row = np.searchsorted(-sensor.row_edges, -np.asarray(elevations), side="right") - 1
     return np.where(row < sensor.shape[0], row, -1)
 
 
 def points_through(points: Points, source: Sensor, target: Sensor, reflectance: np.ndarray | None = None) -> Partial:
-    """What is known of a target's image by a scan of another sensor (`sensor_of`).
+    """The target's partially measured image, from a scan of another sensor (`sensor_of`).
 
-    All points of a beam go to the row that the beam looks into, by the median of their elevations. Rays that did not
-    come back lie evenly between the two returns of their beam next to them, as many as its steps leave room for.
+    All points of a beam are in the row of their median elevation. Rays without return are evenly spaced between the
+    two neighbouring returns of their beam, one per missing azimuth step.
 
     Args:
-        reflectance: Of each point, of [0, 1]; None where the scan has none.
+        reflectance: Reflectance of each point in [0, 1], or None.
     """
     elevation, azimuth = elevations_of(points.xyz), _azimuth(points.xyz)
     beam = rows_of(elevation, source)
     by_beam = [np.flatnonzero(beam == b) for b in range(source.shape[0])]
-    seen = np.array([np.median(elevation[some]) if len(some) else e
-                     for some, e in zip(by_beam, source.elevations, strict=True)])  # fmt: skip
+    seen = np.array([np.median(elevation[members]) if len(members) else e
+                     for members, e in zip(by_beam, source.elevations, strict=True)])  # fmt: skip
     row = rows_of(seen, target)
     empty = np.zeros(target.shape, dtype=bool)
-    for r, some in zip(row, by_beam, strict=True):
+    for r, members in zip(row, by_beam, strict=True):
         if r >= 0:
-            empty[r, _columns(_without_return(azimuth[some], source.columns), target.columns)] = True
-    many = points.dropped > (len(points.xyz) + points.dropped) / 100  # a damaged row or two are no lost rays
+            empty[r, _columns(_without_return(azimuth[members], source.columns), target.columns)] = True
+    many = points.dropped > (len(points.xyz) + points.dropped) / 100  # a few damaged rows are not lost rays
     keeps_empty = many or bool((beam < 0).any() and (~points.xyz.any(axis=1)).any())
     if not keeps_empty:
         empty[:, _blind(azimuth[beam >= 0], target.columns, 3 * 360 / source.columns)] = False
@@ -77,7 +77,7 @@ def points_through(points: Points, source: Sensor, target: Sensor, reflectance: 
 
 
 def image_through(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:
-    """What is known of a target's image by another sensor's image, (2 or 1, H, W), all of whose rays are measured."""
+    """The target's partially measured image, from a fully measured image of another sensor, (2 or 1, H, W)."""
     e, a = source.rays().double().numpy()
     row = rows_of(np.asarray(source.elevations), target)
     pixel = row[:, None] * target.columns + _columns(a, target.columns)
@@ -85,9 +85,9 @@ def image_through(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:
     empty = np.zeros(math.prod(target.shape), dtype=bool)
     empty[pixel[~returned & inside]] = True
     xyz = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1) * image[0][..., None]
-    some = returned & inside
-    reflectance = image[1][some] if len(image) > 1 else None
-    return _cast(target, xyz[some].astype(np.float32), pixel[some], empty.reshape(target.shape), reflectance)
+    hits = returned & inside
+    reflectance = image[1][hits] if len(image) > 1 else None
+    return _cast(target, xyz[hits].astype(np.float32), pixel[hits], empty.reshape(target.shape), reflectance)
 
 
 def points_of_same(
@@ -97,9 +97,9 @@ def points_of_same(
     convention: Convention = "centre",
     reflectance: np.ndarray | None = None,
 ) -> Partial:
-    """What is known of a sensor's image by a scan of this sensor.
+    """The partially measured image of a scan of the same sensor.
 
-    All of it, but for a sector without any return and for what is behind a return nearer than its nearest range.
+    All rays are measured, except sectors without any return and pixels behind a return nearer than the minimum range.
     """
     hit, chosen, r = project_indices(points.xyz, target, projection, convention, points.ring)
     image = scatter(target, hit, [r] if reflectance is None else [r, reflectance[chosen]])
@@ -115,7 +115,7 @@ def points_of_same(
 
 
 def image_of_same(image: np.ndarray, target: Sensor) -> Partial:
-    """What is known of a sensor's image by such an image, (2 or 1, H, W): a ray without a return came back empty."""
+    """The measured image from an image of the same sensor, (2 or 1, H, W); rays without a return are empty."""
     r = image[0]
     near, far = (r > 0) & (r < target.min_range), r > target.max_range
     returned = (r > 0) & ~near & ~far
@@ -133,10 +133,10 @@ def _cast(
     empty: np.ndarray,
     reflectance: np.ndarray | None,
 ) -> Partial:
-    """The image of returns at their pixels, and of pixels that a ray was fired into without one.
+    """The image of returns at their pixels, and of pixels of rays without a return.
 
-    A return nearer than the target's nearest range is the vehicle itself, and what is behind it was not measured; one
-    beyond its farthest does not come back to the target.
+    A return nearer than the target's minimum range is the vehicle itself, and the space behind it was not measured; a
+    return beyond the maximum range is not a return for the target.
     """
     r = np.linalg.norm(xyz, axis=1).astype(np.float32)
     near, far = r < target.min_range, r > target.max_range
@@ -163,7 +163,7 @@ def _columns(azimuth: np.ndarray, columns: int) -> np.ndarray:
 
 
 def _without_return(azimuth: np.ndarray, steps: float) -> np.ndarray:
-    """Azimuths of the rays of one beam that did not come back, from those of its returns, in radians."""
+    """Azimuths of the rays of a beam without return, from the azimuths of its returns, in radians."""
     step = 2 * math.pi / steps
     if not len(azimuth):
         return np.arange(round(steps)) * step

@@ -1,20 +1,20 @@
-"""Scan unfolding: the row of a point by the laser that fired it, from the file instead of its elevation."""
+"""Scan unfolding: the row of a point is the laser that fired it, taken from the file instead of the elevation."""
 
 import numpy as np
 
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention, Sensor
 
-SAMPLE = 256  # firings from which their order is found
-SURE = 0.9  # share of neighbouring lasers whose elevations must fall in that order
+SAMPLE = 256  # number of firings from which their order is estimated
+SURE = 0.9  # minimum share of neighbouring lasers whose elevations decrease in that order
 
 
 def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring: np.ndarray | None) -> np.ndarray:
-    """Row of every point, (N,) int64; outside [0, H) where the image does not hold it.
+    """Row of every point, (N,) int64; outside [0, H) for points outside the image.
 
-    The lasers are found in one of three ways, tried in this order: by ring numbers; by whole firings of H points each,
-    rays without return included, all in one order of the lasers; or ring after ring (`rings_from_order`), aligned at
-    the bottom because rings that see only sky are missing at the top. `reference` uses the last way only.
+    Lasers are found by the first of three ways that works: ring numbers; whole firings of H points each, including rays
+    without return, in a fixed order of lasers; or ring after ring (`rings_from_order`), aligned at the bottom because
+    rings that see only sky are missing at the top. `reference` uses the last way only.
     """
     rows = sensor.shape[0]
     if ring is not None:
@@ -25,10 +25,10 @@ def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring:
     row = order - (order.max(initial=0) + 1) + rows
     if convention == "reference":
         return np.maximum(row, 0)
-    found = int(order.max(initial=-1)) + 1
-    if not rows / 2 <= found <= rows + 1:
+    rings = int(order.max(initial=-1)) + 1
+    if not rows / 2 <= rings <= rows + 1:
         raise InputError(
-            f"the scan unfolds into {found} rings, but sensor '{sensor.name}' has {rows}: it has no ring numbers and "
+            f"the scan unfolds into {rings} rings, but sensor '{sensor.name}' has {rows}: it has no ring numbers and "
             f"is stored neither ring after ring nor in whole firings of {rows}. Use the spherical projection, which "
             "finds rows by elevation."
         )
@@ -38,8 +38,8 @@ def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring:
 def rings_from_order(xyz: np.ndarray) -> np.ndarray:
     """Ring of every point from the order of storage, (N,) int64, 0 for the first ring stored.
 
-    A spinning sensor stored ring after ring sweeps azimuth upwards from 0; a new ring starts where it
-    passes from the 4th to the 1st quadrant. Points at the origin are rays without return (-1).
+    In a scan stored ring after ring, azimuth increases from 0; a new ring starts where it passes from the 4th to the
+    1st quadrant. Points at the origin are rays without return (-1).
     """
     x, y = xyz[:, 0], xyz[:, 1]
     returned = np.flatnonzero((x != 0) | (y != 0))
@@ -56,7 +56,7 @@ def rings_from_order(xyz: np.ndarray) -> np.ndarray:
 
 
 def rows_from_field(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """The rows of a file's own ring numbers, (N,) int64: counted from 0 or 1, from the top, the bottom or by laser."""
+    """Rows from a file's ring numbers, (N,) int64, which count from 0 or 1, from the top, the bottom or by laser."""
     rows = sensor.shape[0]
     if len(ring) and ring.min() > 0 and (ring.max() == rows or _from_one(xyz, ring, sensor)):
         ring = ring - 1
@@ -76,7 +76,7 @@ def rows_from_field(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> np.nda
 
 
 def _means(xyz: np.ndarray, ring: np.ndarray, rows: int) -> np.ndarray:
-    """Mean elevation of each ring in degrees, (H,); NaN for one without returns."""
+    """Mean elevation of each ring in degrees, (H,); NaN for rings without returns."""
     elevation = elevations_of(xyz)
     seen = np.isfinite(elevation)
     count = np.bincount(ring[seen], minlength=rows)
@@ -86,7 +86,7 @@ def _means(xyz: np.ndarray, ring: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _from_one(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> bool:
-    """Whether rings are counted from 1 where neither the first nor the last one returned: by the elevations alone."""
+    """Whether rings are counted from 1, by their elevations, if neither the first nor the last ring has a return."""
     rows = sensor.shape[0]
     if ring.max() > rows:
         return False
@@ -96,19 +96,19 @@ def _from_one(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> bool:
 
 
 def _misfit(elevation: np.ndarray, order: np.ndarray, sensor: Sensor) -> float:
-    """Median distance in degrees of lasers from the rows that an order gives them; infinite without a return."""
+    """Median distance in degrees between lasers and their rows in an order; infinite without a return."""
     apart = np.abs(elevation - np.asarray(sensor.elevations)[order])
     return float(np.nanmedian(apart)) if np.isfinite(apart).any() else np.inf
 
 
 def rows_from_firings(xyz: np.ndarray, sensor: Sensor) -> np.ndarray | None:
-    """The rows where the file holds whole firings, (N,) int64; else None."""
+    """The rows of a file of whole firings, (N,) int64; None for other files."""
     rows = sensor.shape[0]
     firings = len(xyz) // rows
     if len(xyz) % rows or firings < 8:
         return None
-    some = np.linspace(0, firings - 1, min(firings, SAMPLE)).astype(np.int64)
-    elevation = elevations_of(xyz.reshape(firings, rows, 3)[some].reshape(-1, 3)).reshape(-1, rows)
+    sample = np.linspace(0, firings - 1, min(firings, SAMPLE)).astype(np.int64)
+    elevation = elevations_of(xyz.reshape(firings, rows, 3)[sample].reshape(-1, 3)).reshape(-1, rows)
     middle, scatter = scatter_of(elevation)
     if not scatter < 0.25:
         return None
@@ -117,17 +117,17 @@ def rows_from_firings(xyz: np.ndarray, sensor: Sensor) -> np.ndarray | None:
 
 
 def elevations_of(xyz: np.ndarray) -> np.ndarray:
-    """Elevation in degrees of every point, (N,); NaN for a ray without return at the origin."""
+    """Elevation in degrees of every point, (N,); NaN for points at the origin, rays without return."""
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.rad2deg(np.arcsin(xyz[:, 2] / r))
 
 
 def scatter_of(elevation: np.ndarray) -> tuple[np.ndarray, float]:
-    """Median elevation of each column of (firings, lasers), NaN without return; and the scatter of the columns.
+    """Median elevation of each column of (firings, lasers), NaN without return, and the scatter of the columns.
 
-    The scatter is the median distance from a column's median divided by that from the median of all: near 0 where each
-    column is one laser, else near 1. Medians are not affected by returns from the vehicle itself.
+    The scatter is the median distance from the column's median over the median distance from the overall median: near
+    0 if each column is a laser, else near 1. Medians are robust against returns from the vehicle itself.
     """
     middle = median_of_seen(elevation)
     about = np.abs(elevation - middle)
@@ -137,7 +137,7 @@ def scatter_of(elevation: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def median_of_seen(values: np.ndarray) -> np.ndarray:
-    """Median (the upper of two) of what is not NaN in each column, (W,); NaN where all is."""
+    """Upper median of each column without NaN values, (W,); NaN for columns of NaN."""
     ordered = np.sort(values, axis=0)  # NaN last
     seen = np.isfinite(values).sum(axis=0)
     middle = ordered[np.minimum(seen // 2, len(values) - 1), np.arange(values.shape[1])]
@@ -145,10 +145,10 @@ def median_of_seen(values: np.ndarray) -> np.ndarray:
 
 
 def best_order(elevation: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, float]:
-    """Row of each laser in the order that fits their elevations best, (H,) int64.
+    """Row of each laser, (H,) int64, in the order that best fits their elevations, and the quality of the fit.
 
-    The orders are from the top row down, from the bottom up and the sensor's own firing order. The second value is the
-    share of neighbouring lasers, in that order, whose elevations fall; of equals the order with the nearest rows wins.
+    Candidates are top-down, bottom-up and the sensor's firing order. The quality is the share of neighbouring lasers
+    with decreasing elevations; ties go to the order with the smaller distance to the rows.
     """
     rows = len(elevation)
     orders = [np.arange(rows), np.arange(rows)[::-1]]

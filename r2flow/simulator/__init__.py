@@ -17,28 +17,28 @@ from r2flow.simulator.raycast import cast
 from r2flow.simulator.returns import report
 from r2flow.simulator.scene import Scene, SceneBuilder
 
-REVISION = 3  # of the scans: rises with every change after which a seed gives other scans
+REVISION = 3  # of the scans: incremented with every change of the scans of a seed
 
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """One scan."""
+    """A simulated scan with labels."""
 
     image: np.ndarray  # range in metres and reflectance in [0, 1], (2, H, W), float32; 0 where missing
     labels: np.ndarray  # SemanticKITTI ids, (H, W), uint16; 0 where missing
 
 
 def simulate(sensor: Sensor, seed: int, index: int) -> SimulatedScan:
-    """Scan `index` of `seed`: a function of these and the sensor alone, bit for bit the same on every machine.
+    """Scan `index` of `seed`, a function of sensor, seed and index only, bit-identical on every machine.
 
-    The scene is drawn before anything that depends on the sensor, so that all sensors see the same scenes.
+    The scene is drawn before anything that depends on the sensor, so that all sensors scan the same scenes.
     """
     rng = generator(seed, "simulator", index)
     return observe(draw_scene(rng), sensor, rng)
 
 
 def draw_scene(rng: np.random.Generator) -> Scene:
-    """A scene of one of `kinds.KINDS`, drawn by their shares."""
+    """Draw a scene of a kind in `kinds.KINDS`, chosen by their shares."""
     draws = ScalarDraws(rng)
     name = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
     b, k = SceneBuilder(draw_ground(draws, name), draws), KINDS[name]
@@ -58,7 +58,7 @@ def draw_scene(rng: np.random.Generator) -> Scene:
 
 
 def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> SimulatedScan:
-    """A sensor's scan of a scene, from its usual height above the scene's origin."""
+    """Scan a scene with a sensor at its default height above the scene's origin."""
     rays = Rays(lasers_of(sensor), sensor.columns, sensor.height)
     image, labels = report(sensor, rays, cast(scene, rays, rng), scene.rig, rng)
     return SimulatedScan(image, labels)

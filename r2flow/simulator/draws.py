@@ -1,7 +1,7 @@
-"""Numbers with the same bits on every machine: functions made of sums, products, roots and tables, and random draws.
+"""Bit-reproducible functions, composed of sums, products, roots and tables, and random draws.
 
-IEEE arithmetic is the same everywhere. Sine, exponential and others are not: numpy chooses an implementation by the
-processor, and these differ in the last bit. One bit can move a ray past an edge, and scans must be equal throughout.
+IEEE arithmetic is identical on all machines. Sine, exponential and others are not: NumPy chooses an implementation for
+the processor, and results differ in the last bit. A single bit can move a ray past an edge and change a scan.
 """
 
 import math
@@ -12,12 +12,12 @@ from typing import TypeVar
 
 import numpy as np
 
-_ENTRIES = 8192  # of a table of quantiles; the outermost of a Gaussian lie at 3.8 standard deviations
+_ENTRIES = 8192  # of a table of quantiles; the outermost Gaussian quantiles are at 3.8 standard deviations
 _TAYLOR = tuple((-1) ** k * (2 * math.pi) ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(7))
 
 
 def sine(x: np.ndarray) -> np.ndarray:
-    """sin x to 1e-9 (float64) or to rounding (float32), by Taylor's series on a quarter of a turn."""
+    """sin x to 1e-9 (float64) or to rounding (float32), by the Taylor series on a quarter turn."""
     t = x * (1 / (2 * math.pi))
     t = t - np.rint(t)
     t = np.maximum(np.minimum(t, 0.5 - t), -0.5 - t)  # sin(pi - a) = sin a
@@ -47,12 +47,12 @@ def _normal_quantiles() -> np.ndarray:
 
 @cache
 def exponential_quantiles() -> np.ndarray:
-    """Quantiles of Exp(1) at the middles of equal shares, (8192,), float32."""
+    """Quantiles of Exp(1) at the midpoints of 8192 equal shares, (8192,), float32."""
     return np.array([-math.log1p(-(k + 0.5) / _ENTRIES) for k in range(_ENTRIES)], np.float32)
 
 
 def normals(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Gaussian draws, float32: random entries of a table of 8192 quantiles."""
+    """Standard normal draws, float32: random entries of a table of 8192 quantiles."""
     return _normal_quantiles()[rng.integers(0, _ENTRIES, shape, dtype=np.uint16)]
 
 
@@ -62,7 +62,7 @@ def exponentials(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray
 
 
 def logistic(x: np.ndarray) -> np.ndarray:
-    """A smooth step from 0 to 1 with the slope of 1 / (1 + e^-x) at 0: t^2 (3 - 2 t), t = clip(1/2 + x / 6, 0, 1)."""
+    """Smooth step from 0 to 1, with the slope of 1 / (1 + e^-x) at 0: t^2 (3 - 2 t), t = clip(1/2 + x / 6, 0, 1)."""
     t = np.clip(x * (1 / 6) + 0.5, 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -73,7 +73,7 @@ _BULK = 4096  # a scene takes about 12,000
 
 
 class ScalarDraws:
-    """Random numbers, each computed from uniform ones that are drawn in bulk."""
+    """Scalar random numbers, computed from uniform numbers that are drawn in bulk."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -94,7 +94,7 @@ class ScalarDraws:
         return self.unit() < probability
 
     def normal(self, mean: float, deviation: float) -> float:
-        """Gaussian, by the method of Box and Muller."""
+        """Gaussian, by the Box-Muller transform."""
         radius = math.sqrt(-2 * math.log(1 - self.unit()))
         return mean + deviation * radius * math.cos(2 * math.pi * self.unit())
 
@@ -103,22 +103,22 @@ class ScalarDraws:
         return -mean * math.log(1 - self.unit())
 
     def poisson(self, mean: float) -> int:
-        """Poisson: the number of exponential waiting times that fit into `mean`."""
+        """Poisson: the number of exponential waiting times within `mean`."""
         count, waited = 0, self.exponential(1.0)
         while waited < mean:
             count, waited = count + 1, waited + self.exponential(1.0)
         return count
 
     def whole(self, low: int, high: int) -> int:
-        """A whole number, low <= n <= high."""
+        """Uniform integer, low <= n <= high."""
         return low + int((high - low + 1) * self.unit())
 
     def side(self) -> int:
-        """+1, left, or -1, right."""
+        """+1 (left) or -1 (right)."""
         return 1 if self.unit() < 0.5 else -1
 
     def pick(self, options: Sequence[T], shares: Sequence[float]) -> T:
-        """One of the options, with probabilities proportional to `shares`."""
+        """Choose an option with probability proportional to `shares`."""
         left = self.unit() * sum(shares)
         for option, share in zip(options, shares, strict=True):
             left -= share

@@ -1,4 +1,4 @@
-"""A folder of simulated scans, whose missing scans the same command makes."""
+"""Resumable folders of simulated scans."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,11 +18,11 @@ FORMATS = ("bin", "pcd", "ply", "npy")  # npy is the range image itself
 
 
 class SimulatedFolder(FileStore):
-    """The scans of one folder: scan i is a function of the sensor, the seed and i alone.
+    """The scans of a folder; scan i is a function of sensor, seed and i only.
 
     Args:
-        formats: Endings of the files of a scan, some of `FORMATS`.
-        labels: Whether each has a SemanticKITTI .label file, uint32 for each point in the order of the points.
+        formats: Endings of the files of a scan, from `FORMATS`.
+        labels: Whether each scan has a SemanticKITTI .label file, a uint32 per point in the order of the points.
     """
 
     def __init__(
@@ -37,11 +37,11 @@ class SimulatedFolder(FileStore):
                 raise InputError(f"no format named {name!r} for simulated scans; known: {', '.join(FORMATS)}.")
         if labels and tuple(formats) == ("npy",):
             raise InputError(
-                "labels are those of points, and .npy is a range image without any; add another format, such as bin."
+                "labels are those of points, and .npy is a range image without points; add another format, such as bin."
             )
 
     def simulate(self, item: int) -> None:
-        """Make one scan and write its files."""
+        """Simulate a scan and write its files."""
         scan = simulate(self.sensor, self.seed, item)
         rays = self.sensor.rays()
         xyz, reflectance = image_to_points(scan.image, rays)

@@ -1,4 +1,4 @@
-"""The ground: an uneven surface with streets, kerbs, pavements and verges, and where rays meet it."""
+"""The ground: an uneven surface with streets, kerbs, pavements and verges, and its intersection with rays."""
 
 import math
 from dataclasses import dataclass, field
@@ -11,16 +11,16 @@ from r2flow.simulator.draws import sine
 from r2flow.simulator.lasers import Rays
 from r2flow.simulator.materials import INDEX, column
 
-SAMPLES = 72  # points of a column's profile; between them the ground is straight
+SAMPLES = 72  # points of a column's profile, which is piecewise linear
 NEAREST = 1.5  # metres: the profile's first point; nearer, the ground is level
 REACH = 90.0  # metres: the profile's last point
 
-# A number while a scene is drawn, an array when it is scanned.
+# Coordinate: a number in drawing a scene, an array in scanning.
 Where = Any
 
 
 def _sin(x: Where) -> Where:
-    return math.sin(x) if isinstance(x, float) else sine(x)  # for a number numpy takes ten times as long
+    return math.sin(x) if isinstance(x, float) else sine(x)  # NumPy takes ten times as long for a number
 
 
 def _larger(x: Where, y: Where) -> Where:
@@ -31,16 +31,16 @@ class Street(NamedTuple):
     """A strip along v = offset + curvature u^2 / 2, u along the heading and v to its left."""
 
     heading: float  # direction in radians
-    offset: float  # lateral place v of the middle line in metres
+    offset: float  # lateral coordinate v of the centre line in metres
     curvature: float  # 1 / radius, 1 / metre
     half_width: float  # half of the carriageway in metres
-    pavement: float  # width of the pavement beside it in metres; 0 for none
-    start: float = -1e6  # where it begins, metres along
-    stop: float = 1e6  # where it ends
-    lines: tuple[float, ...] = ()  # lateral places of painted lines in metres from the middle; the middle one is dashed
+    pavement: float  # width of the pavements in metres; 0 for none
+    start: float = -1e6  # u of its start in metres
+    stop: float = 1e6  # u of its end in metres
+    lines: tuple[float, ...] = ()  # lateral coordinates of painted lines in metres; the centre line is dashed
 
     def locate(self, x: Where, y: Where) -> tuple[Where, Where]:
-        """(u, lateral): metres along the street and to the left of its middle line."""
+        """(u, lateral): metres along the street and to the left of its centre line."""
         c, s = math.cos(self.heading), math.sin(self.heading)
         u = x * c + y * s
         return u, y * c - x * s - self.offset - (self.curvature / 2) * u * u
@@ -54,14 +54,14 @@ class Street(NamedTuple):
     def away(self, x: Where, y: Where) -> Where:
         """Distance to the carriageway in metres, negative on it."""
         u, lateral = self.locate(x, y)
-        beside = abs(lateral) - self.half_width
+        distance = abs(lateral) - self.half_width
         if self.start > -1e6 or self.stop < 1e6:
-            beside = _larger(beside, _larger(self.start - u, u - self.stop))
-        return beside
+            distance = _larger(distance, _larger(self.start - u, u - self.stop))
+        return distance
 
 
 class Patch(NamedTuple):
-    """A paved rectangle, a drive or a yard; x, y, yaw, length and width as of a box."""
+    """A paved rectangle, such as a drive or a yard; fields as in `Boxes`."""
 
     x: float
     y: float
@@ -74,20 +74,20 @@ class Patch(NamedTuple):
 class Ground:
     """z = -drop + lean . p + sum_k A_k [sin(k . p + phi) - sin phi - cos phi (k . p)] + banks, and a kerb.
 
-    The bracket has neither height nor slope at the origin, where the car stands.
+    The bracket has zero height and slope at the origin, the position of the car.
     """
 
     waves: tuple[tuple[float, float, float, float], ...] = ()  # rows (A in metres, k_x and k_y in radians / metre, phi)
     lean: tuple[float, float] = (0.0, 0.0)  # slope along x and y relative to the car, which leans on its springs
-    drop: float = 0.0  # how much lower than usual the ground is below the sensor, in metres
-    streets: tuple[Street, ...] = ()  # the streets; without any, all of the ground is verge
+    drop: float = 0.0  # how far the ground is below its default height under the sensor, in metres
+    streets: tuple[Street, ...] = ()  # the streets; without streets, all ground is verge
     kerb: float = 0.0  # height of the kerb in metres
     tufts: float = 0.0  # height in metres of grass and rubble beyond the pavements
-    banks: tuple[float, float] = (0.0, 0.0)  # rise beside the first street, left and right, in metres
-    corner: float = 4.0  # radius of the kerb where streets meet, in metres
+    banks: tuple[float, float] = (0.0, 0.0)  # rise next to the first street, left and right, in metres
+    corner: float = 4.0  # radius of the kerb at junctions, in metres
     verge: tuple[int, int] = (LABELS["terrain"], INDEX["grass"])  # (label, material) of the ground beyond the pavements
-    patches: tuple[Patch, ...] = ()  # drives and yards beside the street
-    # Reflectance reading of each material here, (M,).
+    patches: tuple[Patch, ...] = ()  # drives and yards next to the street
+    # Reflectance reading of each material, (M,).
     albedo: np.ndarray = field(default_factory=lambda: column("albedo"))
 
     def height(self, x: Where, y: Where) -> Where:
@@ -99,7 +99,7 @@ class Ground:
         return z + self._bank(x, y) if any(self.banks) else z
 
     def _bank(self, x: Where, y: Where) -> Where:
-        """A smooth step of the banks' heights, over 12 metres from the pavement outwards."""
+        """A smooth step to the height of the banks, over 12 metres outwards from the pavement."""
         street = self.streets[0]
         _, lateral = street.locate(x, y)
         out = (abs(lateral) - street.half_width - street.pavement - 1) / 12
@@ -108,7 +108,7 @@ class Ground:
         return (right + (left - right) * (lateral > 0)) * t * t * (3 - 2 * t)
 
     def off_street(self, x: Where, y: Where) -> Where:
-        """Distance to the nearest carriageway in metres, negative on one; corners are rounded."""
+        """Distance to the nearest carriageway in metres, negative on a carriageway; corners are rounded."""
         first, *others = self.streets
         distance = first.away(x, y)
         for street in others:
@@ -129,17 +129,17 @@ class Ground:
         if self.streets:
             away = self.off_street(x, y)
             pavement = max(street.pavement for street in self.streets)
-            beside, on = away <= pavement, away <= 0
-            label[beside], material[beside] = LABELS["sidewalk"], INDEX["paving"]
+            near, on = away <= pavement, away <= 0
+            label[near], material[near] = LABELS["sidewalk"], INDEX["paving"]
             label[on], material[on] = LABELS["road"], INDEX["asphalt"]
             painted = self._painted(x, y)
             label[painted], material[painted] = LABELS["lane-marking"], INDEX["marking"]
-        # Repairs, wear and damp: reflectance that varies over a few metres.
+        # Repairs, wear and damp: reflectance varies over a few metres.
         stains = 0.03 * sine(1.1 * x + 0.4 * y) * sine(0.5 * x - 1.3 * y) + 0.02 * sine(0.23 * x + 0.31 * y)
         return label, material, self.albedo[material] + stains
 
     def _painted(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Points on a painted line of the first street, outside of the crossings."""
+        """Whether points are on a painted line of the first street, outside crossings."""
         street, *others = self.streets
         if not street.lines:
             return np.zeros(x.shape, bool)
@@ -153,10 +153,10 @@ class Ground:
         return on & (u > street.start) & (u < street.stop)
 
     def meet(self, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
-        """First meeting of every ray with the ground, kerbs included: distance, inf for none, and cosine, (B, W) each.
+        """First intersection of every ray with the ground and kerbs: distance (inf for none) and cosine, (B, W) each.
 
-        The profile of each column is a chain of straight pieces. A ray meets the first piece at whose end the running
-        maximum of (ground - laser) / s, the slope to the ground's skyline, exceeds its own slope.
+        The profile of each column is piecewise linear. A ray intersects the first piece at whose end the running
+        maximum of (ground - laser) / s, the slope to the ground's skyline, exceeds the slope of the ray.
         """
         s = np.geomspace(NEAREST, REACH, SAMPLES).astype(np.float32)[:, None]
         z = self.height(s * rays.cos, s * rays.sin)
@@ -165,7 +165,7 @@ class Ground:
         for block in np.unique(rays.lasers.block):
             rows = np.flatnonzero(rays.lasers.block == block)
             distance[rows], steepness[rows] = _meet_profile(s, z, rays.slope[rows], rays.height[rows])
-        approach = steepness - rays.slope[:, None]  # how much ray and ground approach each other per metre of s
+        approach = steepness - rays.slope[:, None]  # approach of ray and ground per metre of s
         cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + steepness**2))
         if self.kerb > 0 and self.streets:
             distance, cosine = self._step_up(rays, distance, approach, cosine)
@@ -176,10 +176,10 @@ class Ground:
     def _step_up(
         self, rays: Rays, low: np.ndarray, approach: np.ndarray, cosine: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Raise everything but the carriageway by the kerb.
+        """Raise everything except carriageways by the kerb.
 
-        A ray reaches the raised level first, kerb / approach before the low one. Beside the street it stops there; over
-        the street it goes on to the low level, or to the kerb's face where that is nearer.
+        A ray reaches the raised level first, kerb / approach before the low level. Off the street it ends there; over
+        the street it continues to the low level, or to the kerb's face if that is nearer.
         """
         met = np.isfinite(low)
         s_low, c, s = (np.broadcast_to(q, met.shape)[met] for q in (low, rays.cos, rays.sin))
@@ -193,7 +193,7 @@ class Ground:
         return out, facing
 
     def _overgrown(self, rays: Rays, distance: np.ndarray, approach: np.ndarray) -> np.ndarray:
-        """Move the meeting with the verge forward by h / approach, where grass and rubble of height h stand on it."""
+        """Move intersections with the verge forward by h / approach, for grass and rubble of height h."""
         met = np.isfinite(distance)
         s, c, sine_ = (np.broadcast_to(q, met.shape)[met] for q in (distance, rays.cos, rays.sin))
         x, y = s * c, s * sine_
@@ -209,25 +209,25 @@ class Ground:
 
 
 def _meet_profile(s: np.ndarray, z: np.ndarray, slope: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays of falling slopes T and nearly equal heights meet profiles z(s).
+    """Intersect rays of decreasing slopes T and nearly equal heights with profiles z(s).
 
-    The piece that a ray meets is found with the mean height of the lasers, the place on it with the ray's own.
-    s is (S, 1), z (S, W), slope and height (R,); returned are the distance of the first meeting, inf for none, and the
-    slope of the ground there, (R, W) each.
+    The piece of a ray is found with the mean height of the lasers, the position on it with the height of the ray's
+    laser. s is (S, 1), z (S, W), slope and height (R,). Returns the distance of the first intersection, inf for none,
+    and the slope of the ground there, (R, W) each.
     """
     (samples, columns), rays = z.shape, len(slope)
     skyline = np.maximum.accumulate((z - height.mean()) / s, axis=0)
     covered = np.searchsorted(-slope, -skyline, side="left")  # rays above the skyline so far, (S, W)
-    # A ray's piece is the number of profile points whose skyline is still below it: a histogram of
-    # `covered` per column, summed upwards from the lowest ray.
+    # A ray's piece is the number of profile points with a skyline below it: a histogram of `covered` per column,
+    # accumulated upwards from the lowest ray.
     cells = covered * columns + np.arange(columns)
     count = np.bincount(cells.ravel(), minlength=(rays + 1) * columns).reshape(rays + 1, columns)
     piece = np.cumsum(count[::-1], axis=0)[::-1][1:]
     start, end = np.clip(piece - 1, 0, samples - 2), np.clip(piece, 1, samples - 1)
     w = np.arange(columns)
     s_0, s_1, z_0, z_1 = s[start, 0], s[end, 0], z[start, w], z[end, w]
-    own = (z_1 - z_0) / (s_1 - s_0)
-    level = piece == 0  # nearer than the first point: level ground
-    own, z_0, s_0 = np.where(level, 0, own), np.where(level, z[0], z_0), np.where(level, 0, s_0)
-    distance = s_0 + (height[:, None] + s_0 * slope[:, None] - z_0) / np.maximum(own - slope[:, None], 1e-6)
-    return np.where(piece < samples, distance, np.inf), own
+    ground = (z_1 - z_0) / (s_1 - s_0)
+    level = piece == 0  # before the first point: level ground
+    ground, z_0, s_0 = np.where(level, 0, ground), np.where(level, z[0], z_0), np.where(level, 0, s_0)
+    distance = s_0 + (height[:, None] + s_0 * slope[:, None] - z_0) / np.maximum(ground - slope[:, None], 1e-6)
+    return np.where(piece < samples, distance, np.inf), ground

@@ -1,4 +1,4 @@
-"""Kinds of places, and the ground plan of one: its streets and its uneven ground."""
+"""Kinds of places, and their random ground plans: streets and uneven ground."""
 
 import math
 from typing import NamedTuple
@@ -16,15 +16,15 @@ Span = tuple[float, float]
 class Kind(NamedTuple):
     """A kind of place."""
 
-    share: float  # how often it is drawn
-    half_width: Span  # half of the carriageway, from and to, in metres
-    pavement: Span  # width of the pavement, from and to, in metres
-    setback: Span  # distance of the houses from the pavement, from and to, in metres
+    share: float  # share of scenes
+    half_width: Span  # half of the carriageway in metres, from and to
+    pavement: Span  # width of the pavement in metres, from and to
+    setback: Span  # distance of the houses from the pavement in metres, from and to
     gap: float  # mean gap between houses in metres
     storeys: tuple[int, int]  # from and to
     built: float  # share of plots with a house; the others are green
     parked: float  # share of the kerb taken by parked cars
-    plants: float  # trees and bushes for each 10 metres of front
+    plants: float  # trees and bushes per 10 metres of front
     hedges: float  # share of fronts with a hedge
     fences: float  # share of fronts with a fence or wall
     people: float  # mean number of people
@@ -55,7 +55,7 @@ KINDS = {
 
 
 def draw_ground(draws: ScalarDraws, name: str) -> Ground:
-    """The ground of a place of this kind: its streets, slopes and surfaces."""
+    """Draw the ground of a place of this kind: streets, slopes and surfaces."""
     kind = KINDS[name]
     streets = _streets(draws, kind, straight=name == "highway")
     main = streets[0]
@@ -80,7 +80,7 @@ def draw_ground(draws: ScalarDraws, name: str) -> Ground:
 
 TUFTS = 0.02, 0.18  # metres: height of grass and rubble on verges, from and to
 
-# Length and height in metres of the waves that add up to the ground.
+# Length and height in metres of the waves of the ground.
 _WAVES = ((7.0, 0.012), (16.0, 0.03), (38.0, 0.07), (80.0, 0.20), (170.0, 0.40))
 
 
@@ -91,7 +91,7 @@ def _wave(draws: ScalarDraws, length: float, height: float) -> tuple[float, floa
 
 
 def _streets(draws: ScalarDraws, kind: Kind, straight: bool) -> tuple[Street, ...]:
-    """The street that the car drives on, in its right half, and perhaps one that crosses or joins it."""
+    """The street of the car, which drives on its right half, and possibly a crossing or joining street."""
     half = draws.uniform(*kind.half_width)
     lines = (0.0, half - 0.3, 0.3 - half) if straight or draws.chance(0.35) else ()
     main = Street(
@@ -108,7 +108,7 @@ def _streets(draws: ScalarDraws, kind: Kind, straight: bool) -> tuple[Street, ..
 
 
 def _crossed(draws: ScalarDraws, main: Street) -> tuple[Street, ...]:
-    """A crossroads, a side street to one side, or the end of the main street at another."""
+    """A crossroads, a side street, or a main street that ends at another street."""
     at, half = draws.uniform(-40, 50), draws.uniform(2.6, 4.5)
     across = Street(
         heading=math.pi / 2 + draws.normal(0, 0.2), offset=-at, curvature=draws.normal(0, 0.0025),
@@ -126,7 +126,7 @@ def _crossed(draws: ScalarDraws, main: Street) -> tuple[Street, ...]:
 
 
 def _drives(draws: ScalarDraws, main: Street) -> tuple[Patch, ...]:
-    """Paved drives and yards beside the street."""
+    """Paved drives and yards next to the street."""
     out = []
     for _ in range(draws.whole(1, 5)):
         length, width = draws.uniform(2.5, 9), draws.uniform(4, 10)

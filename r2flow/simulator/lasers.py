@@ -1,12 +1,12 @@
-"""The lasers of a sensor: where each starts, its inclination, and the row of the image that a return falls into.
+"""The lasers of a sensor: positions, inclinations, and the image rows of their returns.
 
 The rows of a range image are evenly spaced; the lasers of a real sensor are not, and fire from two blocks of lenses
 above the origin of the points. A return at range r from a laser of inclination E and height z has the elevation
 
     e = asin((z + s tan E) / r),    s the horizontal distance,
 
-which depends on r: near returns move up by whole rows. That is why rows of real projected scans are empty in some
-places and full in others.
+which depends on r: near returns move up by whole rows. Therefore rows of real projected scans are empty in some places
+and full in others.
 """
 
 from dataclasses import dataclass
@@ -22,18 +22,18 @@ from r2flow.lidar.sensors import Sensor
 class Lasers:
     """B lasers on a spinning head."""
 
-    elevation: np.ndarray  # inclination E in radians, falling, (B,)
+    elevation: np.ndarray  # inclination E in radians, decreasing, (B,)
     height: np.ndarray  # height z of each laser above the sensor's origin in metres, (B,)
     side: np.ndarray  # distance of each laser to the left of the axis, seen outwards, in metres, (B,)
-    block: np.ndarray  # number of the lens block of each laser, (B,); the lasers of one block are close together
-    phase: np.ndarray  # where in its first azimuth bin each laser fires first, as a share of half a bin, (B,)
+    block: np.ndarray  # number of the lens block of each laser, (B,); the lasers of a block are close together
+    phase: np.ndarray  # position of each laser's first firing in its azimuth bin, as a share of half a bin, (B,)
     bias: np.ndarray  # error of each laser's range in metres, (B,)
     gain: np.ndarray  # error of each laser's reflectance, (B,)
-    straight: bool  # whether laser b looks along the middles of the bins of the image's row b
+    straight: bool  # whether laser b fires along the bin centres of image row b
 
 
-# Inclinations in degrees of an HDL-64E S2, found by fitting z = z_i + s tan E_i to the 64 rings of scans of
-# a drive; the fit's residual is 0.001 degrees for the upper block and 0.005 for the lower.
+# Inclinations in degrees of an HDL-64E S2, fitted by z = z_i + s tan E_i to the 64 rings of a drive's scans. Residuals:
+# 0.001 degrees for the upper block, 0.005 for the lower.
 _HDL64E_UPPER = (
     1.94, 1.57, 1.30, 0.87, 0.58, 0.18, -0.09, -0.45, -0.80, -1.20, -1.49, -1.83, -2.21, -2.55, -2.87, -3.24,
     -3.54, -3.94, -4.22, -4.59, -4.91, -5.25, -5.61, -5.96, -6.33, -6.68, -7.00, -7.29, -7.68, -8.06, -8.31, -8.71,
@@ -51,9 +51,9 @@ _HDL64E_GAIN = (
     -0.06, 0.03, 0.06, -0.21, 0.00, -0.06, -0.07, 0.00, 0.02, 0.04, -0.11, -0.10, -0.11, -0.02, 0.02, 0.00,
 )  # fmt: skip
 
-# Error of each laser's range in metres. Upper block: steps between neighbouring rings on upright walls, summed; drives
-# agree (correlation 0.96). Lower block, where walls are rare: distances of the rings from a smooth surface through the
-# road 4 to 11 metres away, medians over three drives, which agree within a centimetre.
+# Error of each laser's range in metres. Upper block: summed steps between neighbouring rings on upright walls; drives
+# agree (correlation 0.96). Lower block, which rarely sees walls: distances of the rings from a smooth surface through
+# the road 4 to 11 metres away, medians over three drives, which agree within a centimetre.
 _HDL64E_BIAS = (
     0.006, -0.025, 0.024, -0.031, 0.007, -0.085, 0.051, -0.015, -0.022, 0.012, 0.046, 0.006, 0.042, 0.015, -0.012,
     -0.021, 0.036, -0.005, 0.064, -0.005, 0.003, -0.033, -0.023, -0.027, 0.022, -0.022, 0.009, -0.050, 0.035,
@@ -67,9 +67,9 @@ _HDL64E_BIAS = (
 HDL64E = Lasers(
     elevation=np.deg2rad(np.array(_HDL64E_UPPER + _HDL64E_LOWER)),
     height=np.concatenate([np.linspace(0.209, 0.198, 32), np.linspace(0.126, 0.116, 32)]),
-    side=np.tile([0.026, -0.026], 32),  # neighbours sit left and right of the axis
+    side=np.tile([0.026, -0.026], 32),  # neighbours are left and right of the axis
     block=np.repeat([0, 1], 32),
-    phase=np.modf(0.618 * np.arange(64))[0],  # not known, but neighbours differ
+    phase=np.modf(0.618 * np.arange(64))[0],  # unknown; neighbours differ
     bias=np.array(_HDL64E_BIAS),
     gain=np.array(_HDL64E_GAIN),
     straight=False,
@@ -78,20 +78,20 @@ HDL64E = Lasers(
 
 @lru_cache(maxsize=16)
 def lasers_of(sensor: Sensor) -> Lasers:
-    """The lasers of a sensor: calibrated ones of an HDL-64E, whatever its image size, else one along each row."""
+    """The lasers of a sensor: the calibrated lasers of an HDL-64E for any image size, else a laser along each row."""
     return HDL64E if sensor.name == "hdl64e" else along_rows(sensor)
 
 
 def along_rows(sensor: Sensor) -> Lasers:
-    """Lasers exactly along `sensor.rays("centre")`, all from the origin."""
+    """Lasers along `sensor.rays("centre")`, all at the origin."""
     elevation = np.deg2rad(np.asarray(sensor.elevations, dtype=np.float64))
     zero = np.zeros_like(elevation)
     return Lasers(elevation, zero, zero, zero.astype(int), zero, zero, zero, straight=True)
 
 
 def rows_of(sensor: Sensor, slope: np.ndarray) -> np.ndarray:
-    """Row that each return falls into by its apparent slope tan e; -1 outside the field of view."""
-    edges = np.tan(np.deg2rad(sensor.row_edges))[::-1].astype(np.float32)  # rising, as searchsorted wants
+    """Row of each return by its apparent slope tan e; -1 outside the field of view."""
+    edges = np.tan(np.deg2rad(sensor.row_edges))[::-1].astype(np.float32)  # ascending, for searchsorted
     h = len(sensor.elevations)
     row = h - np.searchsorted(edges, slope, side="right")
     return np.where((row >= 0) & (row < h), row, -1)
@@ -100,11 +100,11 @@ def rows_of(sensor: Sensor, slope: np.ndarray) -> np.ndarray:
 class Rays:
     """B lasers by W azimuths.
 
-    Every ray is p(s) = (s cos a, s sin a, z + s T): s the horizontal distance, a the azimuth of the column, T = tan E
-    the slope of the laser and z its height. An upright surface is met at an s that depends on the column alone.
+    Every ray is p(s) = (s cos a, s sin a, z + s T) with horizontal distance s, azimuth a of the column, slope
+    T = tan E and height z of the laser. The s of an intersection with an upright surface depends on the column only.
 
     Args:
-        columns: Number W of azimuths; column w looks along a = pi - 2 pi (w + 1/2) / W.
+        columns: Number W of azimuths; column w has azimuth a = pi - 2 pi (w + 1/2) / W.
         ground: Height of the sensor's origin above the scene's z = 0, in metres.
     """
 
@@ -113,7 +113,7 @@ class Rays:
         self.shape = len(lasers.elevation), columns
         self.azimuth = np.pi - 2 * np.pi * (np.arange(columns) + 0.5) / columns  # a in radians, (W,), float64
         self.cos, self.sin = np.cos(self.azimuth).astype(np.float32), np.sin(self.azimuth).astype(np.float32)
-        self.slope = np.tan(lasers.elevation).astype(np.float32)  # T, falling, (B,)
+        self.slope = np.tan(lasers.elevation).astype(np.float32)  # T, decreasing, (B,)
         self.height = (lasers.height + ground).astype(np.float32)  # z of each laser above the scene's z = 0, (B,)
 
 
@@ -127,7 +127,7 @@ def expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def column_windows(azimuth: np.ndarray, half: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (object k, column w) whose azimuth lies within half_k of azimuth_k, (N,) each, int32."""
+    """Pairs (object k, column w) with an azimuth within half_k of azimuth_k, (N,) each, int32."""
     to_column = columns / (2 * np.pi)
     half = np.minimum(half, np.pi * (1 - 1e-9))
     first = np.ceil((np.pi - azimuth - half) * to_column - 0.5).astype(np.int64)
@@ -139,7 +139,7 @@ def column_windows(azimuth: np.ndarray, half: np.ndarray, columns: int) -> tuple
 def row_windows(
     rays: Rays, near: np.ndarray, far: np.ndarray, bottom: np.ndarray, top: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (n, laser b) that may meet [bottom, top] between the distances near and far, (F,) each, int32."""
+    """Pairs (n, laser b) that may intersect [bottom, top] between distances near and far, (F,) each, int32."""
     low, high = rays.height.min(), rays.height.max()
     falling, rising = bottom - high, top - low
     least = falling / np.where(falling < 0, near, far)
@@ -151,12 +151,12 @@ def row_windows(
 
 
 class Silhouette(NamedTuple):
-    """A part of the own car, read off two KITTI drives: |across|^p + |up|^p < 1 in degrees; `grounded`: straight down.
+    """A part of the ego vehicle, from two KITTI drives: |across|^p + |up|^p < 1 in degrees; `grounded`: straight down.
 
-    It is about a metre away, nearer than any valid return, so that a scan shows only its shadow. A laser beside the
-    axis sees it displaced: neighbouring rings are cut off alternately left and right.
+    It is about a metre away, nearer than any valid return, so that scans show only its shadow. Lasers next to the axis
+    see it displaced: neighbouring rings are occluded alternately to the left and right.
 
-    `away` is the distance in metres from the axis to the object, which sets how far neighbouring rings shift.
+    `away` is the distance in metres from the axis to the object, which determines the shift of neighbouring rings.
     """
 
     azimuth: float
@@ -182,13 +182,13 @@ _ROOF = (
     Silhouette(161, -17.0, 4.2, 4.0, 1.0, power=4),
     Silhouette(-158.5, -17.0, 4.2, 4.0, 1.0, power=4),
 )
-# A roof with its posts; with an instrument beside the sensor, and without.
+# A roof with its posts; with an instrument next to the sensor, and without.
 RIGS = ((*_ROOF, Silhouette(-69, -20.0, 11.0, 4.4, 0.55)), _ROOF)
 
 
 @lru_cache(maxsize=16)
 def hidden(lasers: Lasers, columns: int, rig: int) -> np.ndarray:
-    """Rays that end on the own car, (B, W), bool, for one of `RIGS`."""
+    """Rays that the ego vehicle occludes, (B, W), bool, for one of `RIGS`."""
     azimuth = 180 - 360 * (np.arange(columns) + 0.5) / columns
     e = np.rad2deg(lasers.elevation)[:, None]
     hidden = np.zeros((len(e), columns), bool)

@@ -1,6 +1,6 @@
-"""Materials and how they reflect.
+"""Materials and their reflectance.
 
-Reflectance is what a calibrated HDL-64E reports: of a rough wall it is about the same from 3 to 20 metres.
+Reflectance is as a calibrated HDL-64E reports it: nearly constant for a rough wall from 3 to 20 metres.
 """
 
 from typing import NamedTuple
@@ -9,14 +9,14 @@ import numpy as np
 
 
 class Material(NamedTuple):
-    """One material."""
+    """Properties of a material."""
 
     name: str
-    albedo: float  # usual reflectance at perpendicular incidence
-    spread: float  # standard deviation of albedo from one object to the next
-    texture: float  # standard deviation of reflectance from one pixel to the next
+    albedo: float  # mean reflectance at perpendicular incidence
+    spread: float  # standard deviation of albedo between objects
+    texture: float  # standard deviation of reflectance between pixels
     gloss: float  # g in the incidence falloff (1 + g) c / (c + g), c the cosine; a mirror has a large g
-    swallow: float  # share of pulses that do not return, whatever the angle and distance
+    swallow: float  # share of pulses that do not return, for any angle and distance
     depth: float  # mean depth in metres at which pulses return from inside (leaves, grass)
 
 
@@ -46,5 +46,5 @@ INDEX = {material.name: k for k, material in enumerate(MATERIALS)}
 
 
 def column(field: str) -> np.ndarray:
-    """One property of all materials, (M,), float32."""
+    """A property of all materials, (M,), float32."""
     return np.array([getattr(material, field) for material in MATERIALS], dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Vehicles, and the other things of a street: houses, plants, people, poles."""
+"""Objects of a street: vehicles, houses, plants, people, poles."""
 
 import math
 from typing import NamedTuple
@@ -32,7 +32,7 @@ _SILL, _BONNET = 0.22, 0.70  # metres: heights of the body's lower edge and of t
 
 
 def _beside(x: float, y: float, yaw: float, u: float, v: float = 0.0) -> tuple[float, float]:
-    """The place u metres ahead of (x, y) along yaw and v metres to the left."""
+    """The position u metres ahead of (x, y) along yaw and v metres to the left."""
     c, s = math.cos(yaw), math.sin(yaw)
     return x + u * c - v * s, y + u * s + v * c
 
@@ -47,7 +47,7 @@ def car(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -
     paint, albedo = ("dark paint", b.albedo("dark paint")) if dark else ("paint", draws.uniform(0.12, 0.62))
     u, long = -form.shift * length, form.cabin * length
     cabin, waist, roof = _beside(x, y, yaw, u), ground + form.waist, ground + form.roof
-    bonnet = (length / 2 - (u + long / 2)) / (form.waist - _BONNET)  # leans all the way to the windscreen
+    bonnet = (length / 2 - (u + long / 2)) / (form.waist - _BONNET)  # leans up to the windscreen
     parts = (
         (Frusta(x, y, yaw, length, width, ground + _SILL, ground + _BONNET, 0.12, 0.08, 0.04), BODY),
         (Frusta(x, y, yaw, length - 0.1, width - 0.04, ground + _BONNET, waist, bonnet, 0.3, 0.10), BODY),
@@ -78,7 +78,7 @@ def truck(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False)
 
 
 def bicycle(b: SceneBuilder, x: float, y: float, yaw: float, label: str = "bicycle") -> None:
-    """Two wheels of spokes and a frame."""
+    """Two spoked wheels and a frame."""
     ground = b.level(x, y)
     for u in (-0.52, 0.52):
         b.add(Boxes(*_beside(x, y, yaw, u), yaw, 0.62, 0.05, ground, ground + 0.66), label, "rubber", closed=0.4)
@@ -92,7 +92,7 @@ def house(b: SceneBuilder, x: float, y: float, yaw: float, length: float, width:
     albedo = b.albedo(wall)
     block = Boxes(x, y, yaw, length, width, ground - 2, ground + height)
     b.add(block, "building", wall, albedo, pattern=FACADE, base=ground)
-    pitch = b.draws.uniform(0.9, 1.6)  # metres inwards for each metre up
+    pitch = b.draws.uniform(0.9, 1.6)  # metres inwards per metre of height
     roof = Frusta(
         x, y, yaw, length + 0.4, width + 0.8, ground + height, ground + height + (width / 2 + 0.4) / pitch,
         0.0, 0.0, pitch,
@@ -131,7 +131,7 @@ def tree(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
     trunk, clear = draws.uniform(0.07, 0.20) * size, draws.uniform(1.5, 2.8)
     crown, tall = draws.uniform(1.2, 2.6) * size, draws.uniform(1.2, 2.2) * size
     b.add(Cylinders(x, y, trunk, ground - 0.5, ground + clear + tall), "trunk", "bark")
-    near = math.hypot(x, y) < 40  # farther away, rays are too sparse to tell clumps apart
+    near = math.hypot(x, y) < 40  # farther away, rays are too sparse to resolve clumps
     count, clump = (draws.whole(13, 18), 0.30) if near else (draws.whole(6, 8), 0.42)
     _clumps(b, x, y, ground + clear + tall, crown, tall, clump * crown, count, draws.uniform(0.4, 1.3))
 
@@ -166,7 +166,7 @@ def woods(b: SceneBuilder, x: float, y: float) -> None:
 
 
 def hedge(b: SceneBuilder, x: float, y: float, yaw: float, length: float, height: float) -> None:
-    """A trimmed hedge, in pieces of different height and depth; open where it meets a carriageway."""
+    """A trimmed hedge, in pieces of different height and depth; open on carriageways."""
     albedo = b.albedo("leaves")
     pieces = max(1, round(length / 2.5))
     for piece in range(pieces):
@@ -201,7 +201,7 @@ def pole(b: SceneBuilder, x: float, y: float) -> None:
     ground = b.level(x, y)
     tall = b.draws.uniform(4.5, 8.5)
     b.add(Cylinders(x, y, b.draws.uniform(0.05, 0.11), ground - 0.3, ground + tall), "pole", "metal")
-    if b.draws.chance(0.3):  # a foot with a door in it
+    if b.draws.chance(0.3):  # a base with a door
         b.add(Cylinders(x, y, b.draws.uniform(0.10, 0.15), ground - 0.3, ground + 0.9), "pole", "metal")
 
 

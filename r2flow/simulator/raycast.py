@@ -1,7 +1,7 @@
-"""Ray casting: what each ray of a scan meets first in a scene.
+"""Ray casting: the first intersection of each ray of a scan with a scene.
 
-Solids give fragments (pixel, distance), of which a pixel keeps the nearest; normal, material and details such as
-windows are computed for these alone.
+Solids give fragments (pixel, distance), of which each pixel keeps the nearest. Normals, materials and details such as
+windows are computed for the nearest fragments only.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from r2flow.simulator.shapes import Fragments, Normal, Shape
 
 ALBEDO = column("albedo")
 STOREY = 2.9  # metres
-BAY = 1.6  # metres: width of the parts of a wall that stand back or out
+BAY = 1.6  # metres: width of the recessed or projecting parts of a wall
 
 
 def divided(surface: Surface, k: np.ndarray, normal: Normal, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -35,30 +35,30 @@ def divided(surface: Surface, k: np.ndarray, normal: Normal, z: np.ndarray) -> t
 
 
 def _hash(a: np.ndarray, b: np.ndarray, key: np.ndarray) -> np.ndarray:
-    """A number in [0, 1) from three whole numbers."""
+    """A number in [0, 1) from three integers."""
     mixed = a * 73856093 ^ b * 83492791 ^ key * 19349663
     mixed = mixed * 2654435761 & 0xFFFFFFFF
     return ((mixed >> 16) & 1023).astype(np.float32) / 1024
 
 
 def _key(albedo: np.ndarray) -> np.ndarray:
-    """A whole number that differs from house to house, from the albedo, which is drawn anew for each."""
+    """An integer per house, from its random albedo."""
     return (albedo * 9973).astype(np.int64)
 
 
 def _window(rise: np.ndarray, along: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-    """Where windows are: a row in each storey, with a spacing that differs from house to house; some are left out."""
+    """Whether points are on a window: a row per storey, with a random spacing per house and random gaps."""
     key = _key(albedo)
     spacing = 2.0 + 2.4 * (key % 101) / 101
     column, storey = np.floor(along / spacing), np.floor(rise / STOREY)
     across, up = along / spacing - column, rise - storey * STOREY
-    there = _hash(column.astype(np.int64), storey.astype(np.int64), key) < 0.6
+    present = _hash(column.astype(np.int64), storey.astype(np.int64), key) < 0.6
     half = 0.10 + 0.12 * (key % 37) / 37
-    return there & (np.abs(across - 0.5) < half) & (up > 0.95) & (up < 2.15) & (rise > 0)
+    return present & (np.abs(across - 0.5) < half) & (up > 0.95) & (up < 2.15) & (rise > 0)
 
 
 def relief(surface: Surface, k: np.ndarray, normal: Normal, z: np.ndarray) -> np.ndarray:
-    """How far walls stand back from the plane of their front, in metres, (N,): bays, doors, a plinth."""
+    """Depth of walls behind the plane of their front, in metres, (N,): bays, doors, a plinth."""
     wall = (surface.pattern[k] == FACADE) & normal.flat
     rise = z - surface.base[k]
     piece, storey = np.floor(normal.along / BAY).astype(np.int64), np.floor(rise / STOREY).astype(np.int64)
@@ -71,7 +71,7 @@ DRIFT = 0.03  # of half a bin: shift of the firings from one bin to the next
 
 
 class Hits(NamedTuple):
-    """What each ray meets first; (B, W) each. Rays that meet nothing have distance inf and label 0."""
+    """First intersection of each ray; (B, W) each. Rays without intersection have distance inf and label 0."""
 
     distance: np.ndarray  # horizontal distance s from the sensor's axis in metres
     cosine: np.ndarray  # cosine of the angle between ray and surface normal
@@ -81,14 +81,14 @@ class Hits(NamedTuple):
 
 
 def cast(scene: Scene, rays: Rays, rng: np.random.Generator) -> Hits:
-    """The nearest meeting of every ray; `rng` decides which rays pass through leaves and slats."""
+    """The nearest intersection of every ray; `rng` draws which rays pass through leaves and slats."""
     low, cosine = (q.ravel() for q in scene.ground.meet(rays))
     distance = low.copy()
     met = [_visible(shape, surface, rays, distance, rng) for shape, surface in scene.tables]
     for fragments in met:
         np.minimum.at(distance, fragments.pixel, fragments.distance)
     hits = _on_ground(scene, rays, low, cosine)._replace(distance=distance)
-    # All nearest fragments are found before any is written, since writing moves some a little behind their surface.
+    # All nearest fragments are found before any is written, since writing moves some slightly behind their surface.
     won = [fragments.distance == distance[fragments.pixel] for fragments in met]
     for fragments, first, (shape, surface) in zip(met, won, scene.tables, strict=True):
         _on_solid(hits, rays, shape, surface, Fragments(*(q[first] for q in fragments)))
@@ -96,13 +96,13 @@ def cast(scene: Scene, rays: Rays, rng: np.random.Generator) -> Hits:
 
 
 def _visible(shape: Shape, surface: Surface, rays: Rays, limit: np.ndarray, rng: np.random.Generator) -> Fragments:
-    """Fragments nearer than the ground, without those that pass between slats."""
+    """Fragments nearer than the ground, without rays that pass between slats."""
     fragments = shape.fragments(rays, rng)
     keep = fragments.distance < limit[fragments.pixel]
     fragments = Fragments(*(q[keep] for q in fragments))
     if (surface.closed == 1).all():
         return fragments
-    # Slats are upright: a column passes or stops at all heights.
+    # Slats are upright: a column passes or is stopped at all heights.
     lots = rng.random(1 << 16, dtype=np.float32)
     slat = (fragments.pixel % rays.columns + fragments.solid.astype(np.int64) * 7919) & 0xFFFF
     keep = lots[slat] < surface.closed[fragments.solid]
@@ -110,7 +110,7 @@ def _visible(shape: Shape, surface: Surface, rays: Rays, limit: np.ndarray, rng:
 
 
 def _on_ground(scene: Scene, rays: Rays, distance: np.ndarray, cosine: np.ndarray) -> Hits:
-    """Hits as if there were no solids, (B W,) each."""
+    """Hits on the ground without solids, (B W,) each."""
     label = np.zeros(distance.shape, np.uint16)
     material = np.zeros(distance.shape, np.uint8)
     met = np.flatnonzero(np.isfinite(distance))
@@ -122,7 +122,7 @@ def _on_ground(scene: Scene, rays: Rays, distance: np.ndarray, cosine: np.ndarra
 
 
 def _on_solid(hits: Hits, rays: Rays, shape: Shape, surface: Surface, fragments: Fragments) -> None:
-    """Write the nearest fragments of one table into the hits."""
+    """Write the nearest fragments of a table into the hits."""
     pixel, s, k = fragments
     b, w = pixel // rays.columns, pixel % rays.columns
     x, y, z = s * rays.cos[w], s * rays.sin[w], rays.height[b] + s * rays.slope[b]
@@ -138,10 +138,10 @@ def _on_solid(hits: Hits, rays: Rays, shape: Shape, surface: Surface, fragments:
 
 
 def _between_columns(rays: Rays, b: np.ndarray, w: np.ndarray, normal: Normal, ahead: np.ndarray) -> np.ndarray:
-    """Factors of s for lasers that do not fire at the middle of the bin, (N,).
+    """Factors of s for lasers that do not fire at the centre of the bin, (N,).
 
-    A plane n . p = const met along d at s is met along d' at s (n . d) / (n . d'). Each laser fires about twice in a
-    bin, which keeps the nearer return.
+    A plane n . p = const at distance s along d is at distance s (n . d) / (n . d') along d'. Each laser fires about
+    twice per bin, which keeps the nearer return.
     """
     firing = (rays.lasers.phase[b] + DRIFT * w) % 1
     across = normal.y * rays.cos[w] - normal.x * rays.sin[w]  # d(n . d) / da

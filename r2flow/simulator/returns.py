@@ -1,4 +1,4 @@
-"""What a sensor reports of its hits: noise, lost pulses, reflectance, the image."""
+"""The returns that a sensor reports: noise, lost pulses, reflectance, the image."""
 
 from functools import cache
 
@@ -11,11 +11,11 @@ from r2flow.simulator.materials import column
 from r2flow.simulator.raycast import Hits
 
 NOISE = 0.006  # metres, scale of the range noise at range 0
-NOISE_FAR = 0.0002  # added to it for each metre of range
-RANGE_STEP = 0.002  # metres: the unit in which ranges are reported
+NOISE_FAR = 0.0002  # added per metre of range
+RANGE_STEP = 0.002  # metres: resolution of reported ranges
 LEVELS = 100  # reflectance is reported in steps of 1 / LEVELS
-# Width of each of the levels from 0.02 to 0.69, in steps: the sensor counts in steps of its own, some of which share a
-# hundredth while others have none. Frequencies of the levels in three drives, divided by those of their neighbours.
+# Width of each level from 0.02 to 0.69, in steps: the sensor has internal steps, several of which may share a hundredth
+# while other hundredths have none. Frequencies of the levels in three drives over the frequencies of their neighbours.
 _WIDTHS = (
     0.16, 0.58, 1.98, 1.58, 0.30, 0.71, 0.80, 1.14, 0.98, 1.25, 1.00, 0.48, 0.76, 0.59, 1.29, 0.93, 1.66, 1.02, 1.12,
     0.91, 0.58, 0.99, 0.64, 1.03, 0.73, 1.15, 0.93, 1.55, 1.38, 0.89, 1.24, 0.76, 1.14, 0.80, 1.21, 0.76, 1.17, 1.06,
@@ -23,12 +23,12 @@ _WIDTHS = (
     1.12, 0.68, 1.05, 1.10, 0.69, 1.06, 0.65, 1.09, 0.75, 1.10, 0.76,
 )  # fmt: skip
 CALIBRATED = 16.0  # metres up to which the sensor compensates for distance
-FADE = 0.0068  # reflectance lost per metre beyond
+FADE = 0.0068  # loss of reflectance per metre beyond
 DARK = 0.13  # reflectance below a random threshold of at most this is reported as 0
-PATCH = 3  # columns that are lost together: dark and slanted surfaces are wider than a bin
+PATCH = 3  # columns lost together: dark and slanted surfaces are wider than a bin
 FAINT = -0.10  # far returns with a reflectance below this are mostly lost
-SOFT = 0.02  # how gradually, in units of reflectance
-LOST = 0.012, 8.0  # share of faint returns lost per metre of range, beyond so many metres
+SOFT = 0.02  # width of the transition, in units of reflectance
+LOST = 0.012, 8.0  # share of faint returns lost per metre of range beyond a distance, and that distance in metres
 
 TEXTURE, GLOSS, SWALLOW, DEPTH = (column(name) for name in ("texture", "gloss", "swallow", "depth"))
 
@@ -36,9 +36,9 @@ TEXTURE, GLOSS, SWALLOW, DEPTH = (column(name) for name in ("texture", "gloss", 
 def report(
     sensor: Sensor, rays: Rays, hits: Hits, rig: int | None, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Range in metres and reflectance, (2, H, W), float32, and labels (H, W), uint16, that a sensor reports of hits.
+    """Range in metres and reflectance, (2, H, W), float32, and labels (H, W), uint16, that a sensor reports for hits.
 
-    All are 0 where a return is missing; `rig` is the number of the silhouettes of the own car, or None without.
+    All are 0 for missing returns; `rig` is the index in `RIGS` of the ego vehicle, or None.
     """
     slope, rise = rays.slope[:, None], rays.height[:, None] - np.float32(rays.ground)
     noise = normals(rng, (2, *rays.shape))
@@ -63,7 +63,7 @@ def report(
 def _levels() -> np.ndarray:
     """The reported reflectance for readings of 0, 1/2000, 2/2000, ... 1, (2001,), float32."""
     first, last = 2, 1 + len(_WIDTHS)
-    edges = (first - 0.5 + np.cumsum(_WIDTHS) * (len(_WIDTHS) / sum(_WIDTHS))) / LEVELS  # upper ones
+    edges = (first - 0.5 + np.cumsum(_WIDTHS) * (len(_WIDTHS) / sum(_WIDTHS))) / LEVELS  # upper edges
     reading = np.arange(2001) / 2000
     level = np.where(reading < (first - 0.5) / LEVELS, 0, first + np.searchsorted(edges, reading, side="right"))
     level = np.where(reading > (last + 0.5) / LEVELS, np.rint(reading * LEVELS), level)
@@ -71,12 +71,12 @@ def _levels() -> np.ndarray:
 
 
 def in_levels(reading: np.ndarray) -> np.ndarray:
-    """Reflectance as reported: clipped to [0, 0.99], in hundredths."""
+    """Reported reflectance: clipped to [0, 0.99], in hundredths."""
     return _levels()[np.rint(np.clip(reading, 0, 1) * 2000).astype(np.int32)]
 
 
 def _reading(hits: Hits, r: np.ndarray, normal: np.ndarray, rays: Rays) -> np.ndarray:
-    """Reflectance before it is clipped: albedo (1 + g) c / (c + g), fading beyond the calibrated range."""
+    """Reflectance before clipping: albedo (1 + g) c / (c + g), decreasing beyond the calibrated range."""
     g = GLOSS[hits.material]
     falloff = (1 + g) * hits.cosine / (hits.cosine + g + 1e-6)
     faded = FADE * np.maximum(r - CALIBRATED, 0)
@@ -85,7 +85,7 @@ def _reading(hits: Hits, r: np.ndarray, normal: np.ndarray, rays: Rays) -> np.nd
 
 
 def _lost(hits: Hits, r: np.ndarray, reading: np.ndarray) -> np.ndarray:
-    """Probability that no return is reported: swallowed, or too faint, which grows with the distance."""
+    """Probability of a lost return: absorbed, or too faint, which increases with the distance."""
     faint = logistic((FAINT - reading) / np.float32(SOFT))
     swallow = SWALLOW[hits.material]
     return swallow + (1 - swallow) * faint * np.clip(LOST[0] * (r - LOST[1]), 0, 1)
@@ -108,7 +108,7 @@ def _sorted_into_rows(
     label: np.ndarray,
     seen: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Each return in the row of its apparent elevation; a pixel keeps the nearest."""
+    """The image of returns in the rows of their apparent elevations; a pixel keeps the nearest."""
     h, w = sensor.shape
     if rays.lasers.straight:
         row = np.broadcast_to(np.arange(h)[:, None], rays.shape)

@@ -1,4 +1,4 @@
-"""Fronts of streets, and what stands and moves beside them."""
+"""Roadsides: houses, gardens, street furniture, parked and moving vehicles, people."""
 
 import math
 
@@ -8,12 +8,12 @@ from r2flow.simulator.kinds import Kind
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Boxes
 
-END = 82.0  # metres: nothing is built farther from the sensor
+END = 82.0  # metres: maximum distance of objects from the sensor
 CLEAR = 3.2  # metres around the sensor that stay empty
 
 
 def free(b: SceneBuilder, x: float, y: float, room: float) -> bool:
-    """Whether a place is `room` metres off all carriageways and pavements, within reach and not too near."""
+    """Whether a position is `room` metres off all carriageways and pavements, within reach and not too near."""
     if not CLEAR < math.hypot(x, y) < END + 5:
         return False
     pavement = max(street.pavement for street in b.ground.streets)
@@ -21,7 +21,7 @@ def free(b: SceneBuilder, x: float, y: float, room: float) -> bool:
 
 
 def line_front(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:
-    """Plots one after another along one side of a street."""
+    """Place plots along a side of a street."""
     draws = b.draws
     setback = draws.uniform(*kind.setback)
     edge = street.half_width + street.pavement
@@ -42,7 +42,7 @@ def line_front(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:
 
 
 def _house(b: SceneBuilder, kind: Kind, street: Street, side: int, u: float, length: float, edge: float) -> bool:
-    """A house, where there is room, and something behind it that limits the view."""
+    """A house, if there is room, usually with an object behind it that limits the view."""
     draws = b.draws
     width, middle = draws.uniform(8, 12), u + length / 2
     x, y, heading = street.place(middle, side * (edge + width / 2))
@@ -98,7 +98,7 @@ def green(b: SceneBuilder, street: Street, side: int, u: float, length: float, e
 
 
 def _gap(b: SceneBuilder, street: Street, side: int, u: float, gap: float, lateral: float) -> None:
-    """Between two houses: a gate or wall, and trees behind."""
+    """A gap between two houses: a gate or wall, with trees behind."""
     draws = b.draws
     x, y, heading = street.place(u + gap / 2, side * (lateral + 0.5))
     if draws.chance(0.4) and free(b, x, y, gap / 2):
@@ -107,7 +107,7 @@ def _gap(b: SceneBuilder, street: Street, side: int, u: float, gap: float, later
 
 
 def _car_park(b: SceneBuilder, street: Street, side: int, middle: float, edge: float) -> None:
-    """Two rows of cars at right angles to the street, on the green."""
+    """A car park on a green plot: two rows of cars at right angles to the street."""
     draws = b.draws
     for row in (3.5, 11.0):
         for slot in range(-3, 4):
@@ -128,7 +128,7 @@ def beyond(b: SceneBuilder, street: Street, side: int, middle: float, lateral: f
 
 
 def close_street(b: SceneBuilder, street: Street) -> None:
-    """Houses or trees across the far ends, as where streets bend out of sight."""
+    """Houses or trees across the far ends of a street, as at a bend."""
     draws = b.draws
     for end, limit in ((-1, street.start), (1, street.stop)):
         if abs(limit) < END:
@@ -142,7 +142,7 @@ def close_street(b: SceneBuilder, street: Street) -> None:
 
 
 def close_view(b: SceneBuilder) -> None:
-    """Woods and houses far away on all sides, wherever there is no street."""
+    """Distant woods and houses on all sides, off the streets."""
     draws = b.draws
     for _ in range(22):
         turn, away = draws.uniform(-math.pi, math.pi), draws.uniform(38, 78)
@@ -154,20 +154,20 @@ def close_view(b: SceneBuilder) -> None:
 
 
 def _clear(b: SceneBuilder, street: Street, x: float, y: float, room: float) -> bool:
-    """Whether a place beside a street is within reach, not too near, and `room` metres off the other streets."""
+    """Whether a position next to a street is within reach, not too near, and `room` metres off the other streets."""
     others = (other for other in b.ground.streets if other != street)
     return 2.6 < math.hypot(x, y) < END and all(other.away(x, y) > room for other in others)
 
 
 def _driven(b: SceneBuilder, x: float, y: float) -> bool:
-    """Whether a place is on the own car's path."""
+    """Whether a position is on the ego vehicle's path."""
     main = b.ground.streets[0]
     u, lateral = main.locate(x, y)
     return abs(lateral + main.offset) < 2.6 and abs(u) < 30
 
 
 def park(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:
-    """Cars along the kerb, partly on it, with free places between; or side by side, facing the kerb."""
+    """Parked cars along the kerb, partly on it, with gaps; or side by side, facing the kerb."""
     draws = b.draws
     if draws.chance(0.2) or kind.parked == 0:
         return
@@ -214,7 +214,7 @@ def furnish(b: SceneBuilder, street: Street, side: int) -> None:
 
 
 def _clutter(b: SceneBuilder, street: Street, side: int, edge: float) -> None:
-    """Small things on the pavement."""
+    """Small objects on the pavement."""
     draws = b.draws
     if draws.chance(0.25):
         start = draws.uniform(-30, 20)
@@ -229,16 +229,16 @@ def _clutter(b: SceneBuilder, street: Street, side: int, edge: float) -> None:
 
 
 def drive(b: SceneBuilder, kind: Kind, main: Street) -> None:
-    """Moving vehicles: ahead and behind in the own lane, oncoming in the other."""
+    """Moving vehicles: ahead and behind in the ego lane, oncoming in the other."""
     draws = b.draws
     for _ in range(draws.poisson(kind.traffic)):
-        own = draws.chance(0.5)
+        same_lane = draws.chance(0.5)
         u = draws.uniform(8, 65) * (1 if draws.chance(0.6) else -1)
         if not main.start < u < main.stop:
             continue
-        x, y, heading = main.place(u, (-1 if own else 1) * main.half_width / 2)
+        x, y, heading = main.place(u, (-1 if same_lane else 1) * main.half_width / 2)
         build = objects.truck if draws.chance(0.1) else objects.car
-        build(b, x, y, heading + (0 if own else math.pi), moving=True)
+        build(b, x, y, heading + (0 if same_lane else math.pi), moving=True)
 
 
 def walk(b: SceneBuilder, kind: Kind, main: Street) -> None:

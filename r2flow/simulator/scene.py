@@ -1,4 +1,4 @@
-"""A scene: the ground and tables of solids with their surfaces."""
+"""Scenes: the ground and tables of solids with their surfaces."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, get_args
@@ -20,26 +20,26 @@ class Surface(NamedTuple):
     label: np.ndarray  # SemanticKITTI id
     material: np.ndarray  # index into `materials.MATERIALS`
     albedo: np.ndarray  # reflectance at perpendicular incidence
-    closed: np.ndarray  # share of the rays that the solid stops, less than 1 for a fence of slats
+    closed: np.ndarray  # share of rays that the solid stops; less than 1 for slats
     pattern: np.ndarray  # PLAIN, FACADE (windows), CABIN (panes), BODY (number plates and lamps)
-    base: np.ndarray  # height of the ground at the solid, above which patterns are measured
+    base: np.ndarray  # height of the ground at the solid, the reference of patterns
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that rays can meet, in metres; z = 0 is the usual ground below the sensor."""
+    """All surfaces of a scene, in metres; z = 0 is the default height of the ground below the sensor."""
 
     ground: Ground
-    tables: tuple[tuple[Shape, Surface], ...] = ()  # solids of one kind with their surfaces
-    rig: int | None = None  # number of the silhouettes of the own car, or None without
+    tables: tuple[tuple[Shape, Surface], ...] = ()  # solids of each shape with their surfaces
+    rig: int | None = None  # index in `lasers.RIGS` of the ego vehicle, or None
 
 
 class SceneBuilder:
-    """Collects solids one at a time.
+    """Collects the solids of a scene.
 
     Attributes:
-        ground: What they stand on.
-        draws: Source of their random numbers.
+        ground: The ground of the scene.
+        draws: Random number generator of the scene.
     """
 
     def __init__(self, ground: Ground, draws: ScalarDraws) -> None:
@@ -49,12 +49,12 @@ class SceneBuilder:
         self._surfaces: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self._rows}
 
     def level(self, x: float, y: float) -> float:
-        """Height of the ground at a place, kerb included, in metres."""
+        """Height of the ground at a position in metres, including the kerb."""
         raised = bool(self.ground.streets) and self.ground.off_street(x, y) > 0
         return float(self.ground.height(x, y)) + self.ground.kerb * raised
 
     def albedo(self, material: str) -> float:
-        """Reflectance of one object of a material, drawn around the usual one."""
+        """Draw the reflectance of an object of a material."""
         m = MATERIALS[INDEX[material]]
         return min(max(self.draws.normal(m.albedo, m.spread), 0.01), 0.99)
 
@@ -68,7 +68,7 @@ class SceneBuilder:
         pattern: int = PLAIN,
         base: float = 0.0,
     ) -> None:
-        """Add one solid, whose fields are numbers, to the scene."""
+        """Add a solid, whose fields are numbers, to the scene."""
         kind = type(solid)
         self._rows[kind].append(tuple(solid))
         albedo = self.albedo(material) if albedo is None else albedo
@@ -85,7 +85,7 @@ class SceneBuilder:
 
 
 def _columns(rows: list[tuple[float, ...]]) -> np.ndarray:
-    # Rounded to a 16384th, since the last bit of a sine behind them depends on the machine.
+    # Rounded to 1 / 16384, since the last bit of sines depends on the machine.
     return np.ascontiguousarray((np.rint(np.array(rows) * 16384) / 16384).astype(np.float32).T)
 
 

@@ -1,8 +1,7 @@
-"""Shapes: tables of solids of one kind, and where rays meet them.
+"""Shapes: tables of solids, and their intersections with rays.
 
-`fragments` says which rays meet which solids and where, `normal` which way the surface faces there. Coordinates are
-metres in the scene's frame: x ahead and y left of the sensor's axis, z up. A solid turned by `yaw` has its length along
-(cos yaw, sin yaw).
+`fragments` returns the intersections of rays and solids, `normal` the surface normals there. Coordinates are in metres
+in the scene's frame: x ahead and y left of the sensor's axis, z up. The length of a solid is along (cos yaw, sin yaw).
 """
 
 from typing import Any, NamedTuple
@@ -12,16 +11,16 @@ import numpy as np
 from r2flow.simulator.draws import cosine, exponential_quantiles, hypotenuse, sine
 from r2flow.simulator.lasers import Rays, column_windows, row_windows
 
-# A field of all solids of a table, (P,) float32; a number for a single solid before it is in a table.
+# A field of all solids of a table, (P,) float32; a number for a single solid.
 Column = Any
 
-NEAR = 0.05  # metres: nothing nearer is met
+NEAR = 0.05  # metres: minimum distance of intersections
 LEAF = 3  # columns over which leaves pass all pulses or none
-EDGE = 1e-6  # radians by which windows are wider than objects, so that rounding in arctan and arcsin has no effect
+EDGE = 1e-6  # radians: margin of windows around objects, against rounding in arctan and arcsin
 
 
 class Fragments(NamedTuple):
-    """Meetings of rays and solids: pixel b W + w, horizontal distance s in metres, solid k; (F,) each."""
+    """Intersections of rays and solids: pixel b W + w, horizontal distance s in metres, solid k; (F,) each."""
 
     pixel: np.ndarray
     distance: np.ndarray
@@ -29,14 +28,14 @@ class Fragments(NamedTuple):
 
 
 class Normal(NamedTuple):
-    """The outward unit normal of a surface where it was met; every field (N,)."""
+    """The outward unit normals of surfaces at intersections; every field (N,)."""
 
     x: np.ndarray
     y: np.ndarray
     z: np.ndarray
-    along: np.ndarray  # metres along the face from its middle; 0 where there is no face
-    end: np.ndarray  # whether it is the front or back of a box
-    flat: np.ndarray  # whether it is a plane
+    along: np.ndarray  # metres along the face from its centre; 0 without faces
+    end: np.ndarray  # whether the face is the front or back of a box
+    flat: np.ndarray  # whether the surface is a plane
 
 
 class Boxes(NamedTuple):
@@ -51,12 +50,12 @@ class Boxes(NamedTuple):
     top: Column
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
-        """Side, top or bottom, whichever is met first."""
+        """The first intersection with side, top or bottom."""
         k, w, near, far = _box_spans(self, rays)
         return _upright(rays, k, w, near, far, self.bottom[k], self.top[k])
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        """Of the face that the point (N,) lies nearest to."""
+        """Normals of the faces nearest to the points, (N,)."""
         u, v, c, s = _into(self, k, x, y)
         sides = np.abs(u) - self.length[k] / 2, np.abs(v) - self.width[k] / 2
         face = np.stack([*sides, z - self.top[k], self.bottom[k] - z]).argmax(0)
@@ -91,7 +90,7 @@ class Frusta(NamedTuple):
         ]
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
-        """Each ray in the box around a solid is clipped by the solid's leaning sides, top and bottom."""
+        """Each ray in a solid's bounding box is clipped by the solid's leaning sides, top and bottom."""
         k, w, near, far = _box_spans(self, rays)
         n, b = row_windows(rays, near, far, self.bottom[k], self.top[k])
         k, w, near, far = k[n], w[n], near[n], far[n]
@@ -106,7 +105,7 @@ class Frusta(NamedTuple):
         return Fragments((b * rays.columns + w)[hit], near[hit], k[hit])
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        """Of the plane that the point (N,) lies nearest to."""
+        """Normals of the planes nearest to the points, (N,)."""
         u, v, c, s = _into(self, k, x, y)
         rise = z - self.bottom[k]
         planes = self._planes(k)
@@ -131,7 +130,7 @@ class Cylinders(NamedTuple):
     top: Column
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
-        """Mantle, top or bottom, whichever is met first."""
+        """The first intersection with side, top or bottom."""
         k, w, middle, half = _chords(self.x, self.y, self.radius, rays)
         near, far = np.maximum(middle - half, NEAR), middle + half
         ahead = far > NEAR
@@ -139,7 +138,7 @@ class Cylinders(NamedTuple):
         return _upright(rays, k, w, near, far, self.bottom[k], self.top[k])
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        """Away from the axis, or up or down on the ends."""
+        """Normals away from the axis, or up or down at the ends."""
         u, v = x - self.x[k], y - self.y[k]
         away = hypotenuse(u, v)
         on_top = z - self.top[k] > away - self.radius[k]
@@ -153,7 +152,7 @@ class Blobs(NamedTuple):
     """Upright ellipsoids of revolution; every field a column.
 
     `path` is the mean free path of a pulse inside, in metres; 0 is solid. A pulse returns from a depth drawn from
-    Exp(path), or passes where it has left the ellipsoid before: rays pass through a tree.
+    Exp(path), or passes if it leaves the ellipsoid before, as through a tree.
     """
 
     x: Column
@@ -164,7 +163,7 @@ class Blobs(NamedTuple):
     path: Column
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
-        """Roots of |p(s) - c|^2 = 1 in units of the half axes, the near one moved inwards by the free path."""
+        """Roots of |p(s) - c|^2 = 1 in units of the semi-axes; the near root moves inwards by the free path."""
         k, w, middle, half = _chords(self.x, self.y, self.radius, rays)
         ahead = middle - half > NEAR
         k, w, middle, half = k[ahead], w[ahead], middle[ahead], half[ahead]
@@ -184,7 +183,7 @@ class Blobs(NamedTuple):
         return Fragments((b * rays.columns + w)[hit], distance[hit], k[hit])
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        """Gradient of the ellipsoid through the point."""
+        """Gradients of the ellipsoids at the points."""
         u, v = (x - self.x[k]) / self.radius[k] ** 2, (y - self.y[k]) / self.radius[k] ** 2
         t = (z - self.z[k]) / self.height[k] ** 2
         norm = 1 / np.maximum(np.sqrt(u * u + v * v + t * t), 1e-6)
@@ -196,7 +195,7 @@ Shape = Boxes | Frusta | Cylinders | Blobs
 
 
 def _depths(k: np.ndarray, b: np.ndarray, w: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draws from Exp(1), one for each solid and LEAF neighbouring columns of a laser, as leaves come in clusters."""
+    """Draws from Exp(1), one per solid and LEAF neighbouring columns of a laser, as leaves are clustered."""
     cell = (w + b * 7) // LEAF
     mixed = k * np.int64(73856093) ^ b * np.int64(19349663) ^ cell * np.int64(83492791)
     mixed = (mixed + int(rng.integers(1 << 31))) * 2654435761 & 0xFFFFFFFF
@@ -205,19 +204,19 @@ def _depths(k: np.ndarray, b: np.ndarray, w: np.ndarray, rng: np.random.Generato
 
 
 def _round(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-    """A normal of a surface without faces."""
+    """Normals of a surface without faces."""
     return Normal(x, y, z, np.zeros_like(x), np.zeros(len(x), bool), np.zeros(len(x), bool))
 
 
 def _into(solids: "Boxes | Frusta", k: np.ndarray, x: Column, y: Column) -> tuple[np.ndarray, ...]:
-    """The points in the axes of the solids, and cos and sin of their yaw: (u, v, c, s), (N,) each."""
+    """Points in the frames of the solids, and cos and sin of their yaw: (u, v, c, s), (N,) each."""
     c, s = cosine(solids.yaw)[k], sine(solids.yaw)[k]
     dx, dy = x - solids.x[k], y - solids.y[k]
     return dx * c + dy * s, dy * c - dx * s, c, s
 
 
 def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
-    """Where each column w enters and leaves the outlines of solids k seen from above: k, w, near < far in metres."""
+    """Distances at which columns w enter and leave the footprints of solids k: k, w, near < far in metres."""
     u, v, c, s = _into(solids, np.arange(len(solids.x)), np.float32(0), np.float32(0))
     a, b = solids.length / 2, solids.width / 2
     corner_x = [solids.x + i * a * c - j * b * s for i, j in _CORNERS]
@@ -232,8 +231,8 @@ def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
     near, far = np.full(len(k), NEAR, np.float32), np.full(len(k), np.inf, np.float32)
     for position, direction, reach in ((u, du, a), (v, dv, b)):
         direction = np.where(np.abs(direction) < 1e-7, np.float32(1e-7), direction)
-        one, two = (-reach - position) / direction, (reach - position) / direction
-        near, far = np.maximum(near, np.minimum(one, two)), np.minimum(far, np.maximum(one, two))
+        low, high = (-reach - position) / direction, (reach - position) / direction
+        near, far = np.maximum(near, np.minimum(low, high)), np.minimum(far, np.maximum(low, high))
     met = near < far
     return k[met], w[met], near[met], far[met]
 
@@ -242,7 +241,7 @@ _CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 def _chords(x: np.ndarray, y: np.ndarray, radius: np.ndarray, rays: Rays) -> tuple[np.ndarray, ...]:
-    """Where each column crosses circles seen from above: solid k, column w, middle and half of the chord."""
+    """Chords of columns in the circular footprints of solids: solid k, column w, midpoint and half length."""
     distance = hypotenuse(x, y)
     inside = distance <= radius
     half = np.where(inside, np.pi, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1)))
@@ -263,14 +262,14 @@ def _upright(
     bottom: np.ndarray,
     top: np.ndarray,
 ) -> Fragments:
-    """First meeting with upright walls between near and far that reach from bottom to top, lids included."""
+    """First intersection with upright solids between near and far, from bottom to top, including both lids."""
     n, b = row_windows(rays, near, far, bottom, top)
     k, w, near, far, bottom, top = (q[n] for q in (k, w, near, far, bottom, top))
     slope, height = rays.slope[b], rays.height[b]
     z = height + near * slope
     lid = np.where(z > top, top, bottom)
     with np.errstate(divide="ignore", invalid="ignore"):
-        over = (lid - height) / slope  # where a ray that passes above or below the wall comes to the lid
+        over = (lid - height) / slope  # distance at which a ray above or below the wall reaches the lid
     on_wall = (z <= top) & (z >= bottom)
     distance = np.where(on_wall, near, over)
     hit = on_wall | ((over > near) & (over < far))
@@ -278,7 +277,7 @@ def _upright(
 
 
 def _clip(near: np.ndarray, far: np.ndarray, direction: np.ndarray, room: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of near..far where direction s <= room."""
+    """The part of [near, far] with direction s <= room."""
     with np.errstate(divide="ignore", invalid="ignore"):
         at = room / direction
     near = np.where(direction < 0, np.maximum(near, at), near)

@@ -50,7 +50,7 @@ _READERS = {
     ".las": read_las,
     ".laz": read_las,
 }
-# Formats that are not read, and what turns them into files that are.
+# Formats that are not supported, with advice on conversion.
 ELSEWHERE = {
     **dict.fromkeys((".mcap", ".db3", ".bag"), "holds many scans: r2flow unpack {path} --out FOLDER writes them"),
     **dict.fromkeys(
@@ -65,7 +65,7 @@ ELSEWHERE = {
 }
 WRITTEN = (".bin", ".pcd", ".ply", ".npy")
 SCAN_ENDINGS = tuple(_READERS)
-LOOSE_ENDINGS = (".csv", ".txt", ".npz")  # which other things than scans have too
+LOOSE_ENDINGS = (".csv", ".txt", ".npz")  # also used for other files than scans
 FIRM_ENDINGS = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
 
 FARTHEST_RAY = 400.0  # metres; no spinning LiDAR measures farther
@@ -73,22 +73,22 @@ LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; reading m
 
 
 def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Points:
-    """The points of one scan file, in the file's order; rows that are not finite are dropped and counted.
+    """The points of a scan file, in the order of the file; rows that are not finite are dropped and counted.
 
-    The ending tells the format. .bin: KITTI's float32 rows x y z reflectance. .pcd.bin: nuScenes' x y z intensity ring.
+    The ending is the format. .bin: KITTI's float32 rows x y z reflectance. .pcd.bin: nuScenes' x y z intensity ring.
     .pcd, .ply, .las, .laz, .feather, .parquet: fields x y z and, where present, intensity (or reflectance,
     reflectivity, remission, i) and ring, of any type. .npy, .npz: (N, 3) or (N, 4), or named fields. .csv, .xyz, .txt:
     three or four columns, or columns named in the first line. LAS needs laspy, Arrow tables pyarrow.
 
     Args:
-        columns: What each column of a .bin, .npy, .npz or text file without names holds: x, y, z and, where present,
-            intensity and ring; any other name is passed over. The usual ones if left out.
+        columns: Names of the columns of a .bin, .npy, .npz or text file without names: x, y, z and, where present,
+            intensity and ring; columns with other names are ignored. None: the default of the format.
 
     Returns:
         xyz float32 (N, 3) in metres, reflectance float32 (N,) as stored or None, ring uint16 (N,) or None.
 
     Raises:
-        NoPointsError: the file is whole, and has no point.
+        NoPointsError: the file is intact, but has no point.
         InputError: the file is missing, of an unknown format, damaged, without a finite point, or holds values that no
             LiDAR measures. The message names the file.
     """
@@ -109,14 +109,14 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
 def read_range_image(path: str | Path) -> np.ndarray | None:
     """The range image in a .npy of floats (2 or 1, H, W), float32; None for any other array.
 
-    What is not finite is 0, a ray without return; so is a range that no LiDAR measures, with a warning.
+    Values that are not finite become 0, a ray without return; so do, with a warning, ranges that no LiDAR measures.
     """
     if Path(path).suffix.lower() != ".npy":
         return None
     array = read_numbers(path)
     if array.ndim != 3 or array.shape[0] not in (1, 2) or array.dtype.kind != "f" or not array.size:
         return None
-    with np.errstate(over="ignore"):  # beyond float32 is infinite, and so no return
+    with np.errstate(over="ignore"):  # float32 overflow is infinite: no return
         image = np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     wrong = (image[0] < 0) | (image[0] > FARTHEST_RAY)
     if wrong.any():
@@ -133,7 +133,7 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
 
 
 def read_numbers(path: str | Path) -> np.ndarray:
-    """The array of numbers in a .npy, of any shape and type. Nothing is unpickled."""
+    """The array of numbers in a .npy, of any shape and type, read without unpickling."""
     path = Path(path)
     with _door(path):
         refuse_unreadable(path, LARGEST_FILE, ".npy file")
@@ -143,7 +143,7 @@ def read_numbers(path: str | Path) -> np.ndarray:
 
 @contextmanager
 def _door(path: Path) -> Iterator[None]:
-    """Turns every error of a reader into an InputError of one line with the file's name."""
+    """Turn every error of a reader into an InputError of one line with the file's name."""
     try:
         yield
     except InputError as error:
@@ -152,10 +152,10 @@ def _door(path: Path) -> Iterator[None]:
         with naming(path):
             raise
     except OSError as error:
-        reason = " ".join(str(error.strerror or error).split())  # pyarrow's have several lines
+        reason = " ".join(str(error.strerror or error).split())  # pyarrow's messages have several lines
         raise InputError(f"{path} cannot be read: {reason}.") from None
     except BaseException as error:  # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # of Rust's decoders
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # Rust decoders
             raise
         reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
         raise InputError(f"{path} is not a readable {path.suffix} file ({reason}). Is it damaged?") from None
@@ -164,14 +164,14 @@ def _door(path: Path) -> Iterator[None]:
 def write_points(
     path: str | Path, xyz: np.ndarray, reflectance: np.ndarray | None = None, ring: np.ndarray | None = None
 ) -> None:
-    """Write one scan as little-endian float32, whole or not at all.
+    """Write a scan as little-endian float32, atomically.
 
     Args:
-        path: The file, its format told by the ending: .bin, .pcd or .ply (binary), or .npy. Its folder is made when
-            missing, an existing file is replaced.
+        path: The file; its ending determines the format: .bin, .pcd or .ply (binary), or .npy. Missing folders are
+            created, an existing file is replaced.
         xyz: Points in metres, (N, 3), sensor frame.
-        reflectance: (N,), or None for none.
-        ring: Number of each point's beam, (N,), or None; for a .ply.
+        reflectance: (N,), or None.
+        ring: Number of each point's beam, (N,), or None; only for .ply.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -182,7 +182,7 @@ def write_points(
     assert ring is None or ending == ".ply"
     columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "intensity": reflectance, "ring": ring}
     columns = {name: column for name, column in columns.items() if column is not None}
-    with np.errstate(over="ignore"):  # beyond float32 is infinite
+    with np.errstate(over="ignore"):  # float32 overflow is infinite
         table = np.column_stack([column for column in columns.values() if column is not None]).astype("<f4")
     assert np.isfinite(table).all(), "a coordinate or reflectance is NaN or infinite"
     try:
@@ -198,7 +198,7 @@ def write_points(
 
 
 def scan_ending(name: str) -> str:
-    """The ending of a scan file's name, in lower case, `.pcd.bin` as one; empty where it is none."""
+    """The ending of a scan file's name in lower case, including `.pcd.bin`; empty for other files."""
     return next((ending for ending in SCAN_ENDINGS if name.lower().endswith(ending)), "")
 
 

@@ -1,7 +1,7 @@
-"""PCD (Point Cloud Library) and PLY (Stanford): own readers of text, binary and compressed points, writers of binary.
+"""PCD (Point Cloud Library) and PLY (Stanford): readers of text, binary and compressed points, writers of binary.
 
-plyfile is under the GPL and allocates what a header declares, pypcd4 returns half a scan from half a file, and the
-bindings to LZF need a compiler.
+No libraries are used: plyfile is under the GPL and allocates what a header declares, pypcd4 returns half a scan from
+half a file, and the bindings to LZF need a compiler.
 """
 
 import struct
@@ -23,7 +23,7 @@ PLY_CODES = {  # NumPy's codes of PLY's types
     "float": "f", "double": "d", "float32": "f", "float64": "d",
 }  # fmt: skip
 
-Table = tuple[list[str] | None, list[np.ndarray]]  # names of the columns, None where a file does not name them; columns
+Table = tuple[list[str] | None, list[np.ndarray]]  # names of the columns, or None; columns
 
 
 def read_pcd(path: Path, columns: object = None) -> Table:
@@ -33,7 +33,7 @@ def read_pcd(path: Path, columns: object = None) -> Table:
     header: dict[str, list[str]] = {}
     for key, *values in lines:
         if not key.startswith("#"):
-            # Unknown keys are not skipped: where a flipped bit has renamed COUNT, every row would be wrong.
+            # Unknown keys are refused: if a flipped bit renamed COUNT, every row would be wrong.
             check(key in PCD_KEYS and key not in header, f"its header line {key[:24]!r} is unknown or there twice.")
             header[key] = values
     check(header.keys() >= {"FIELDS", "SIZE", "TYPE"}, "its header has no FIELDS, SIZE or TYPE line.")
@@ -68,7 +68,7 @@ def read_pcd(path: Path, columns: object = None) -> Table:
     body = body[8:]
     check(len(body) >= packed and not body[packed:].strip(b"\0\r\n "), _wrong_size(packed, len(body)))
     blocks = memoryview(decompress_lzf(body[:packed], size))
-    arrays = []  # stored field by field: every x, then every y, and so on
+    arrays = []  # stored field by field: all x, then all y, ...
     for kind, width in zip(kinds, widths, strict=True):
         array = np.frombuffer(blocks, f"<{kind.lower()}", count * width)
         arrays.append(array if width == 1 else array.reshape(count, width))
@@ -77,7 +77,7 @@ def read_pcd(path: Path, columns: object = None) -> Table:
 
 
 def write_pcd(file: IO[bytes], table: np.ndarray, names: tuple[str, ...]) -> None:
-    """Fields as binary float32."""
+    """Write fields as binary float32."""
     count, width = table.shape
     ones, fours, floats = (" ".join(mark * width) for mark in "14F")
     file.write(
@@ -89,7 +89,7 @@ def write_pcd(file: IO[bytes], table: np.ndarray, names: tuple[str, ...]) -> Non
 
 @dataclass
 class _Element:
-    """`count` rows of numbers, by name and type; `listed` where a row has lists, too."""
+    """`count` rows of numbers, by name and type; `listed` if rows also have lists."""
 
     name: str
     count: int
@@ -98,7 +98,7 @@ class _Element:
 
 
 def read_ply(path: Path, columns: object = None) -> Table:
-    """All properties of the element `vertex`. Only elements behind it, as the faces of a mesh, may have lists."""
+    """All properties of the element `vertex`. Only later elements, such as the faces of a mesh, may have lists."""
     data = path.read_bytes()
     lines, start = _split_header(data, "end_header")
     check(lines[0] == ["ply"], f"it begins with {lines[0][0][:24]!r}, not with 'ply'. Is it a PLY file?")
@@ -127,7 +127,7 @@ def read_ply(path: Path, columns: object = None) -> Table:
     names = [name for name, _ in vertex.fields]
     if kind == "ascii":
         rows = [line for line in data[start:].decode("ascii").splitlines() if line.strip()]
-        declared, first = (sum(element.count for element in some) for some in (elements, before))
+        declared, first = (sum(element.count for element in part) for part in (elements, before))
         check(declared == len(rows), f"it declares {declared} rows but holds {len(rows)}. Is it whole?")
         return names, list(text_table(rows[first : first + vertex.count], vertex.count, len(names)).T)
     order = PLY_ORDERS[kind]
@@ -140,7 +140,7 @@ def read_ply(path: Path, columns: object = None) -> Table:
 
 
 def write_ply(file: IO[bytes], table: np.ndarray, names: tuple[str, ...]) -> None:
-    """Vertices of little-endian float32."""
+    """Write vertices as little-endian float32."""
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names]
     file.write("\n".join([*header, "end_header", ""]).encode())
@@ -148,7 +148,7 @@ def write_ply(file: IO[bytes], table: np.ndarray, names: tuple[str, ...]) -> Non
 
 
 def text_table(lines: list[str], rows: int, width: int) -> np.ndarray:
-    """Numbers of lines that are not blank, float64 (rows, width)."""
+    """Numbers in all lines that are not blank, float64 (rows, width)."""
     lines = [line for line in lines if line.strip()]
     check(len(lines) == rows, f"it declares {rows} points but holds {len(lines)} lines. Is it whole?")
     table = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
@@ -157,11 +157,11 @@ def text_table(lines: list[str], rows: int, width: int) -> np.ndarray:
 
 
 def decompress_lzf(stream: bytes, size: int) -> bytes:
-    """The `size` bytes that an LZF stream stands for.
+    """Decompress an LZF stream to `size` bytes.
 
-    A control byte below 32 announces control + 1 literal bytes. Any other copies what was written before: its upper
-    three bits hold length - 2, where 7 means that one more byte is to be added; its lower five bits and the next byte
-    hold distance - 1. A copy may overlap its own output, which repeats a pattern.
+    A control byte below 32 announces control + 1 literal bytes. Other control bytes copy earlier output: the upper
+    three bits hold length - 2, where 7 means that the next byte is added; the lower five bits and the next byte hold
+    distance - 1. A copy may overlap its output, which repeats a pattern.
     """
     output = bytearray()
     position, end = 0, len(stream)
@@ -188,7 +188,7 @@ def decompress_lzf(stream: bytes, size: int) -> bytes:
 
 
 def _split_header(data: bytes, last: str) -> tuple[list[list[str]], int]:
-    """The words of each line of a text header up to the line that begins with `last`, and the offset behind it."""
+    """The words of each line of a text header up to the line that begins with `last`, and the offset after it."""
     lines: list[list[str]] = []
     start = 0
     while (end := data.find(b"\n", start, HEADER_LIMIT)) >= 0:
@@ -202,7 +202,7 @@ def _split_header(data: bytes, last: str) -> tuple[list[list[str]], int]:
 
 
 def _whole(word: str) -> int:
-    """A count from a header."""
+    """Parse a count in a header."""
     check(word.isascii() and word.isdigit() and len(word) <= 18, f"it declares {word[:24]!r}, not a whole number.")
     return int(word)
 

@@ -1,4 +1,4 @@
-"""The points of a scan file: found among named columns, and checked to be a scan."""
+"""Points of a scan file, selected from named columns and validated."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ import numpy as np
 
 from r2flow.errors import InputError
 
-# No LiDAR measures 10 km or less than a millimetre: nearly all bytes read in the wrong order or width are beyond these
-# limits, because the exponent of a float changes.
+# No LiDAR measures 10 km or less than a millimetre. Nearly all floats read in the wrong byte order or width are beyond
+# these limits, because their exponent changes.
 FARTHEST = 1e4
 NEAREST = 1e-3
 MOST_COLUMNS = 64  # of a file without names
-# The first name that a file has is taken: Ouster writes both an intensity and a calibrated reflectivity.
+# The first name in the file is used: Ouster writes both an intensity and a calibrated reflectivity.
 ROLES: Mapping[str, tuple[str, ...]] = {
     "x": ("x", "points_m_xyz:0", "points:0"),  # VeloView's
     "y": ("y", "points_m_xyz:1", "points:1"),
@@ -23,24 +23,24 @@ ROLES: Mapping[str, tuple[str, ...]] = {
 
 
 class NoPointsError(InputError):
-    """A scan file that is whole and has no point; a generator may well write one."""
+    """A scan file is intact, but has no point, as generators may write."""
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """The N points of one scan, in the file's order."""
+    """The N points of a scan, in the order of the file."""
 
     xyz: np.ndarray  # coordinates in metres, (N, 3), float32, sensor frame: x ahead, y left, z up
-    reflectance: np.ndarray | None = None  # as stored, (N,), float32, not rescaled; None when the file has none
-    ring: np.ndarray | None = None  # number of the beam, (N,), uint16; None when the file has none
-    dropped: int = 0  # rows left out: a value was NaN or infinite, or a coordinate beyond `FARTHEST`
-    kept: np.ndarray | None = None  # index in the file of each row that is left, (N,); None when all are
+    reflectance: np.ndarray | None = None  # as stored, (N,), float32, not rescaled; None if the file has none
+    ring: np.ndarray | None = None  # number of the beam, (N,), uint16; None if the file has none
+    dropped: int = 0  # number of dropped rows: a value was NaN or infinite, or a coordinate beyond `FARTHEST`
+    kept: np.ndarray | None = None  # index in the file of each remaining row, (N,); None if all remain
 
     def with_lost_rays(self) -> "Points":
-        """The rows of the file again, dropped ones at the origin, as rays without return.
+        """All rows of the file, with dropped rows at the origin, as rays without return.
 
-        Where lasers are told by the order of the points, a lost ray keeps its place, stored as NaN or as (0, 0, 0).
-        Points with ring numbers need no order and stay as they are.
+        If the order of the points determines their lasers, lost rays must keep their position, stored as NaN or as
+        (0, 0, 0). Points with ring numbers are returned unchanged.
         """
         if self.kept is None or self.ring is not None:
             return self
@@ -54,13 +54,13 @@ class Points:
 
 
 def check(holds: object, message: str) -> None:
-    """Raise an InputError unless a condition holds; the reader's door adds the file's name."""
+    """Raise an InputError unless a condition holds; `_door` adds the file's name."""
     if not holds:
         raise InputError(message)
 
 
 def check_columns(columns: Sequence[str] | None) -> None:
-    """Refuse names of columns that do not have x, y and z once each."""
+    """Refuse names of columns without exactly one x, y and z."""
     names = [str(name).lower() for name in columns or "xyz"]
     counts = {role: sum(name in aliases for name in names) for role, aliases in ROLES.items()}
     check(
@@ -71,28 +71,28 @@ def check_columns(columns: Sequence[str] | None) -> None:
 
 
 def find_roles(names: Sequence[str]) -> dict[str, list[int]]:
-    """The columns that may hold x, y, z, reflectance and ring, the first choice first.
+    """Indices of the candidate columns of x, y, z, reflectance and ring, in order of preference.
 
-    Names are compared without case and CloudCompare's `scalar_`.
+    Names are compared without case and without CloudCompare's prefix `scalar_`.
     """
     lower = [name.lower().removeprefix("scalar_") for name in names]
     roles: dict[str, list[int]] = {}
     for role, aliases in ROLES.items():
         present = [alias for alias in aliases if alias in lower]
-        twice = [alias for alias in present if lower.count(alias) > 1]
-        check(not twice, f"it declares {', '.join(twice)} more than once; one number a point is needed.")
+        repeated = [alias for alias in present if lower.count(alias) > 1]
+        check(not repeated, f"it declares {', '.join(repeated)} more than once; one number a point is needed.")
         roles[role] = [lower.index(alias) for alias in present]
     missing = [role for role in "xyz" if not roles[role]]
-    found = " ".join(", ".join(names)[:120].split()) or "none"
-    check(not missing, f"it has no field {', '.join(missing)}; it has: {found}. Points need x, y and z.")
+    listed = " ".join(", ".join(names)[:120].split()) or "none"
+    check(not missing, f"it has no field {', '.join(missing)}; it has: {listed}. Points need x, y and z.")
     return roles
 
 
 def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool = False) -> Points:
-    """Points from all columns of a file, (N,) each: those that are finite and within `FARTHEST`; refuses other files.
+    """The finite points within `FARTHEST` from all columns of a file, (N,) each; refuses files that are not scans.
 
-    A file without header, `raw`, is refused, too, where most rows are not finite or reflectance is negative, as in rows
-    of another layout. A file without a point, or of rays without return alone, is a `NoPointsError`.
+    A file without header, `raw`, is also refused if most rows are not finite or if reflectances are negative, as in
+    another row layout. A file without points, or with only rays without return, raises `NoPointsError`.
     """
     roles = {role: [np.asarray(columns[index]) for index in indices] for role, indices in find_roles(names).items()}
     rows = roles["x"][0].shape[:1]
@@ -103,25 +103,25 @@ def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool
     strengths, rings = roles["reflectance"], roles["ring"]
     if rows == (0,):
         raise NoPointsError("it holds no points; leave it out, or fetch it again.")
-    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, and so dropped
+    with np.errstate(over="ignore", invalid="ignore"):  # float32 overflow is infinite: dropped
         axes = np.array([roles[axis][0] for axis in "xyz"], dtype=np.float32)
-        # An intensity that is 0 throughout was not measured.
+        # An intensity of only 0 was not measured.
         strength = next((column for column in strengths if column.any()), strengths[0] if strengths else None)
         reflectance = None if strength is None else np.array(strength, dtype=np.float32)
         size = np.abs(axes).max(axis=0)
     finite = np.isfinite(size) if reflectance is None else np.isfinite(size) & np.isfinite(reflectance)
     check(finite.any(), f"each of its {len(size)} rows has a value that is NaN or infinite.")
-    returned = size[finite & (size > 0)]  # an organised scan keeps rays without return as (0, 0, 0)
+    returned = size[finite & (size > 0)]  # organised scans store rays without return as (0, 0, 0)
     if not len(returned):
         raise NoPointsError(f"it holds {finite.sum()} points, all at (0, 0, 0): no ray returned. Is it whole?")
     far, near = np.count_nonzero(returned > FARTHEST), np.count_nonzero(returned < NEAREST)
-    # A twentieth, so that a few flipped bits cost only their own points. Of float64 read as float32 a third is beyond.
+    # A limit of 1/20, so that flipped bits lose only their points. Of float64 read as float32, 1/3 is beyond.
     check(
         far <= len(returned) / 20 and near <= len(returned) / 2,
         f"it does not look like a scan: of {len(returned)} points, {far} lie beyond {FARTHEST:g} m and {near} within "
         f"{NEAREST:g} m. Is it damaged, not in metres, big-endian, or of another row layout?",
     )
-    # Rows of three or five floats read as four put coordinates into the reflectance, and half of these are negative.
+    # Rows of three or five floats read as four have coordinates as reflectance, half of which are negative.
     negative = 0 if reflectance is None else np.count_nonzero(finite & (reflectance < 0))
     lost = np.count_nonzero(~finite)
     check(
@@ -130,15 +130,15 @@ def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool
         "negative reflectance. Is it big-endian, float64, text, or another row layout?",
     )
     kept = np.flatnonzero(finite & (size <= FARTHEST))
-    some = kept if len(kept) < len(size) else slice(None)
-    ring = rings[0][some] if rings else None
+    selected = kept if len(kept) < len(size) else slice(None)
+    ring = rings[0][selected] if rings else None
     if ring is not None:
         whole = (ring >= 0) & (ring <= 65535) & (ring == np.floor(ring))
         check(whole.all(), "it has a ring number that is not a whole number from 0 to 65535. Is it damaged?")
         ring = ring.astype(np.uint16)
     return Points(
-        np.ascontiguousarray(axes.T[some]),
-        None if reflectance is None else reflectance[some],
+        np.ascontiguousarray(axes.T[selected]),
+        None if reflectance is None else reflectance[selected],
         ring,
         len(size) - len(kept),
         kept if len(kept) < len(size) else None,

@@ -1,4 +1,4 @@
-"""Points as columns: rows of floats, NumPy's .npy and .npz, text, Arrow tables, LAS and LAZ."""
+"""Readers of columns: rows of floats, NumPy's .npy and .npz, text, Arrow tables, LAS and LAZ."""
 
 import io
 import math
@@ -14,12 +14,12 @@ from r2flow.errors import require
 from r2flow.lidar.scan_files.clouds import Table
 from r2flow.lidar.scan_files.points import MOST_COLUMNS, ROLES, check
 
-MOST_UNPACKED = 100  # times its own size that a compressed file may hold, beside 1 MiB
+MOST_UNPACKED = 100  # maximum expansion of a compressed file, plus 1 MiB
 TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar", "scan", "data", "arr_0")
 
 
 def read_rows(path: Path, columns: Sequence[str] | None) -> Table:
-    """Rows of little-endian float32: KITTI's 4, nuScenes' 5, or as many as there are columns."""
+    """Rows of little-endian float32: 4 of KITTI, 5 of nuScenes, or as many as `columns`."""
     content = path.read_bytes()
     head = content[:64]
     text = all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head) or head.startswith(b"\x93NUMPY")
@@ -34,13 +34,13 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> Table:
 
 
 def read_npy(path: Path, columns: object = None) -> Table:
-    """An array (N, 3) or more, or with named fields."""
+    """An array (N, 3) or wider, or with named fields."""
     with path.open("rb") as file:
         return _columns_of(read_array(file, path.stat().st_size))
 
 
 def read_npz(path: Path, columns: object = None) -> Table:
-    """An archive of arrays: one of points by its usual name or the only one, and columns beside it; or all columns."""
+    """An archive with an array of points, by a usual name or as its only member, and further columns; or of columns."""
     with zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         check_unpacked(path, sum(info.file_size for info in members.values()))
@@ -62,13 +62,13 @@ def read_npz(path: Path, columns: object = None) -> Table:
 
 
 def _named(names: Iterable[str]) -> list[str]:
-    """Names of columns that points use."""
+    """The names that are columns of points."""
     roles = {alias for aliases in ROLES.values() for alias in aliases}
     return [name for name in names if name.lower() in roles]
 
 
 def read_array(file: IO[bytes], size: int) -> np.ndarray:
-    """The array of numbers in an open .npy of `size` bytes. Never unpickles or allocates more than the file has."""
+    """The array of numbers in an open .npy of `size` bytes, read without unpickling or allocating more than that."""
     version = np.lib.format.read_magic(file)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran_order, dtype = header(file)
@@ -89,7 +89,7 @@ def _columns_of(array: np.ndarray) -> Table:
 
 
 def read_text(path: Path, columns: object = None) -> Table:
-    """One point a line, numbers apart by commas, semicolons, tabs or spaces; names in the first line or a comment."""
+    """A point per line, separated by commas, semicolons, tabs or spaces; names in the first line or a comment."""
     lines = [line.strip(" \r") for line in path.read_text("utf-8-sig", "replace").split("\n") if line.strip()]
     rows = [line for line in lines if line[0] not in "#/"]
     check(rows, "it holds no line of numbers.")
@@ -102,7 +102,7 @@ def read_text(path: Path, columns: object = None) -> Table:
     if not any(map(_is_number, words(rows[0]))):
         names, rows = words(rows[0]), rows[1:]
         check(rows, "it holds no line of numbers.")
-    else:  # CloudCompare writes names behind //, numpy behind #
+    else:  # CloudCompare writes names after //, NumPy after #
         width, comments = len(words(rows[0])), [words(line) for line in lines if line[0] in "#/"]
         named = (line for line in comments if len(line) == width and {"x", "y", "z"} <= {word.lower() for word in line})
         names = next(named, None)
@@ -111,7 +111,7 @@ def read_text(path: Path, columns: object = None) -> Table:
     except ValueError:
         if apart is None:
             raise
-        # Slower; a gap, as of a ray without return, and a word are NaN.
+        # Slower; empty values, as of rays without return, and words become NaN.
         table = np.genfromtxt(rows, delimiter=apart, comments=None, ndmin=2)  # type: ignore[call-overload]
     return names, list(table.T)
 
@@ -132,7 +132,7 @@ def read_arrow(path: Path, columns: object = None) -> Table:
 
     if path.name.lower().endswith(".parquet"):
         file = parquet.ParquetFile(path)
-        check_unpacked(path, 8 * file.metadata.num_rows)  # a run of equal values takes no bytes
+        check_unpacked(path, 8 * file.metadata.num_rows)  # run-length encoded values take no bytes
         table = file.read(_named(file.schema_arrow.names) or None)
     else:
         with pyarrow.memory_map(str(path)) as source:
@@ -143,7 +143,7 @@ def read_arrow(path: Path, columns: object = None) -> Table:
 
 
 def read_las(path: Path, columns: object = None) -> Table:
-    """LAS and LAZ by laspy: scaled x, y, z in the sensor's frame, intensity where it was measured, extra fields."""
+    """LAS and LAZ, read with laspy: scaled x, y, z in the sensor's frame, intensity if measured, extra fields."""
     require(str(path), "formats", "laspy", "lazrs")
     import laspy
     import lazrs
@@ -152,7 +152,7 @@ def read_las(path: Path, columns: object = None) -> Table:
     records = 54 * int.from_bytes(content[100:104], "little")
     records += 60 * int.from_bytes(content[243:247], "little") if content[24:26] == b"\x01\x04" else 0
     check(content[:4] == b"LASF" and records <= len(content), "it is not a LAS file, or its header is damaged.")
-    # From memory, which gives no more bytes than there are: laspy and lazrs allocate what a header declares.
+    # Read from memory, which limits the size: laspy and lazrs allocate what a header declares.
     with laspy.open(io.BytesIO(content), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
         header = reader.header
         check_unpacked(path, header.point_count * header.point_format.size)
@@ -169,10 +169,10 @@ def read_las(path: Path, columns: object = None) -> Table:
 
 
 def _check_chunks(content: bytes, start: int) -> None:
-    """Refuse compressed points of more chunks than the file has bytes: lazrs ends the process where memory is short.
+    """Refuse compressed points with more chunks than the file has bytes: lazrs aborts the process if memory runs out.
 
-    Points begin with the place of the chunk table, int64, or -1 where it is in the last 8 bytes; the table with its
-    version and its number of chunks, uint32 each.
+    Points begin with the offset of the chunk table, int64, or -1 if the offset is in the last 8 bytes; the table begins
+    with its version and number of chunks, uint32 each.
     """
     places = (int.from_bytes(content[at : at + 8], "little", signed=True) for at in (start, len(content) - 8))
     table = max(next((place for place in places if place != -1), 0), 0)
@@ -187,7 +187,7 @@ def check_unpacked(path: Path, size: int) -> None:
 
 
 def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
-    """Names of the columns of a file without names: those given, else x, y, z and perhaps reflectance."""
+    """Names of the columns of a file without names: `columns`, else x, y, z and, for four columns, reflectance."""
     if columns is not None:
         check(len(columns) == width, f"it has {width} columns, but {len(columns)} were named: {','.join(columns)}.")
         return columns
