@@ -1,11 +1,11 @@
-"""r2flow VERB: what is done with scans and checkpoints from the command line."""
+"""Command line: r2flow VERB."""
 
 from r2flow.memory import prepare_process
 from r2flow.signals import heard_from_the_first_import
 
 
 def main() -> None:
-    """Run a verb; Ctrl-C and SIGTERM end it in one line."""
+    """Run a verb; Ctrl-C and SIGTERM stop it with a one-line message."""
     prepare_process()
     with heard_from_the_first_import():
         from r2flow.cli.verbs import run

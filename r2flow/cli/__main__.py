@@ -1,4 +1,4 @@
-"""python -m r2flow.cli VERB, as torchrun starts it."""
+"""python -m r2flow.cli VERB, for torchrun."""
 
 from r2flow.cli import main
 

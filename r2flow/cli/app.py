@@ -1,18 +1,18 @@
-"""The command, and its group of reports."""
+"""The typer application and its group of reports."""
 
 import typer
 
-# Imports of torch and matplotlib stay inside the verbs: --help and a mistyped option answer at once.
+# Verbs import torch and matplotlib in their bodies, so that --help and usage errors are fast.
 
 app = typer.Typer(
     help=(
-        "Rectified flows for LiDAR scans: train, sample, show, measure. "
-        "--plugin MODULE, with any verb, imports a module of yours first (or a path ending in .py)."
+        "Rectified flows for LiDAR scans: train, sample, view, evaluate. "
+        "Every verb takes --plugin MODULE, which first imports a module or a .py file."
     ),
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
 
-report = typer.Typer(help="Measure scans and flows.", no_args_is_help=True, pretty_exceptions_enable=False)
+report = typer.Typer(help="Measure flows and solvers.", no_args_is_help=True, pretty_exceptions_enable=False)
 app.add_typer(report, name="report")

@@ -1,4 +1,4 @@
-"""`r2flow simulate`, `prepare`, `sensor` and `unpack`: where scans come from."""
+"""`r2flow simulate`, `prepare`, `sensor` and `unpack`: sources of scans."""
 
 import logging
 import re
@@ -32,16 +32,14 @@ def simulate(
     num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 100,
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Scan i depends on the seed and on i alone.")] = 0,
-    format: Annotated[
-        str, typer.Option(help="Any of bin,ply,pcd, or npy: the range image, (2, H, W) float32.")
-    ] = "bin",
-    labels: Annotated[bool, typer.Option("--labels", help="SemanticKITTI's .label files beside them.")] = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Scan i depends only on the seed and i.")] = 0,
+    format: Annotated[str, typer.Option(help="Formats, of bin,ply,pcd,npy (range images).")] = "bin",
+    labels: Annotated[bool, typer.Option("--labels", help="Write SemanticKITTI .label files.")] = False,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes; one a core if left out.", show_default=False)
+        int | None, typer.Option(min=1, help="Processes. Default: one per core.", show_default=False)
     ] = None,
 ) -> None:
-    """Simulate scans of street scenes. After a stop or a kill, the same command resumes."""
+    """Simulate scans of street scenes. The same command resumes an interrupted run."""
     from r2flow.progress import Bar
     from r2flow.simulator.folder import SimulatedFolder
 
@@ -59,20 +57,20 @@ def simulate(
 @grouped
 def prepare(
     reading: ReadingOptions,
-    scans: Annotated[str, typer.Argument(help="A folder of scans, or LAYOUT:FOLDER, as kitti_360:/data/KITTI-360.")],
+    scans: Annotated[str, typer.Argument(help="A folder of scans, or LAYOUT:FOLDER: kitti_360:/data/KITTI-360.")],
     out: OutOption,
-    split: Annotated[str | None, typer.Option(help="A part of the layout's split; all of it if left out.")] = None,
-    drives: Annotated[str | None, typer.Option(help="Names or numbers, separated by commas; all if left out.")] = None,
+    split: Annotated[str | None, typer.Option(help="Part of the standard split. Default: all.")] = None,
+    drives: Annotated[str | None, typer.Option(help="Names or numbers, separated by commas. Default: all.")] = None,
     on_bad_scan: Annotated[
-        Literal["error", "skip"], typer.Option(help="skip: leave out by name what cannot be used.")
+        Literal["error", "skip"], typer.Option(help="skip: leave out unusable scans and list their names.")
     ] = "error",
-    shard_scans: Annotated[int, typer.Option(min=1, help="Scans a file.")] = 64,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one a core if left out.")] = None,
+    shard_scans: Annotated[int, typer.Option(min=1, help="Scans per shard.")] = 64,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one per core.")] = None,
 ) -> None:
-    """Project a data set once, into shards that training reads: range in 2 bytes, reflectance in 1.
+    """Project a data set into shards for training: range in 2 bytes, reflectance in 1.
 
-    After a stop or a kill the same command resumes; two at once share the work; damaged shards are made again.
-    Then: python train.py data=prepared data.root=FOLDER.
+    The same command resumes an interrupted run, shares the work with others at the same time and replaces damaged
+    shards. Train on them with python train.py data=prepared data.root=FOLDER.
     """
     from r2flow.data.opening import SOURCES, parse
     from r2flow.data.prepared import plan_files
@@ -83,8 +81,8 @@ def prepare(
     if file is not None:
         raise InputError(f"{scans} is one scan; give the folder of a data set.")
     options = replace(options, split=split, drives=[*drives.split(",")] if drives else None)
-    found = SOURCES[options.name].find_drives(options)
-    plan = plan_files(options.name, options.folder, found, reading.reading([scans]), shard_scans)
+    drives_found = SOURCES[options.name].find_drives(options)
+    plan = plan_files(options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
     with Bar("checking", len(plan.shards), "shards") as checked, Bar("preparing", len(plan.shards), "shards") as made:
         notes = make(out, plan, on_bad_scan, workers or cores(), lambda shard: checked(), lambda shard: made())
     size = sum(plan.store(out).files(shard)[0].stat().st_size for shard in plan.shards)
@@ -101,15 +99,15 @@ def prepare(
 
 @app.command(epilog="Example: r2flow sensor my/scans --out conf/sensor/mine.yaml")
 def sensor(
-    scans: Annotated[list[Path], typer.Argument(help="Scan files, or folders of them, of one sensor.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="The .yaml to write; none if left out.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    scans: Annotated[list[Path], typer.Argument(help="Scan files or folders, all of one sensor.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="YAML file to write. Default: print only.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     columns: ColumnsOption = None,
-    most: Annotated[int, typer.Option("--num", min=1, help="The most scans to read of a folder.")] = 8,
+    most: Annotated[int, typer.Option("--num", min=1, help="Maximum number of scans to read per folder.")] = 8,
 ) -> None:
-    """Estimate a sensor from scans: beams, resolution, limits, height, reflectance; write it as YAML.
+    """Estimate a sensor from scans (beams, resolution, range limits, height, reflectance) and write it as YAML.
 
-    The YAML is a sensor for the verbs (--sensor mine.yaml) and, in conf/sensor/, for train.py (sensor=mine).
+    Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py (sensor=mine).
     """
     from r2flow.data.sources import spread
     from r2flow.lidar.beams import estimate_sensor, nearest_sensor
@@ -121,7 +119,7 @@ def sensor(
     from r2flow.reports.views import scans_of
 
     if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
-        raise InputError(f"--out must be a .yaml file, as --sensor expects; found {out}.")
+        raise InputError(f"--out must be a .yaml file, as for --sensor; found {out}.")
     if out is not None and out.exists() and not overwrite:
         raise InputError(f"{out} exists; give another --out, or --overwrite to replace it.")
     name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
@@ -137,9 +135,9 @@ def sensor(
     rows = [
         ("beams", f"{len(e)}: {beams.order}"),
         ("elevations", f"{shown} degrees"),
-        ("nearest sensor", f"{nearest}, its beams {distance:.2f} degrees away" if nearest else "none of the built-in"),
+        ("nearest sensor", f"{nearest}, beams {distance:.2f} degrees apart" if nearest else "no built-in sensor"),
         ("resolution", f"{steps:,.0f} steps a turn; images of {mine.columns} columns"),
-        ("range", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle itself is seen"),
+        ("range", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle is visible"),
         ("height", f"{mine.height:.2f} m above the ground"),
         ("reflectance", "none: encoding.reflectance=false" if scale is None else f"reflectance_scale={scale:g}"),
     ]
@@ -153,15 +151,15 @@ def sensor(
 def unpack(
     recording: Annotated[Path, typer.Argument(help="A .mcap, .db3 or .bag file, or the folder of a ROS 2 bag.")],
     out: OutOption,
-    topic: Annotated[str | None, typer.Option(help="Topic of the point clouds, where there are several.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Take one message of so many.")] = 1,
+    topic: Annotated[str | None, typer.Option(help="Topic of the point clouds, required if several.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Take every Nth message.")] = 1,
     most: Annotated[
-        int | None, typer.Option("--num", min=1, help="The most scans to write.", show_default=False)
+        int | None, typer.Option("--num", min=1, help="Maximum number of scans to write.", show_default=False)
     ] = None,
 ) -> None:
-    """Write the PointCloud2 messages of a recording as scan files, named by their time in ns.
+    """Write the PointCloud2 messages of a recording as scan files, named by time in ns.
 
-    They hold x, y, z and, where the messages do, intensity and ring.
+    The files contain x, y, z and, if present, intensity and ring.
     """
     from r2flow.lidar.bags import read_bag
     from r2flow.lidar.scan_files import write_points
@@ -175,12 +173,12 @@ def unpack(
             log.warning("left out: %s", points)
             continue
         stamps[stamp] += 1
-        again = f"-{stamps[stamp]}" if stamps[stamp] > 1 else ""  # clouds of one time keep apart
+        again = f"-{stamps[stamp]}" if stamps[stamp] > 1 else ""  # distinct names for clouds of the same time
         points = points.with_lost_rays()
         write_points(out / f"{stamp:019d}{again}.ply", points.xyz, points.reflectance, points.ring)
         written += 1
         if written == most:
             break
     if not written:
-        raise InputError(f"{recording} holds no scan that could be written.")
+        raise InputError(f"{recording} contains no usable scan.")
     print(f"{written} scans in {out}")

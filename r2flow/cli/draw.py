@@ -34,34 +34,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RegionOptions:
-    """The part of a scan that is asked for."""
+    """Part of the scan to generate."""
 
     sector: Annotated[
-        str | None, typer.Option(help="Azimuths in degrees, as -45,45 for the quarter ahead: generate no more.")
+        str | None, typer.Option(help="Generate only these azimuths, in degrees: -45,45 is the quarter ahead.")
     ] = None
-    rows: Annotated[str | None, typer.Option(help="Rows of the image, as 0-31 for the upper half of 64.")] = None
-    channels: Annotated[Literal["both", "range", "reflectance"], typer.Option(help="What is decoded and written.")] = (
+    rows: Annotated[str | None, typer.Option(help="Image rows, such as 0-31 for the upper half of 64.")] = None
+    channels: Annotated[Literal["both", "range", "reflectance"], typer.Option(help="Channels to decode and write.")] = (
         "both"
     )
 
     def region(self, checkpoint: "Checkpoint") -> "Region | None":
-        """The region of --sector and --rows; prints what is generated for it."""
+        """Region of --sector and --rows; prints the part that the generator evaluates."""
         from r2flow.lidar.region import MARGIN, region
         from r2flow.model.sampling import evaluated_region
 
         if self.sector is None and self.rows is None:
             return None
-        angles = self.sector and _pair("--sector", self.sector, ",", float, "two azimuths in degrees, as -45,45")
-        limits = self.rows and _pair("--rows", self.rows, "-", int, "the first and the last row, as 0-31")
-        wanted = region(checkpoint.sensor.shape, angles or None, limits or None, MARGIN if angles else 0.0)
-        seen = evaluated_region(checkpoint.generator, wanted)
-        print(f"generating {seen}, for {wanted}: {seen.share:.0%} of the image")
-        return wanted
+        angles = self.sector and _pair("--sector", self.sector, ",", float, "two azimuths in degrees, such as -45,45")
+        limits = self.rows and _pair("--rows", self.rows, "-", int, "the first and the last row, such as 0-31")
+        requested = region(checkpoint.sensor.shape, angles or None, limits or None, MARGIN if angles else 0.0)
+        evaluated = evaluated_region(checkpoint.generator, requested)
+        print(f"generating {evaluated}, for {requested}: {evaluated.share:.0%} of the image")
+        return requested
 
 
-def _pair(option: str, text: str, between: str, kind: type, meaning: str) -> tuple[Any, Any]:
+def _pair(option: str, text: str, separator: str, kind: type, meaning: str) -> tuple[Any, Any]:
     try:
-        first, second = (kind(part) for part in text.split(between))
+        first, second = (kind(part) for part in text.split(separator))
     except ValueError:
         raise InputError(f"{option} must be {meaning}; found {text!r}.") from None
     return first, second
@@ -78,12 +78,12 @@ def sample(
         str | None, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)
     ] = None,
     precision: PrecisionOption = "32-true",
-    format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
-    pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
+    format: Annotated[str | None, typer.Option(help="Formats, of ply,bin,npy. Default: all possible.")] = None,
+    pictures: Annotated[int, typer.Option(min=0, help="Number of scans to draw as pictures.")] = 8,
 ) -> None:
-    """Draw scans from a trained generator, `street` if left out: point clouds, range images and pictures.
+    """Sample scans from a trained model (default: `street`): point clouds, range images and pictures.
 
-    The sampler is the generator's own if left out.
+    The default sampler is the generator's.
     """
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.models import DEFAULT, MODELS, find_model
@@ -98,26 +98,26 @@ def sample(
     write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels,
         precision=precision,
     )  # fmt: skip
-    seen = f", pictures in {out / 'samples.png'}" if pictures else ""
-    seen += f", in 3-D in {out / 'samples.html'}" if pictures and part.channels != "reflectance" else ""
-    print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{seen}")
+    pages = f", pictures in {out / 'samples.png'}" if pictures else ""
+    pages += f", in 3-D in {out / 'samples.html'}" if pictures and part.channels != "reflectance" else ""
+    print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{pages}")
 
 
 @app.command(epilog="Example: r2flow interpolate 0000000100.bin 0000000250.bin -c runs/NAME --frames 6 --out between")
 @grouped
 def interpolate(
     first: Annotated[str, typer.Argument(help="A scan file or a range image (.npy).")],
-    last: Annotated[str, typer.Argument(help="Another.")],
+    last: Annotated[str, typer.Argument(help="A second scan file or range image.")],
     checkpoint: CheckpointOption,
     out: OutOption,
     sampling: SamplerOptions,
-    frames: Annotated[int, typer.Option(min=2, help="Scans in all, the two ends included.")] = 6,
+    frames: Annotated[int, typer.Option(min=2, help="Number of scans, both ends included.")] = 6,
     reflectance_scale: ScaleChoice = None,
     device: DeviceOption = "auto",
 ) -> None:
-    """Go from one real scan to another through their noises: a figure and a point cloud for every frame.
+    """Interpolate between two real scans in noise space: a figure and a point cloud per frame.
 
-    The solver is dopri5 at a tolerance of 1e-4 if left out.
+    Default solver: dopri5 with tolerance 1e-4.
     """
     from r2flow.generators import as_flow
     from r2flow.inversion import real_scans
@@ -150,42 +150,41 @@ def complete(
         typer.Option(
             "--checkpoint",
             "-c",
-            help="A checkpoint file, a run folder or a model; if left out densify, and street for what lies in sectors "
-            "without any ray or with a --sampler of flows from noise.",
+            help="A checkpoint file, a run folder or a model. Default: densify; street for sectors without rays or a "
+            "--sampler for flows from noise.",
         ),
     ] = None,
     precision: PrecisionOption = "32-true",
     source: Annotated[
         str | None,
-        typer.Option("--from", help="Sensor of the scans, by name or YAML; found in the scans if left out."),
+        typer.Option("--from", help="Sensor of the scans, name or YAML file. Default: detected from the scans."),
     ] = None,
     to: Annotated[
-        str | None, typer.Option(help="Sensor of the answers, by name or YAML; the model's own if left out.")
+        str | None, typer.Option(help="Sensor of the completed scans, name or YAML file. Default: the model's.")
     ] = None,
     size: SizeOption = None,
     mask: Annotated[
         str | None,
-        typer.Option(help="Keep a part of what was measured: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
+        typer.Option(help="Use a part of the scan: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
     ] = None,
     fill_gaps: Annotated[
-        bool,
-        typer.Option("--fill-gaps", help="Take rays without a return as not measured, as in a thinned scan."),
+        bool, typer.Option("--fill-gaps", help="Treat rays without a return as unmeasured, as in a thinned scan.")
     ] = False,
     reflectance_scale: ScaleChoice = None,
     columns: ColumnsOption = None,
-    num: Annotated[int, typer.Option(min=1, help="Answers to each scan.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="An answer depends on seed, scan and its number alone.")] = 0,
+    num: Annotated[int, typer.Option(min=1, help="Completions per scan.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="A completion depends only on seed, scan and its index.")] = 0,
     scans: Annotated[
         int | None,
-        typer.Option("--scans", min=1, help="Most scans of each folder, evenly spread; all if left out."),
+        typer.Option("--scans", min=1, help="Maximum number of scans per folder, evenly spaced. Default: all."),
     ] = None,
-    batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 1,
-    pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture and a page in 3-D.")] = 8,
+    batch_size: Annotated[int, typer.Option(min=1, help="Completions per batch.")] = 1,
+    pictures: Annotated[int, typer.Option(min=0, help="Number of scans to show in pictures and a 3-D page.")] = 8,
     device: DeviceOption = "auto",
 ) -> None:
-    """Complete scans: from fewer beams to more, from a part to the whole.
+    """Complete scans: more beams, filled gaps, hidden parts.
 
-    Answers are files of the scan's own format. The same command resumes where it stopped.
+    Output files have the format of the input. The same command resumes an interrupted run.
     """
     from dataclasses import replace
 
@@ -212,22 +211,22 @@ def complete(
 
     by_densify = how.given.get("name", "jump") in ("jump", "transport")
     name = str(checkpoint or (DENSIFY if by_densify else DEFAULT))
-    loaded, partial, said = opened(name)
+    loaded, partial, messages = opened(name)
     if name == DENSIFY and not (checkpoint or to or size or how.sampler) and lack_sectors(partial, job):
         name = DEFAULT
-        loaded, partial, said = opened(name)
-    if said and isinstance(loaded.generator, TransferFlow):  # of another sensor, which fills other rows
+        loaded, partial, messages = opened(name)
+    if messages and isinstance(loaded.generator, TransferFlow):  # another sensor fills other rows
         loaded = loaded.through(loaded.sensor, numbered=False)
     if checkpoint is None:
         print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
     sampler = completing(loaded.generator, several=num > 1, **how.given)
-    for line in said:
+    for line in messages:
         print(line)
     for ending in sorted({scan.ending for scan in partial if answer_ending(loaded, scan) != scan.ending}):
-        print(f"answers to {ending} are written as .ply")
+        print(f"completions of {ending} files are written as .ply")
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
-    print(f"an answer has at most one point in each pixel of the image, {'x'.join(map(str, loaded.sensor.shape))}")
+    print(f"completions have at most one point per pixel of the image, {'x'.join(map(str, loaded.sensor.shape))}")
     about = {
         "mask": mask and mask_identity(mask), "from": source, "reflectance_scale": reflectance_scale,
         "columns": columns,
@@ -237,6 +236,8 @@ def complete(
     print(f"{len(done)} scans completed in {out}" + (f", {skipped} were there already" if skipped else ""))
     if errors := [error for error in done.values() if error is not None]:
         (mae, linear), (wrong, wrong_linear) = np.ma.masked_invalid(errors).mean(0).filled(np.nan)
-        print(f"on the hidden rays of {len(errors)} scans, with linear interpolation in brackets:")
-        off = f"MAE {mae:.2f} m ({linear:.2f}) where all return" if np.isfinite(mae) else "no ray returns in all"
+        print(f"on hidden rays of {len(errors)} scans (linear interpolation in brackets):")
+        off = (
+            f"MAE {mae:.2f} m ({linear:.2f}) where all return" if np.isfinite(mae) else "no ray returns in all of them"
+        )
         print(f"{off}, {wrong:.1%} ({wrong_linear:.1%}) wrong in ray-drop")

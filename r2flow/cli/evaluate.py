@@ -1,4 +1,4 @@
-"""`r2flow evaluate`: generated scans against real ones."""
+"""`r2flow evaluate`: compare generated with real scans."""
 
 import logging
 import time
@@ -33,24 +33,24 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SAMPLED = 1000  # scans of a flow
+SAMPLED = 1000  # default number of scans per sampled model
 REAL = "the real scans"
-SAMPLING = ("steps", "sampler", "tolerance", "precision", "seed")  # options of a sampled flow
+SAMPLING = ("steps", "sampler", "tolerance", "precision", "seed")  # options of sampled models
 
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """What is measured, on which scans, and where the figures are written."""
+    """Metrics, sets of scans, and output files."""
 
     metrics: Annotated[
         str | None,
         typer.Option(
-            help="Names, separated by commas; KID and Frechet of hand-made features, the panel, JSD, MMD if left out; "
-            "all: whatever can be computed here."
+            help="Metrics, separated by commas, or all available here: all. Default: KID and Frechet distance of "
+            "hand-made features, panel, JSD, MMD."
         ),
     ] = None
     protocol: Annotated[
-        str, typer.Option(help="r2flow, or paper: measured points of real scans against generated ones' bin corners.")
+        str, typer.Option(help="r2flow, or paper: measured points of real, bin corners of generated scans.")
     ] = "r2flow"
     reference: Annotated[
         bool | None,
@@ -63,35 +63,30 @@ class EvaluateOptions:
         ),
     ] = None
     train: Annotated[
-        str | None, typer.Option(help=f"Training scans: adds distances to the nearest, to find copies: {SETS}.")
+        str | None, typer.Option(help=f"Training scans, to detect copies by nearest-neighbour distances: {SETS}.")
     ] = None
     train_split: Annotated[str | None, typer.Option(help="Part of TRAIN's standard split.")] = None
-    bootstrap: Annotated[int, typer.Option(min=0, help="Resamples for 95 % intervals; 0 for none.")] = 0
-    no_cache: Annotated[bool, typer.Option("--no-cache", help="Read the real scans again.")] = False
+    bootstrap: Annotated[int, typer.Option(min=0, help="Bootstrap resamples for 95 % intervals; 0: no intervals.")] = 0
+    no_cache: Annotated[bool, typer.Option("--no-cache", help="Recompute the statistics of the real scans.")] = False
     num: Annotated[
-        int | None, typer.Option(min=1, help="Scans to sample or simulate (1000); the most to take of a folder (all).")
+        int | None, typer.Option(min=1, help="Scans to sample or simulate (1000), or to read per folder (all).")
     ] = None
-    real_num: Annotated[int | None, typer.Option(min=1, help="The most real scans to take, by a fixed shuffle.")] = None
+    real_num: Annotated[int | None, typer.Option(min=1, help="Maximum of real scans, by a fixed shuffle.")] = None
     split: Annotated[str | None, typer.Option(help="Part of REAL's standard split.")] = None
-    generated_split: Annotated[str | None, typer.Option(help="Part of GENERATED's, for a LAYOUT:FOLDER.")] = None
+    generated_split: Annotated[str | None, typer.Option(help="Part of GENERATED's standard split.")] = None
     generated_scale: Annotated[
-        float | None, typer.Option(min=1e-6, max=1e9, help="--reflectance-scale of the files in GENERATED, if other.")
+        float | None, typer.Option(min=1e-6, max=1e9, help="--reflectance-scale of files in GENERATED, if different.")
     ] = None
-    steps: Annotated[
-        str | None, typer.Option(help="Of the models, their own if left out; 1,2,4 makes a set of each number.")
-    ] = None
-    sampler: Annotated[
-        str | None,
-        typer.Option(help="Of the models, their own if left out; adams3,heun2 makes a set of each sampler."),
-    ] = None
-    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive sampler.")] = None
+    steps: Annotated[str | None, typer.Option(help="Steps of models; 1,2,4: one set each.")] = None
+    sampler: Annotated[str | None, typer.Option(help="Samplers of models; adams3,heun2: one set each.")] = None
+    tolerance: Annotated[float | None, typer.Option(help="Error tolerance per step, for adaptive samplers.")] = None
     precision: PrecisionOption = "32-true"
-    seed: Annotated[int, typer.Option(min=0, help="Of sampled scans.")] = 0
-    json: Annotated[Path | None, typer.Option("--json", help="File for every figure with its protocol.")] = None
+    seed: Annotated[int, typer.Option(min=0, help="Seed of sampled scans.")] = 0
+    json: Annotated[Path | None, typer.Option("--json", help="JSON file for all results with their protocols.")] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page.", show_default=False)] = None
 
     def check(self, named: Sequence[str], sampled: Sequence[str]) -> None:
-        """Refuse options that do not go together, before anything is read."""
+        """Refuse incompatible options before reading any scan."""
         if not (named or self.reference or self.baselines):
             raise InputError("nothing to compare with: give GENERATED or --reference.")
         if self.json is not None and (self.json.is_dir() or self.json.suffix.lower() != ".json"):
@@ -114,16 +109,16 @@ def evaluate(
     generated: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Scans to judge, one or several sets: the same, or a run, checkpoint or model to sample.",
+            help="Sets of generated scans, as REAL, or runs, checkpoints or models to sample.",
             show_default=False,
         ),
     ] = None,
 ) -> None:
-    """Measure generated scans against real ones: distances, each with its protocol and the sensor.
+    """Evaluate generated scans against real scans: distances with their protocols and sensor.
 
-    Several sets make one table, next to reference distances between real scans and to baselines. Models are sampled;
-    several --steps or --sampler show distance against evaluations and seconds. The same command with --out resumes.
-    Under torchrun the processes share the scans.
+    One table compares all sets with reference distances between real scans and with baselines. Models are sampled;
+    several --steps or --sampler plot distance against evaluations and seconds. The same command with --out resumes.
+    Under torchrun, processes share the scans.
     """
     from r2flow.evaluation.measuring import Work, check_reflectance
     from r2flow.evaluation.protocols import PROTOCOLS
@@ -135,25 +130,25 @@ def evaluate(
     from r2flow.reports.pages import prepare_folder
 
     named = list(dict.fromkeys(generated or []))
-    sampled = [one for one in named if is_checkpoint(one)]
+    sampled = [name for name in named if is_checkpoint(name)]
     rules = PROTOCOLS[options.protocol]
     options.check(named, sampled)
     with joined(choose_device(work.device)) as device:
         keep = options.bootstrap > 0
-        wanted = None
+        chosen = None
         if options.metrics not in (None, "all"):
-            wanted = _build(options.metrics.split(","), keep, device)
+            chosen = _build(options.metrics.split(","), keep, device)
         flows = {name: load_checkpoint(name, device) for name in sampled}
         if len({(flow.sensor.shape, flow.sensor.elevations) for flow in flows.values()}) > 1:
             raise InputError(f"{', '.join(flows)} have different sensors or image sizes; measure each by itself.")
         if flows and options.num is None and place()[0] == 0:
-            print(f"{', '.join(flows)}: {SAMPLED} scans of each set are drawn (--num says how many)")
-        files = [one for one in named if one not in sampled]
+            print(f"{', '.join(flows)}: sampling {SAMPLED} scans per set (change the number by --num)")
+        files = [name for name in named if name not in sampled]
         reading = how.reading([real, *files, options.train], next(iter(flows.values()), None))
         if rules.convention is not None and how.convention is None:
             reading = replace(reading, convention=rules.convention)
-        if wanted and not any(m.needs_reflectance or m.uses_reflectance for m in wanted.values()):
-            reading = replace(reading, reflectance=False)  # its scale does not matter
+        if chosen and not any(m.needs_reflectance or m.uses_reflectance for m in chosen.values()):
+            reading = replace(reading, reflectance=False)  # else a scale would be required
         truth = _open(real, reading, options.split, options.real_num)
         rules.check(truth)
         scaled = replace(reading, reflectance_scale=options.generated_scale or reading.reflectance_scale)
@@ -169,7 +164,7 @@ def evaluate(
         reflectance = all(s.about["reflectance"] for s in sets)
         reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
         usual = [*METRICS] if options.metrics == "all" else default_metrics(reflectance)
-        metrics = wanted or _build_possible(usual, reflectance, keep, device)
+        metrics = chosen or _build_possible(usual, reflectance, keep, device)
         check_reflectance(metrics, sets)
         training = None if options.train is None else _open(options.train, reading, options.train_split, None)
         for folder in (options.out, options.json.parent if options.json else None):
@@ -199,13 +194,14 @@ def _compare(
     from r2flow.reports.view.panels import write_sets
 
     kinds: dict[Kind, dict[str, tuple[ScanSet, ScanSet]]]
-    kinds = {"judged": {name: (truth, one) for name, one in judged.items()}}
+    kinds = {"judged": {name: (truth, scans) for name, scans in judged.items()}}
     usual = bool(judged)
     if options.reference or (usual and options.reference is None and len(truth) > 1):
         kinds["reference"] = reference_sets(truth, judged)
     if options.baselines or (usual and options.baselines is None):
-        num = max((len(one) for one in judged.values()), default=len(truth))
-        kinds["baseline"] = {name: (truth, one) for name, one in baseline_sets(truth, min(num, SAMPLED)).items()}
+        num = max((len(scans) for scans in judged.values()), default=len(truth))
+        baselines = baseline_sets(truth, min(num, SAMPLED))
+        kinds["baseline"] = {name: (truth, scans) for name, scans in baselines.items()}
     comparisons: list[Comparison] = []
     (rank, _), rules, cache = place(), PROTOCOLS[options.protocol], None if options.no_cache else Cache()
     statistics: dict[int, dict[str, Statistics]] = {}
@@ -231,17 +227,17 @@ def _compare(
     if training is not None:
         nearest = find_nearest({**judged, REAL: truth}, training, work, device)
         of = {("judged", name): nearest[name] for name in judged} | {("reference", "real halves"): nearest[REAL]}
-        for index, one in enumerate(comparisons):
-            if (at := of.get((one.kind, one.name))) is not None:
-                result = copies_result(at, nearest[REAL], len(training))
-                comparisons[index] = replace(one, measured=[*one.measured, result])
+        for index, row in enumerate(comparisons):
+            if (neighbours := of.get((row.kind, row.name))) is not None:
+                result = copies_result(neighbours, nearest[REAL], len(training))
+                comparisons[index] = replace(row, measured=[*row.measured, result])
     seeds: dict[str, int] = {}
-    if any(one.about["kind"] == "sampled" for one in judged.values()):
+    if any(scans.about["kind"] == "sampled" for scans in judged.values()):
         seeds["sampled scans"] = options.seed
     if options.bootstrap:
         seeds["bootstrap"] = 0
-    drawn = {name: one for name, one in nearest.items() if name in judged}
-    page = evaluation_page(comparisons, command(), device, seeds, drawn, training)
+    of_judged = {name: neighbours for name, neighbours in nearest.items() if name in judged}
+    page = evaluation_page(comparisons, command(), device, seeds, of_judged, training)
     print_comparisons(comparisons)
     if options.json is not None:
         write_json(page, options.json)
@@ -249,7 +245,7 @@ def _compare(
     if options.out is not None:
         for path in write_page(page, options.out):
             print(path)
-        sets = {"real": truth} | {"real, judged" if name == "real" else name: one for name, one in judged.items()}
+        sets = {"real": truth} | {"real, judged" if name == "real" else name: s for name, s in judged.items()}
         print(write_sets(options.out / "evaluation.html", sets, title="Generated and real scans"))
 
 
@@ -259,12 +255,12 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
     scans = open_scans(text, reading, split, num)
     refuse_parts(text)
     if len(scans):
-        _ = scans.source[0]  # what does not fit is better known now than after the other set was read
+        _ = scans.source[0]  # fail before the other set is read
     return scans
 
 
 def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[str, ScanSet]":
-    """A set for each of the samplers and numbers of steps that the generator can be run with, by its name."""
+    """One set per sampler and number of steps that suits the generator, by name."""
     from r2flow.evaluation.sets import sampled_set
 
     names = options.sampler.split(",") if options.sampler else [None]
@@ -282,12 +278,12 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
 def _samplers(
     generator: "Generator", names: Sequence[str | None], steps: Sequence[int | None], tolerance: float | None
 ) -> "list[Sampler]":
-    """The samplers that a generator can be run with; of several each takes the options that it has."""
+    """Samplers that suit a generator; of several, each receives only the options that it has."""
     from r2flow.registry import options_of
     from r2flow.samplers import SAMPLERS, parse_sampler
 
     fields = [options_of(SAMPLERS[parse_sampler(name)["name"]]) if name else vars(generator.sampler) for name in names]
-    curve = names == [None] and len(steps) > 1  # a generator without steps, a GAN, is one point of it
+    curve = names == [None] and len(steps) > 1  # a generator without steps (GAN) is one point of the curve
     chosen: list[Sampler] = []
     refused = None
     for place, name in enumerate(names):
@@ -315,19 +311,19 @@ def _build(names: Sequence[str], keep: bool, device: str) -> "dict[str, ScanMetr
 
 
 def _build_possible(names: Sequence[str], reflectance: bool, keep: bool, device: str) -> "dict[str, ScanMetric]":
-    """The metrics that can be computed here; a warning names the others."""
+    """Build the metrics that can be computed here; warn about the others."""
     built: dict[str, ScanMetric] = {}
     left_out: dict[str, list[str]] = {}
     for name in names:
         try:
             metric = _build([name], keep, device)[name]
         except InputError:
-            left_out.setdefault("their weights are not here (r2flow weights)", []).append(name)
+            left_out.setdefault("their weights are not installed (r2flow weights)", []).append(name)
             continue
         if metric.needs_reflectance and not reflectance:
             left_out.setdefault("a set has no reflectance", []).append(name)
         else:
             built[name] = metric
-    for why, those in left_out.items():
-        log.warning("%s left out: %s", ", ".join(those), why)
+    for reason, skipped in left_out.items():
+        log.warning("%s left out: %s", ", ".join(skipped), reason)
     return built

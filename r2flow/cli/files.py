@@ -19,20 +19,20 @@ def export(
     checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.")],
     how: SamplerOptions,
     to: Annotated[
-        str, typer.Option(help="onnx for onnxruntime and its like, pt2 for torch, or safetensors for r2flow.")
+        str, typer.Option(help="onnx (onnxruntime and others), pt2 (torch) or safetensors (r2flow).")
     ] = "onnx",
     what: Annotated[
-        Literal["sampler", "network"], typer.Option(help="sampler: noise in, scan out; or network: v(t, x) alone.")
+        Literal["sampler", "network"], typer.Option(help="sampler: noise to scan; network: only v(t, x).")
     ] = "sampler",
     half: Annotated[
-        bool, typer.Option("--half", help="Large weights of a .safetensors in float16: half the size.")
+        bool, typer.Option("--half", help="Store large weights of a .safetensors file in float16: half the size.")
     ] = False,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; NAME.onnx, ... if left out.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write. Default: NAME.onnx, ...")] = None,
 ) -> None:
-    """Write a flow as one file that runs without r2flow: noise in, range in metres, reflectance and points out.
+    """Export a flow as a file that runs without r2flow: from noise to range in metres, reflectance and points.
 
-    The number of steps is fixed by the file. The file is run and compared with the flow. With --to safetensors: the
-    averaged weights, config and sampler of any generator, to share; the same bytes each time.
+    The file has a fixed number of steps; r2flow runs it and compares it with the flow. --to safetensors writes the
+    averaged weights, config and sampler of any generator, reproducibly.
     """
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
@@ -48,36 +48,36 @@ def export(
     loaded = load_checkpoint(checkpoint)
     if to == "safetensors":
         if out.exists() and out.samefile(loaded.path):
-            raise InputError(f"{out} would be replaced by what is made of it; give another name.")
+            raise InputError(f"{out} is the model itself and would be replaced; give another name.")
         save_checkpoint(loaded, out, half)
         print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {sha256(out.read_bytes()).hexdigest()}")
         return
     writing.FORMATS[to]
     sampler = loaded.generator.choose(**how.given)
     written = writing.export(loaded, out, sampler, what == "network")
-    batch = "any batch" if written.any_batch else "one scan at a time, torch could not free its batch"
+    batch = "any batch" if written.any_batch else "batch of one scan (torch could not export a variable batch)"
     print(
         f"{out}: {out.stat().st_size / 1e6:.1f} MB, {sampler if what == 'sampler' else 'the network v(t, x)'}, {batch}"
     )
     if what == "network":
         return
     try:
-        apart = writing.compare(loaded, written, sampler)
+        difference = writing.compare(loaded, written, sampler)
     except InputError as missing:
         print(f"not compared with the flow: {missing}")
         return
     print(
-        f"compared with the flow: range within {1000 * apart.metres:.2g} mm, reflectance within "
-        f"{apart.reflectance:.2g}, {apart.rays} rays dropped by one alone"
+        f"compared with the flow: range within {1000 * difference.metres:.2g} mm, reflectance within "
+        f"{difference.reflectance:.2g}, {difference.rays} rays differ in ray-drop"
     )
 
 
 @app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")
 def info(
     checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.")],
-    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print what is in a checkpoint."""
+    """Print the contents of a checkpoint."""
     from r2flow.reports.contents import describe, print_contents
 
     contents = describe(checkpoint)
@@ -91,14 +91,14 @@ def info(
 def weights(
     add: Annotated[
         tuple[str, Path] | None,
-        typer.Option(metavar="NAME FILE", help="Take a model from its file, or a network from a file or a folder."),
+        typer.Option(metavar="NAME FILE", help="Install a model from its file, or a network from a file or folder."),
     ] = None,
 ) -> None:
-    """Which trained models and which networks of published distances are on this machine, and where to get others.
+    """List the models and the feature networks of published metrics, which are installed, and where to get others.
 
-    Nothing is fetched: get the file, then --add it. A model is checked by its SHA-256 and kept in R2FLOW_MODELS, or
-    ~/.cache/r2flow/models. A network is read as tensors alone, checked and kept in R2FLOW_WEIGHTS, or
-    ~/.cache/r2flow/weights.
+    r2flow does not download: get a file, then --add it. Models are checked by SHA-256 and stored in R2FLOW_MODELS
+    (default ~/.cache/r2flow/models). Networks are loaded as tensors only, checked and stored in R2FLOW_WEIGHTS (default
+    ~/.cache/r2flow/weights).
     """
     from r2flow.metrics import FIELD_NAMES
     from r2flow.metrics.extractors.weights import SOURCES, kept, kept_file, weights_folder
@@ -112,18 +112,18 @@ def weights(
             print(f"{add_model(name, path)}: the model {name}")
             return
         if name not in SOURCES:
-            known = [*MODELS, *SOURCES]
-            raise InputError(f"no weights named {name!r}; known: {', '.join(known)}.{did_you_mean(name, known)}")
+            names = [*MODELS, *SOURCES]
+            raise InputError(f"no weights named {name!r}; known: {', '.join(names)}.{did_you_mean(name, names)}")
         print(f"{kept_file(name)}: weights {take(name, path)} of {path.name}")
         return
     models = [
         (name, model.about, "yes" if model_file(name).is_file() else "no", model.page or "in the package")
         for name, model in MODELS.items()
     ]
-    print_table(models, ("model", "draws", "here", "file"))
-    print(f"\nLooked for in {models_folder()} (R2FLOW_MODELS) unless in the package. Draw: r2flow sample MODEL\n")
+    print_table(models, ("model", "samples", "installed", "file"))
+    print(f"\nLooked for in {models_folder()} (R2FLOW_MODELS) unless in the package. Sample: r2flow sample MODEL\n")
     rows = [(name, FIELD_NAMES[name].upper(), kept(name) or "no", Path(page).name) for name, page in SOURCES.items()]
-    print_table(rows, ("network", "distance", "here", "published file"))
-    print(f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Take one from disk: r2flow weights --add NAME FILE")
+    print_table(rows, ("network", "distance", "installed", "published file"))
+    print(f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Install one: r2flow weights --add NAME FILE")
     for name, page in SOURCES.items():
         print(f"  {name}: {page}")

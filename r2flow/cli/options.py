@@ -1,4 +1,4 @@
-"""Options that several verbs share, and what becomes of them; a dataclass of options is one parameter of a verb."""
+"""Options shared by verbs, and their parsing; a verb takes a dataclass of options as one parameter."""
 
 import inspect
 import math
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
-from r2flow.devices import choose_device as choose_device  # for every verb
+from r2flow.devices import choose_device as choose_device  # re-exported for verbs
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,33 +24,33 @@ if TYPE_CHECKING:
 CheckpointOption = Annotated[
     Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
 ]
-DeviceOption = Annotated[str, typer.Option(help="Where to compute: auto, cpu, cuda, cuda:1, ...")]
+DeviceOption = Annotated[str, typer.Option(help="Device: auto, cpu, cuda, cuda:1, ...")]
 PrecisionOption = Annotated[
     Literal["32-true", "bf16-mixed"],
-    typer.Option(help="Precision of the network; bf16-mixed is faster where there is bfloat16."),
+    typer.Option(help="Precision of the network; bf16-mixed is faster on hardware with bfloat16."),
 ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
-SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML file of your own (r2flow sensor).")]
-SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]
+SensorOption = Annotated[str, typer.Option(help="Sensor name, or a YAML file (see r2flow sensor).")]
+SizeOption = Annotated[
+    str | None, typer.Option(help="Image size, rows x columns, such as 64x1024. Default: the sensor's.")
+]
 SETS = "a folder of scans, samples, a run, prepared shards, NAME:FOLDER, simulated:SEED"
 SensorChoice = Annotated[
-    str | None, typer.Option(help="Name of the sensor; that of the flow or the scans, or hdl64e, if left out.")
+    str | None, typer.Option(help="Sensor name or YAML file. Default: the sensor of the flow or the scans, or hdl64e.")
 ]
 ScaleChoice = Annotated[
     float | None,
-    typer.Option(min=1e-6, max=1e9, help="Value in scan files that means full reflectance; the usual one if left out."),
+    typer.Option(min=1e-6, max=1e9, help="Full reflectance in scan files. Default: the format's."),
 ]
 
 ColumnsOption = Annotated[
     str | None,
-    typer.Option(
-        help="What the columns of files without names hold, as x,y,z,intensity,_; the usual ones if left out."
-    ),
+    typer.Option(help="Columns of scan files without column names, such as x,y,z,intensity,_. Default: the format's."),
 ]
 
 
 def named_columns(text: str | None) -> tuple[str, ...] | None:
-    """The columns that are named by `--columns`, checked."""
+    """Parse and check `--columns`."""
     from r2flow.lidar.scan_files import check_columns
 
     columns = None if text is None else tuple(name.strip() for name in text.split(","))
@@ -59,29 +59,29 @@ def named_columns(text: str | None) -> tuple[str, ...] | None:
 
 
 def build_sized(sensor: str, size: str | None) -> "Sensor":
-    """The sensor of a name or a YAML file, at an image size written as 64x1024."""
+    """Build a sensor from its name or YAML file and an image size such as 64x1024."""
     from r2flow.data.opening import named_sensor
 
     return named_sensor(sensor, rows_and_columns(size))
 
 
 def rows_and_columns(size: str | None) -> tuple[int, int] | None:
-    """The numbers of an image size written as 64x1024."""
+    """Parse an image size such as 64x1024."""
     if size is None:
         return None
     parts = size.lower().split("x")
     if len(parts) != 2 or not all(part.isascii() and part.isdigit() and int(part) > 0 for part in parts):
-        raise InputError(f"--size must be ROWSxCOLUMNS, as 64x1024; found {size!r}.")
+        raise InputError(f"--size must be ROWSxCOLUMNS, such as 64x1024; found {size!r}.")
     return int(parts[0]), int(parts[1])
 
 
 def cores() -> int:
-    """The cores that this process may use."""
+    """Number of CPU cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:
-    """Let typer see every field of a verb's dataclass parameters as an option of its own.
+    """Expose each field of a verb's dataclass parameters to typer as an option.
 
     @app.command()
     @grouped
@@ -97,14 +97,14 @@ def grouped(verb: Callable[..., None]) -> Callable[..., None]:
             continue
         groups[name] = hints[name]
         types = get_type_hints(hints[name], include_extras=True)
-        for one in fields(groups[name]):
-            default = parameter.empty if one.default is MISSING else one.default
-            parameters.append(parameter.replace(name=one.name, default=default, annotation=types[one.name]))
+        for field in fields(groups[name]):
+            default = parameter.empty if field.default is MISSING else field.default
+            parameters.append(parameter.replace(name=field.name, default=default, annotation=types[field.name]))
 
     @wraps(verb)
     def call(**given: Any) -> None:
         for name, group in groups.items():
-            given[name] = group(**{one.name: given.pop(one.name) for one in fields(group)})
+            given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
         verb(**given)
 
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -114,20 +114,21 @@ def grouped(verb: Callable[..., None]) -> Callable[..., None]:
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How scans become images: as the flow or the prepared scans say where an option is left out."""
+    """Projection of scans to images; defaults come from the flow or the prepared scans."""
 
     sensor: SensorChoice = None
     size: SizeOption = None
-    projection: Annotated[Literal["spherical", "unfolding"] | None, typer.Option(help="Usual: spherical.")] = None
+    projection: Annotated[
+        Literal["spherical", "unfolding"] | None, typer.Option(help="Projection. Default: spherical.")
+    ] = None
     convention: Annotated[
-        Literal["centre", "reference"] | None,
-        typer.Option(help="Usual: centre; reference is that of the published models."),
+        Literal["centre", "reference"] | None, typer.Option(help="reference: as in published models. Default: centre.")
     ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
 
     def reading(self, specs: Sequence[str | None], model: "Checkpoint | None" = None) -> "Reading":
-        """`reading_for` these scans and this model with the options that are given."""
+        """The reading for scans and a model under these options."""
         from r2flow.data.opening import reading_for
 
         return reading_for(
@@ -138,34 +139,34 @@ class ReadingOptions:
 
 @dataclass(frozen=True)
 class WorkOptions:
-    """How the work is done; the figures do not depend on it."""
+    """Batch size, processes and device; results do not depend on them."""
 
-    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 8
-    workers: Annotated[int, typer.Option(min=0, help="Further processes that read scans.")] = 2
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans per batch.")] = 8
+    workers: Annotated[int, typer.Option(min=0, help="Additional processes that read scans.")] = 2
     device: DeviceOption = "auto"
 
 
 @dataclass(frozen=True)
 class SamplerOptions:
-    """How a generator is run: by its own sampler where an option is left out."""
+    """Sampler of a generator; defaults come from the generator's sampler."""
 
     sampler: Annotated[
         str | None,
         typer.Option(
             help="NAME or NAME:FIELD=VALUE:...: adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, "
-            "auto, torchdiffeq; with fresh noise: sde; of flow maps: jump, chord, renoise; to complete: mmps, replace, "
-            "repaint. Other systems have their own (docs/systems.md)."
+            "auto, torchdiffeq; stochastic: sde; flow maps: jump, chord, renoise; completion: mmps, replace, repaint. "
+            "For other systems see docs/systems.md."
         ),
     ] = None
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, of fixed steps.")] = None
-    tolerance: Annotated[float | None, typer.Option(help="Largest error of a step, of an adaptive sampler.")] = None
-    grid: Annotated[
-        str | None, typer.Option(help="Where fixed steps fall: uniform, power:P or power-start:P, as power:1.75.")
-    ] = None
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, for fixed-step samplers.")] = None
+    tolerance: Annotated[float | None, typer.Option(help="Error tolerance per step, for adaptive samplers.")] = None
+    grid: Annotated[str | None, typer.Option(help="Time grid of fixed steps: uniform, power:P or power-start:P.")] = (
+        None
+    )
 
     @property
     def given(self) -> dict[str, Any]:
-        """Name and fields that were given, as `Generator.choose` takes them."""
+        """Given name and fields, as arguments of `Generator.choose`."""
         from r2flow.samplers import parse_sampler
 
         fields = {"steps": self.steps, "tolerance": self.tolerance, "grid": self.grid}
@@ -175,16 +176,16 @@ class SamplerOptions:
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """Which scans are drawn, and on what device."""
+    """Number of samples, seed, batch size and device."""
 
-    num: Annotated[int, typer.Option(min=1, help="How many scans.")] = 4
-    seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0
-    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
+    num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 4
+    seed: Annotated[int, typer.Option(min=0, help="Scan i depends only on the seed and i.")] = 0
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans per batch.")] = 1
     device: DeviceOption = "auto"
 
 
 def numbers(option: str, text: str, kind: type = float) -> list[Any]:
-    """'4,8' as [4, 8]."""
+    """Parse positive numbers: '4,8' to [4, 8]."""
     try:
         values = [kind(part) for part in text.split(",")]
     except ValueError:
@@ -195,5 +196,5 @@ def numbers(option: str, text: str, kind: type = float) -> list[Any]:
 
 
 def command() -> str:
-    """The command as it was typed, for a shell."""
+    """The current command line, quoted for a shell."""
     return shlex.join(["r2flow", *sys.argv[1:]])

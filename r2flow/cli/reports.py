@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from r2flow.reports.pages import Page
 
 
-def finish(page: "Page", out: Path, said: Sequence[str]) -> None:
-    """Write a page; print these parts of it, and the files."""
+def finish(page: "Page", out: Path, parts: Sequence[str]) -> None:
+    """Write a page; print the given parts and the paths of its files."""
     from r2flow.reports.pages import write_page
 
     written = write_page(page, out)
-    print("\n\n".join(said), end="\n\n")
+    print("\n\n".join(parts), end="\n\n")
     print(*written, sep="\n")
 
 
@@ -46,9 +46,9 @@ def curvature(
     models: Annotated[list[str], typer.Argument(help="Models, run folders or checkpoint files.")],
     out: OutOption,
     draw: DrawOptions,
-    steps: Annotated[int, typer.Option(min=1, help="Euler steps of a path.")] = 256,
+    steps: Annotated[int, typer.Option(min=1, help="Euler steps per path.")] = 256,
 ) -> None:
-    """How straight trained flows are: s(t), and the paths of the most curved pixels (the paper's figure 8)."""
+    """Measure the straightness s(t) of trained flows; plot paths of the most curved pixels (the paper's figure 8)."""
     from r2flow.generators import as_flow
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.sampling import batches
@@ -76,15 +76,15 @@ def solvers(
     out: OutOption,
     draw: DrawOptions,
     model: Annotated[
-        str | None, typer.Argument(help="A model, a run or a checkpoint; exact problems alone if left out.")
+        str | None, typer.Argument(help="A model, a run folder or a checkpoint file. Default: test problems only.")
     ] = None,
-    samplers: Annotated[str | None, typer.Option(help="Solvers, separated by commas; all of ours if left out.")] = None,
-    budgets: Annotated[str, typer.Option(help="Evaluations of the fixed-step solvers.")] = "4,8,16,32,64",
-    problems: Annotated[str | None, typer.Option(help="Exact problems by name; all if left out, or none.")] = None,
+    samplers: Annotated[str | None, typer.Option(help="Solvers, separated by commas. Default: all built-in.")] = None,
+    budgets: Annotated[str, typer.Option(help="Evaluations of fixed-step solvers.")] = "4,8,16,32,64",
+    problems: Annotated[str | None, typer.Option(help="Test problems by name, or none. Default: all.")] = None,
 ) -> None:
-    """Error against run time of every solver: exact problems, stiff and extreme ones too, and a trained flow.
+    """Compare solvers by error against run time, on test problems with exact solutions and on a trained flow.
 
-    The page names the sampler that reaches a wanted error, as a command.
+    The page lists the best sampler for each error as a command.
     """
     from r2flow.flow.problems import PROBLEMS
     from r2flow.generators import as_flow
@@ -97,7 +97,7 @@ def solvers(
     methods = samplers.split(",") if samplers else measuring.METHODS
     names = [] if problems == "none" else problems.split(",") if problems else list(PROBLEMS)
     most = numbers("budgets", budgets, int)
-    chosen, everything, flow = measuring.configurations(methods, most), measuring.problem_subjects(names), None
+    chosen, subjects, flow = measuring.configurations(methods, most), measuring.problem_subjects(names), None
     if not chosen or not (names or model):
         raise InputError("nothing to measure: give a model, more --budgets, or leave --problems none out.")
     loaded = None if model is None else load_checkpoint(model, where)
@@ -105,28 +105,28 @@ def solvers(
         as_flow(loaded.generator, "report solvers")
     prepare_folder(out)
     log = logging.getLogger("r2flow.flow")
-    log.setLevel(logging.ERROR)  # the report counts the scans that a solver gave up on
+    log.setLevel(logging.ERROR)  # the report counts failed scans
     if loaded is not None:
         with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
             flow = measuring.checkpoint_subject(
                 loaded, str(model), draw.num, draw.seed, draw.batch_size, progress=advance
             )
-        everything.append(flow)
-    with Bar("measuring", len(everything) * len(chosen), "solutions") as advance:
-        rows = measuring.measure(everything, chosen, advance)
+        subjects.append(flow)
+    with Bar("measuring", len(subjects) * len(chosen), "solutions") as advance:
+        rows = measuring.measure(subjects, chosen, advance)
     page = measuring.solvers_page(rows, flow, most, {"scans": draw.seed}, command(), where)
     finish(page, out, page.text[:-2])  # without the long table
 
 
 @report.command(epilog="Example: r2flow report backbones --size 64x1024")
 def backbones(
-    only: Annotated[str | None, typer.Option(help="Names, separated by commas; all if left out.")] = None,
+    only: Annotated[str | None, typer.Option(help="Configurations, separated by commas. Default: all.")] = None,
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
-    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
+    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations per configuration; 0: no latency.")] = 3,
     device: DeviceOption = "auto",
 ) -> None:
-    """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
+    """List parameters, multiply-accumulates and latency of all backbone configurations (the paper's table II)."""
     from r2flow.backbones import configurations
     from r2flow.progress import track
     from r2flow.reports.backbones import backbone_costs, print_costs
@@ -138,29 +138,29 @@ def backbones(
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
     print_costs(measured, chosen, where)
     if repeats and load > cores():
-        print(f"The machine was busy (load {load:.1f} on {cores()} cores): latencies are higher than they need be.")
+        print(f"The machine was busy (load {load:.1f} on {cores()} cores): latencies may be too high.")
 
 
 @report.command(epilog="Example: r2flow report completion kitti360/test street --num 15 --out reports")
 def completion(
-    real: Annotated[str, typer.Argument(help=f"Scans, of which a part is hidden: {SETS}.")],
+    real: Annotated[str, typer.Argument(help=f"Complete scans: {SETS}.")],
     models: Annotated[
-        list[str] | None, typer.Argument(help="Models, run folders or checkpoint files; densify if left out.")
+        list[str] | None, typer.Argument(help="Models, run folders or checkpoint files. Default: densify.")
     ] = None,
     tasks: Annotated[
-        str | None, typer.Option(help="Masks, as rows:4, a space between them; five masks if left out.")
+        str | None, typer.Option(help="Masks such as rows:4, separated by spaces. Default: five masks.")
     ] = None,
-    samplers: Annotated[str | None, typer.Option(help="Samplers for the models, as mmps,replace.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each sampler.")] = None,
-    num: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 16,
-    answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Of the noise. What is hidden of a scan does not depend on it.")] = 0,
-    batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 4,
+    samplers: Annotated[str | None, typer.Option(help="Samplers of the models, such as mmps,replace.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps per sampler.")] = None,
+    num: Annotated[int, typer.Option(min=1, help="Maximum number of scans, evenly spaced over the set.")] = 16,
+    answers: Annotated[int, typer.Option(min=1, help="Completions per scan; 19 give 90 % intervals.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise; masks do not depend on it.")] = 0,
+    batch_size: Annotated[int, typer.Option(min=1, help="Completions per batch.")] = 4,
     reflectance_scale: ScaleChoice = None,
     device: DeviceOption = "auto",
     out: OutOption = Path("reports"),
 ) -> None:
-    """Hide a part of scans and complete them, by models and by plain interpolation: errors against evaluations."""
+    """Mask scans and complete them by models and by interpolation: errors against evaluations."""
     import numpy as np
 
     from r2flow.inversion import real_scans
@@ -173,8 +173,8 @@ def completion(
 
     loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or [DENSIFY]}
     ways = [
-        Way(name, one, completing(one.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
-        for name, one in loaded.items()
+        Way(name, model, completing(model.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
+        for name, model in loaded.items()
         for sampler in (samplers.split(",") if samplers else [None])
     ]
     first = ways[0].checkpoint
@@ -190,25 +190,25 @@ def completion(
     with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
         shown = list(completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, progress=advance))
     figure = pictured(truths[0], shown, first.sensor)
-    about = f"{len(truths)} scans of {real}, {answers} answers to each."
+    about = f"{len(truths)} scans of {real}, {answers} completions per scan."
     page = completion_page([row for row, _ in shown], figure, about, seed, command(), str(choose_device(device)))
     finish(page, out, page.text[1:])
 
 
 @report.command(epilog="Example: r2flow report paper runs/1rf runs/2rf --results e.json --real kitti360/test -o paper")
 def paper(
-    models: Annotated[list[str], typer.Argument(help="Runs, checkpoint files or models; ROLE=MODEL sets the row.")],
+    models: Annotated[list[str], typer.Argument(help="Runs, checkpoint files or models; ROLE=MODEL selects the row.")],
     out: OutOption,
     results: Annotated[
         list[Path] | None,
         typer.Option(help="JSON file of `r2flow evaluate REAL MODEL... --json FILE`; may be repeated."),
     ] = None,
     real: Annotated[str | None, typer.Option(help=f"Real scans for figures 3, 5 and 7: {SETS}.")] = None,
-    num: Annotated[int, typer.Option(min=1, help="Scans of each model in figures 5 and 7.")] = 16,
+    num: Annotated[int, typer.Option(min=1, help="Scans per model in figures 5 and 7.")] = 16,
     steps: Annotated[int, typer.Option(min=1, help="Euler steps of the paths in figure 8.")] = 256,
     device: DeviceOption = "auto",
 ) -> None:
-    """The paper's tables I and II and figures 3 and 5 to 8: its printed numbers next to those of `evaluate`."""
+    """Reproduce the paper's tables I and II and figures 3 and 5 to 8, printed numbers next to those of `evaluate`."""
     from r2flow.data.opening import open_scans, reading_for
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.pages import prepare_folder
@@ -220,7 +220,7 @@ def paper(
         role, _, model = text.rpartition("=")
         checkpoint = load_checkpoint(model, where)
         if not checkpoint.generator.draws:
-            raise InputError(f"{model} draws no scans from noise.")
+            raise InputError(f"{model} does not generate scans from noise.")
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
     scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
     prepare_folder(out)
@@ -230,15 +230,15 @@ def paper(
 
 @app.command(epilog="Example: r2flow compare runs/sweep --group --out reports")
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of them: a chain's, a sweep's.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of runs (a chain, a sweep).")],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for compare.md, .csv, .json and .png.")
     ] = None,
     group: Annotated[
-        bool, typer.Option("--group", help="Several seeds of one configuration as mean ± spread.")
+        bool, typer.Option("--group", help="Aggregate seeds of one configuration: mean ± spread.")
     ] = False,
 ) -> None:
-    """Set runs side by side: loss, straightness, parameters, cost."""
+    """Compare runs: loss, straightness, parameters, cost."""
     from r2flow.reports.compare import compare_page, group_runs, read_runs, tables
     from r2flow.reports.pages import prepare_folder, write_page
     from r2flow.reports.tables import print_table

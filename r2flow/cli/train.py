@@ -18,7 +18,7 @@ from r2flow.registry import check_options
     epilog="Example: r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small",
 )
 def train(context: typer.Context) -> int:
-    """Train a flow: keys and choices of the config as KEY=VALUE; --help lists the choices, --cfg job every key."""
+    """Train a model; set config keys as KEY=VALUE. --help lists the choices, --cfg job prints all keys."""
     from r2flow.runs.launch import main
 
     return main(context.args, [sys.executable, "-m", "r2flow.cli", "train"])
@@ -29,22 +29,22 @@ def train(context: typer.Context) -> int:
 def pairs(
     model: Annotated[str, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)],
     how: SamplerOptions,
-    num: Annotated[int, typer.Option(min=1, help="Pairs in all.")] = 1000,
+    num: Annotated[int, typer.Option(min=1, help="Total number of pairs.")] = 1000,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Their folder; `pairs` in the run's if left out.")
+        Path | None, typer.Option("--out", "-o", help="Output folder. Default: `pairs` in the run folder.")
     ] = None,
-    batch_size: Annotated[int, typer.Option(min=1, help="Pairs solved at once.")] = 16,
-    shard_mib: Annotated[float, typer.Option(min=0.001, help="Size of a shard.")] = 16.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of their noise.")] = 0,
+    batch_size: Annotated[int, typer.Option(min=1, help="Pairs per batch.")] = 16,
+    shard_mib: Annotated[float, typer.Option(min=0.001, help="Shard size in MiB.")] = 16.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     precision: PrecisionOption = "32-true",
-    knots: Annotated[int | None, typer.Option(min=1, help="Inner states to keep of each path, for a flow map.")] = None,
+    knots: Annotated[int | None, typer.Option(min=1, help="Inner states to store per path, for flow maps.")] = None,
     device: DeviceOption = "auto",
 ) -> None:
-    """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
+    """Generate reflow pairs with a flow; several processes share the missing or damaged pairs.
 
-    `python train.py experiment=reflow stage.init=RUN` makes them itself; this makes them alone, under torchrun or as a
-    SLURM array, with the settings of `data.pairs`. The sampler is adams3 in 32 steps if left out;
-    --sampler dopri5 is the paper's; chord or renoise gives a flow map's first jump as its later ones correct it.
+    `python train.py experiment=reflow stage.init=RUN` generates pairs itself; this verb only generates, also under
+    torchrun or as a SLURM array, with the settings of `data.pairs`. Default sampler: adams3 in 32 steps; the paper uses
+    --sampler dopri5. chord or renoise samples a flow map in several jumps, as targets for its first jump.
     """
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import PairStore, default_folder
@@ -59,7 +59,7 @@ def pairs(
     if where == "cuda" and ranks > 1:
         import torch
 
-        where = f"cuda:{local % torch.cuda.device_count()}"  # SLURM may show each task one GPU alone
+        where = f"cuda:{local % torch.cuda.device_count()}"  # SLURM may expose one GPU per task
     flow = load_checkpoint(model)
     check_finished(Path(model), flow)
     options = {
@@ -72,8 +72,8 @@ def pairs(
     )
     store = PairStore(out or default_folder(flow.path), recipe, num)
     make_and_tell(store, flow, rank, ranks, where, wait=False)
-    if lacking := store.missing_pairs():
-        print(f"{store.folder}: other processes have still to make about {lacking} of {num} pairs")
+    if missing := store.missing_pairs():
+        print(f"{store.folder}: other processes are still generating about {missing} of {num} pairs")
     else:
         shards = store.shards
         size = sum(store.files(shard)[0].stat().st_size for shard in shards)

@@ -1,4 +1,4 @@
-"""Every verb, and how one is run."""
+"""Register the verbs and run one."""
 
 import logging
 import re
@@ -8,16 +8,16 @@ from typing import Any
 import typer
 
 from r2flow import __version__
-from r2flow.cli import data, draw, evaluate, files, reports, train, view  # noqa: F401 (each enters its verbs)
+from r2flow.cli import data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
 from r2flow.cli.app import app
 from r2flow.errors import InputError, PlainFormatter, explain_mistake, one_line, open_streams, tell_odd
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import Stopped, listening, stop_at_once
 
-# Its home is click in older releases of typer and typer itself in newer ones.
+# ClickException: in click for older releases of typer, in typer for newer ones.
 USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
-# The verbs of --help in their order.
+# Panels of --help and their verbs, in order.
 GROUPS = {
     "Make": ("train", "pairs"),
     "Draw": ("sample", "complete", "interpolate"),
@@ -26,25 +26,25 @@ GROUPS = {
     "Data": ("simulate", "prepare", "sensor"),
     "Files": ("export", "info", "weights"),
 }
-for one in app.registered_commands:
-    assert one.callback is not None
-    one.name = one.callback.__name__
-    one.rich_help_panel = next((group for group, names in GROUPS.items() if one.name in names), "Data")
+for verb in app.registered_commands:
+    assert verb.callback is not None
+    verb.name = verb.callback.__name__
+    verb.rich_help_panel = next((group for group, names in GROUPS.items() if verb.name in names), "Data")
 app.registered_groups[0].rich_help_panel = "Measure"
-app.registered_commands.sort(key=lambda one: list(GROUPS).index(str(one.rich_help_panel)))
+app.registered_commands.sort(key=lambda verb: list(GROUPS).index(str(verb.rich_help_panel)))
 
-FULL = ("can't allocate memory", "not enough memory", "out of memory")  # of the RuntimeErrors of torch
+FULL = ("can't allocate memory", "not enough memory", "out of memory")  # in messages of torch RuntimeErrors
 
 
 def run() -> None:
-    """Run a verb, with `--plugin MODULE` anywhere; what the user can mend is one line and exit code 2."""
+    """Run a verb, with `--plugin MODULE` anywhere; user errors print one line and exit with code 2."""
     try:
         with listening(stop_at_once):
             _run()
     except Stopped as stop:
         print(stop, file=sys.stderr)
         sys.exit(stop.code)
-    except (KeyboardInterrupt, typer.Abort):  # Ctrl-C where nobody listens: in a library's thread
+    except (KeyboardInterrupt, typer.Abort):  # Ctrl-C outside our handler, in a library's thread
         print("stopped", file=sys.stderr)
         sys.exit(130)
 
@@ -59,7 +59,7 @@ def _run() -> None:
             raise InputError("an argument is empty; is a variable of the shell not set?")
         arguments, plugins = take_plugins(sys.argv[1:])
         load_plugins(plugins)
-        if arguments[:1] == ["train"]:  # which passes them on to its own processes
+        if arguments[:1] == ["train"]:  # it passes plug-ins to its processes
             arguments += [f"--plugin={name}" for name in plugins]
         if arguments[:1] == ["--version"]:
             print(f"r2flow {__version__}")
@@ -71,8 +71,8 @@ def _run() -> None:
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not any(words in str(error) for words in FULL):
             raise
-        asked = re.search(r"allocate ([\d.]+ \w+)", str(error))
-        more = f" for {asked[1]} more" if asked else ""
+        size = re.search(r"allocate ([\d.]+ \w+)", str(error))
+        more = f" for {size[1]} more" if size else ""
         batched = any(word.startswith("--batch-size") for word in sys.argv)
         less = "a smaller --batch-size" if batched else "smaller batches or images"
         print(f"error: the memory has no room{more}; give {less}.", file=sys.stderr)
@@ -86,15 +86,15 @@ def _run() -> None:
 
 
 def _usage(message: str) -> str:
-    """What typer says of a wrong option, with the value that was found."""
-    said = one_line(message).rstrip(".") or "no verb is given"
-    wrong = re.fullmatch(r"Invalid value for ('.*'): Input should be (.*?)(, unable to .*)?", said)
+    """Format typer's message on a wrong option, with the value found."""
+    text = one_line(message).rstrip(".") or "no verb given"
+    wrong = re.fullmatch(r"Invalid value for ('.*'): Input should be (.*?)(, unable to .*)?", text)
     if not wrong:
-        return said + "." * (not said.endswith("?"))
+        return text + "." * (not text.endswith("?"))
     names = re.findall(r"--?[\w-]+", wrong[1])
     words = [word.partition("=") for word in sys.argv[1:]]
     after = [*sys.argv[2:], ""]
     values = [value if equals else other for (word, equals, value), other in zip(words, after, strict=True)
               if word in names]  # fmt: skip
-    found = f", found {', '.join(values)}" if values else ""
-    return f"{' or '.join(names) or wrong[1]} must be {wrong[2]}{found}."
+    suffix = f", found {', '.join(values)}" if values else ""
+    return f"{' or '.join(names) or wrong[1]} must be {wrong[2]}{suffix}."

@@ -1,4 +1,4 @@
-"""`r2flow view` and `r2flow show`: scans in a browser, and as pictures."""
+"""`r2flow view` and `r2flow show`: scans in a browser and as pictures."""
 
 import logging
 import os
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SCANS, SAMPLES = 16, 4  # of a folder, of a generator, where nobody says how many
-MOST = 256  # of each; a page holds no more
+SCANS, SAMPLES = 16, 4  # default numbers per folder and per generator
+MOST = 256  # largest number of each per page
 
 
 def views(scans: Sequence[str], how: ReadingOptions, most: int) -> "list[View]":
-    """The scans that are named, of each folder at most so many."""
+    """Load scans as views, at most `most` per folder."""
     from r2flow.data.opening import own_reading
     from r2flow.reports.views import views_of
 
-    found: list[View] = []
+    loaded: list[View] = []
     for spec in scans:
         reading = how.reading([spec])
-        if how.reflectance_scale is None and own_reading(spec) is None:  # else guessed from the values
+        if how.reflectance_scale is None and own_reading(spec) is None:  # do not guess it from the values
             reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
-        found += views_of(spec, reading, most)
-    return found
+        loaded += views_of(spec, reading, most)
+    return loaded
 
 
 @app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
@@ -48,18 +48,18 @@ def show(
     scans: Annotated[list[str], typer.Argument(help=f"Scan files, range images (.npy), or {SETS}.")],
     out: OutOption,
     how: ReadingOptions,
-    most: Annotated[int, typer.Option("--num", min=1, help="The most scans to draw of a folder.")] = SCANS,
-    labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
-    format: Annotated[Literal["png", "npy"], typer.Option(help="npy: range images, (2, H, W).")] = "png",
+    most: Annotated[int, typer.Option("--num", min=1, help="Maximum number of scans per folder.")] = SCANS,
+    labels: Annotated[bool, typer.Option("--labels", help="Also draw classes of .label files.")] = False,
+    format: Annotated[Literal["png", "npy"], typer.Option(help="png: pictures; npy: range images, (2, H, W).")] = "png",
 ) -> None:
-    """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each; or write range images."""
+    """Draw each scan as a PNG (range, reflectance, bird's-eye view, perspective), or write range images."""
     from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure
 
     names: list[str] = []
     for view in views(scans, how, most):
         stem = view.path.stem
-        names.append(next(one for n in count(1) if (one := stem if n == 1 else f"{stem}_{n}") not in names))
+        names.append(next(s for n in count(1) if (s := stem if n == 1 else f"{stem}_{n}") not in names))
         path = out / f"{names[-1]}.{format}"
         if format == "npy":
             save_array(path, view.image)
@@ -68,7 +68,7 @@ def show(
             continue
         image, classes = view.labelled() if labels else (view.image, None)
         if labels and classes is None:
-            log.warning("%s: no .label file lies beside it", view.path)
+            log.warning("%s: no .label file next to it", view.path)
         print(save_figure(scan_figure(image, view.rays, view.path.name, classes), path))
 
 
@@ -76,34 +76,32 @@ def show(
 @grouped
 def view(
     what: Annotated[
-        list[str],
-        typer.Argument(help=f"Scan files, range images, {SETS}; or a run, checkpoint or model to draw from."),
+        list[str], typer.Argument(help=f"Scan files, range images, {SETS}; or a run, checkpoint or model to sample.")
     ],
     how: ReadingOptions,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The .html to write; a temporary one, opened, if left out.")
+        Path | None,
+        typer.Option("--out", "-o", help="HTML file to write. Default: a temporary file, opened in the browser."),
     ] = None,
     num: Annotated[
         int | None,
         typer.Option(
             min=1,
             max=MOST,
-            help=f"The most scans of a folder, spread evenly ({SCANS}); samples of a model ({SAMPLES}).",
+            help=f"Maximum number of scans per folder, evenly spaced ({SCANS}); samples per model ({SAMPLES}).",
         ),
     ] = None,
-    sequence: Annotated[bool, typer.Option("--sequence", help="Scans one after another, on a slider.")] = False,
+    sequence: Annotated[bool, typer.Option("--sequence", help="Show scans as a sequence with a slider.")] = False,
     steps: Annotated[
-        str | None, typer.Option(help="As 1,2,4,32: the same noise at each number of steps, side by side.")
+        str | None, typer.Option(help="Such as 1,2,4,32: compare numbers of steps from the same noise.")
     ] = None,
-    times: Annotated[
-        int | None, typer.Option(min=2, max=MOST, help="Show x_t at so many times, from noise to scan.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the samples of a model.")] = 0,
+    times: Annotated[int | None, typer.Option(min=2, max=MOST, help="Show x_t at N times from noise to scan.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the samples.")] = 0,
     device: DeviceOption = "auto",
 ) -> None:
-    """Look at scans in 3-D: one page that works offline, to turn, colour and compare them.
+    """View scans in 3-D: an offline page to rotate, colour and compare them.
 
-    Points and range image find each other under the cursor; labels beside the scans are shown.
+    The cursor links points and range image; labels next to the scans are shown.
     """
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.model.checkpoint import load_checkpoint
@@ -111,12 +109,12 @@ def view(
 
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out must be a file that ends in .html, found {out}.")
-    models = [one for one in what if is_checkpoint(one)]
+    models = [spec for spec in what if is_checkpoint(spec)]
     if not models and (steps or times or seed or device != "auto"):
         raise InputError("--steps, --times, --seed and --device are of a run, a checkpoint or a model; found none.")
     if len(models) == len(what) and (sequence or how != ReadingOptions()):
-        words = "--sensor, --size, --projection, --convention, --reflectance-scale and --columns"
-        raise InputError(f"--sequence, {words} are of scans; found none.")
+        names = "--sensor, --size, --projection, --convention, --reflectance-scale and --columns"
+        raise InputError(f"--sequence, {names} are of scans; found none.")
     if sequence and times:
         raise InputError("--sequence and --times both use the slider; give one of them.")
     counts = numbers("steps", steps, int) if steps else []
@@ -124,20 +122,20 @@ def view(
         raise InputError(f"--times takes one number of --steps, found {steps}.")
     panels: list[Panel] = []
     frames: list[str] = []
-    for one in what:
-        if one not in models:
-            new = scan_panels(views([one], how, num or SCANS))
+    for spec in what:
+        if spec not in models:
+            new = scan_panels(views([spec], how, num or SCANS))
             if sequence and len(new) > 1:
-                together, frames = in_turn(new, one)
-                new = [together]
+                combined, frames = in_turn(new, spec)
+                new = [combined]
         elif times:
-            model = load_checkpoint(one, choose_device(device))
-            new, frames = way_panels(model, one, num or SAMPLES, seed, counts[0] if counts else None, times)
+            model = load_checkpoint(spec, choose_device(device))
+            new, frames = way_panels(model, spec, num or SAMPLES, seed, counts[0] if counts else None, times)
         else:
-            new = sample_panels(load_checkpoint(one, choose_device(device)), one, num or SAMPLES, seed, counts)
+            new = sample_panels(load_checkpoint(spec, choose_device(device)), spec, num or SAMPLES, seed, counts)
             frames = [f"sample {number}" for number in range(num or SAMPLES)] if counts else []
         panels += new
-    title = ", ".join(Path(one).name or one for one in what)
+    title = ", ".join(Path(spec).name or spec for spec in what)
     path = write_panels(out or Path(mkdtemp(prefix="r2flow-"), "view.html"), panels, frames, title)
     print(path)
     if out is None:
@@ -145,7 +143,7 @@ def view(
 
 
 def open_browser(path: Path) -> None:
-    """Open a page where there is a screen: a browser of text would take the terminal."""
+    """Open a page if there is a display: a text browser would block the terminal."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return
     with suppress(webbrowser.Error):
