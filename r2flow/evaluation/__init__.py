@@ -1,1 +1,1 @@
-"""Generated scans against real ones: which scans, which metrics, what is kept of the real side, and the figures."""
+"""Evaluation of generated against real scans: sets, protocols, cached statistics, results."""

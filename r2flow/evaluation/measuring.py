@@ -1,4 +1,4 @@
-"""The metrics' figures of generated scans against real ones, each with its protocol."""
+"""Compute metrics of generated against real scans, with their protocols."""
 
 import math
 import statistics
@@ -19,36 +19,36 @@ from r2flow.metrics.scans import Scans
 from r2flow.processes import place, summed
 from r2flow.progress import Bar
 
-# The field compares histograms of single scans with this many real scans, by a fixed shuffle, and features with all.
+# Metrics of single-scan histograms use this many real scans, by a fixed shuffle; metrics of features use all.
 REAL_SCANS = 10_000
 
 
 @dataclass(frozen=True)
 class Work:
-    """How the work is done; figures do not depend on it beyond rounding."""
+    """Batch size and reader processes; results do not depend on them beyond rounding."""
 
-    batch_size: int = 8  # scans at once
-    workers: int = 0  # further processes that read
+    batch_size: int = 8  # scans per batch
+    workers: int = 0  # additional reader processes
 
 
 def bar(doing: str, total: int, unit: str = "scans") -> Bar:
-    """A progress bar, shown by the first of several processes."""
+    """Create a progress bar, shown only by the first process."""
     return Bar(doing, total, unit, shown=None if place()[0] == 0 else False)
 
 
 @dataclass(frozen=True)
 class MetricResult:
-    """One metric's figures of one comparison."""
+    """Results of one metric for one pair of sets."""
 
     metric: str
-    figures: Mapping[str, float]  # by name; NaN where one does not exist, and a remark says why
-    protocol: Mapping[str, Any]  # the metric's, with the numbers of scans and how the real ones were chosen
+    figures: Mapping[str, float]  # by name; NaN if undefined, with a remark
+    protocol: Mapping[str, Any]  # the metric's, plus set sizes and choice of real scans
     remarks: Sequence[str] = ()
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # (low, high), where asked for
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # (low, high), if requested
 
 
 def real_rule(metric: ScanMetric, real: ScanSet, protocol: Rules = R2FLOW) -> tuple[Sequence[int] | None, str]:
-    """The real scans that a metric is given: their numbers, or None for all, and the rule in words."""
+    """Indices of the real scans for a metric (None: all) and a description of the choice."""
     count = len(real)
     if metric.protocol.extractor is not None or count <= REAL_SCANS:
         return None, f"all {count}"
@@ -56,7 +56,7 @@ def real_rule(metric: ScanMetric, real: ScanSet, protocol: Rules = R2FLOW) -> tu
 
 
 def check_reflectance(metrics: Mapping[str, ScanMetric], sets: Iterable[ScanSet]) -> None:
-    """Refuse, before anything is read, a set without the reflectance that a metric needs."""
+    """Refuse a set without the reflectance that a metric needs, before reading scans."""
     needing = [name for name, metric in metrics.items() if metric.needs_reflectance]
     for scans in sets:
         if needing and not scans.about.get("reflectance", True):
@@ -66,29 +66,29 @@ def check_reflectance(metrics: Mapping[str, ScanMetric], sets: Iterable[ScanSet]
 def gather_real(
     metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, cache: Cache | None = None, protocol: Rules = R2FLOW
 ) -> dict[str, Statistics]:
-    """Each metric's statistics of the real scans, from the cache where it holds them."""
+    """Compute each metric's statistics of the real scans, or read them from the cache."""
     if len(real) == 0:
-        raise InputError(f"{real.label} holds no scan to compare with.")
+        raise InputError(f"{real.label} contains no scan to compare with.")
     protocol.check(real)
     chosen = {name: real_rule(metric, real, protocol) for name, metric in metrics.items()}
     points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
     statistics: dict[str, Statistics] = {}
-    cache = None if real.identity is None else cache  # what cannot be told apart from other scans
+    cache = None if real.identity is None else cache  # without an identity there is no key
     if cache is not None:
         keys = {name: key_of(metric, real, chosen[name][1] + points) for name, metric in metrics.items()}
-        held = {name: one for name, key in keys.items() if (one := cache.read(key)) is not None}
-        statistics = {name: replace(held[name], chosen=chosen[name][1]) for name in _common(set(held))}
+        cached = {name: entry for name, key in keys.items() if (entry := cache.read(key)) is not None}
+        statistics = {name: replace(cached[name], chosen=chosen[name][1]) for name in _common(set(cached))}
     missing = {name: metric for name, metric in metrics.items() if name not in statistics}
     for metric in missing.values():
         metric.reset()
-    # The subset first, for every metric, then the rest, for those that take all scans: every scan is read once.
-    some = next((chosen[name][0] for name in missing if chosen[name][0] is not None), None) or []
+    # Read the subset for all metrics, then the rest for metrics of all scans: every scan is read once.
+    subset = next((chosen[name][0] for name in missing if chosen[name][0] is not None), None) or []
     whole_set = {name: metric for name, metric in missing.items() if chosen[name][0] is None}
-    rest = sorted(set(range(len(real))) - set(some)) if whole_set else []
-    first = _update(missing, real, some, 0, True, work, protocol)
-    second = _update(whole_set, real, rest, len(some), True, work, protocol)
+    rest = sorted(set(range(len(real))) - set(subset)) if whole_set else []
+    first = _update(missing, real, subset, 0, True, work, protocol)
+    second = _update(whole_set, real, rest, len(subset), True, work, protocol)
     for name, metric in missing.items():
-        counts = (len(real), first + second) if name in whole_set else (len(some), first)
+        counts = (len(real), first + second) if name in whole_set else (len(subset), first)
         statistics[name] = Statistics(metric.real_state(), *counts, chosen[name][1])
         if cache is not None and place()[0] == 0:
             cache.write(keys[name], statistics[name])
@@ -103,15 +103,15 @@ def measure(
     draws: int = 0,
     protocol: Rules = R2FLOW,
 ) -> list[MetricResult]:
-    """Every metric's figures of a generated set.
+    """Compute all metrics of a generated set.
 
     Args:
-        metrics: Built with `keep=True` where there are draws.
-        real: Of `gather_real`, under the same protocol.
-        draws: Bootstrap resamples for 95 % intervals; 0 for none.
+        metrics: Built with `keep=True` if `draws` > 0.
+        real: Statistics from `gather_real` under the same protocol.
+        draws: Bootstrap resamples for 95 % intervals; 0: no intervals.
     """
     if len(generated) == 0:
-        raise InputError(f"{generated.label} holds no scan to measure.")
+        raise InputError(f"{generated.label} contains no scan to measure.")
     for name, metric in metrics.items():
         metric.reset()
         metric.load_real_state(real[name].states)
@@ -130,33 +130,33 @@ def measure(
         for side, count in (("real", real[name].scans), ("generated", len(generated))):
             if count == 1:
                 remarks.append(f"a single {side} scan is not a distribution.")
-        if lost := [key for key, value in figures.items() if math.isnan(value)]:
-            remarks.append(f"no figure for {', '.join(lost)}.")
+        if undefined := [key for key, value in figures.items() if math.isnan(value)]:
+            remarks.append(f"no figure for {', '.join(undefined)}.")
         if unsolved:
             remarks.append(f"{unsolved} of {len(generated)} scans are not solved to the tolerance.")
         sizes = {
             "real": real[name].scans, "real_chosen": real[name].chosen, "real_empty": real[name].empty,
             "generated": len(generated), "generated_empty": empty,
         }  # fmt: skip
-        used: dict[str, Any] = {
+        settings: dict[str, Any] = {
             **protocol.describe(), **metric.protocol.asdict(), **described, "sizes": sizes
         }  # fmt: skip
         intervals: dict[str, tuple[float, float]] = {}
         if draws and not metric.resamples:
             remarks.append(f"{name} has no bootstrap interval.")
         elif draws:
-            used["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
+            settings["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
             with bar("resampling", draws, "sets") as advance:
                 intervals = bootstrap(metric, draws, advance=advance)
-        results.append(MetricResult(name, figures, used, remarks, intervals))
+        results.append(MetricResult(name, figures, settings, remarks, intervals))
     return results
 
 
 def speed_result(real: ScanSet, generated: ScanSet) -> MetricResult:
-    """Mean network evaluations a scan, and seconds a scan: the median over batches, without the metrics' time."""
+    """Mean network evaluations per scan and median over batches of seconds per scan, excluding metrics."""
     source = generated.source
     assert isinstance(source, SampledScans)
-    # A process without a batch has drawn nothing; the first process always has.
+    # A process without a batch has no samples; the first process always has some.
     figures = {
         "evaluations": statistics.fmean(source.evaluations or [math.nan]),
         "seconds": statistics.median(source.seconds or [math.nan]),
@@ -174,7 +174,7 @@ def _update(
     work: Work,
     protocol: Rules,
 ) -> int:
-    """Give this process's share of the scans to the metrics; returns how many of all have no return within the mask."""
+    """Update the metrics with this process's share of scans; return how many of all scans are empty within the mask."""
     if not metrics or not numbers:
         return 0
     device = next(iter(metrics.values())).device
@@ -200,7 +200,7 @@ def _update(
 
 
 def _common(names: set[str]) -> set[str]:
-    """The names that every process has found in the cache: a metric is read from it by all of them or by none."""
+    """Names cached on every process: all processes read a metric from the cache, or none."""
     _, ranks = place()
     if ranks == 1:
         return names

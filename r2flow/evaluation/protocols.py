@@ -1,8 +1,7 @@
-"""Under which rules two sets of scans are compared: the paper's and ours, by name; figures of two are not comparable.
+"""Evaluation protocols: the paper's and ours, by name. Results of different protocols are not comparable.
 
-They differ in where the points of a pixel lie, which decides bird's-eye histograms and all that a network sees of x, y
-and z; and in which real scans are compared where there are more than are needed. The mask, the histograms and the
-features are the same.
+The protocols differ in the position of a pixel's point, which affects bird's-eye histograms and the networks' inputs x,
+y and z, and in the choice of real scans from larger sets. Masks, histograms and features are the same.
 """
 
 import random
@@ -23,43 +22,43 @@ WORDS = {"measured": "as measured", "centre": "on rays through bin centres", "re
 
 @dataclass(frozen=True)
 class Rules:
-    """One protocol."""
+    """A protocol."""
 
     name: str
-    real: Points  # where the point of a pixel lies: as measured, or on a ray through its bin's middle or upper left
+    real: Points  # position of a pixel's point: as measured, or on the ray through its bin's centre or upper left
     generated: Convention  # corner ("reference")
-    convention: Convention | None  # how points of files become images where nobody says so; None for the model's
-    choose: Callable[[ScanSet, int], Sequence[int]]  # numbers of so many scans of a set, rising
-    chosen: str  # how, in words
+    convention: Convention | None  # default projection of point clouds to images; None: the model's
+    choose: Callable[[ScanSet, int], Sequence[int]]  # sorted indices of at most n scans of a set
+    chosen: str  # description of the choice
 
     def describe(self) -> dict[str, Any]:
-        """For a figure's protocol."""
+        """Entries for the protocol of a result."""
         return {"name": self.name, "points": {"real": WORDS[self.real], "generated": WORDS[self.generated]}}
 
     def rays(self, real: bool) -> Convention:
-        """The rays on which points lie that were not measured."""
+        """Rays of points that are not measured."""
         return self.real if real and self.real != "measured" else self.generated
 
     def check(self, real: ScanSet) -> None:
-        """Refuse a real set without the measured coordinates that the protocol compares."""
+        """Refuse a real set without the measured coordinates that the protocol needs."""
         if self.real == "measured" and not real.source.measured:
             raise InputError(
                 f"{real.label} lacks the measured coordinates of its points, which the protocol '{self.name}' compares:"
-                " only files of points have them (KITTI's .bin). Or give --protocol r2flow."
+                " only point files have them (KITTI's .bin). Or give --protocol r2flow."
             )
 
 
 def published_choice(scans: ScanSet, most: int) -> list[int]:
-    """`most` scans by the published draw, the first of Python's `random.Random(0).shuffle`, in rising order.
+    """The first `most` scans of Python's `random.Random(0).shuffle`, sorted, as in the published code.
 
-    The published evaluation has KITTI-360's training drives before its test drives.
+    The published evaluation lists KITTI-360's training drives before its test drives.
     """
     order = list(range(len(scans)))
     if "kitti_360" in str(scans.about.get("kind")):
-        known = SOURCES["kitti_360"]
-        last = {n for drive, held in scans.drives.items() if known.split_of(drive) == "test" for n in held}
-        order.sort(key=lambda number: number in last)
-    random.Random(0).shuffle(order)  # shuffles whatever stands at each place
+        layout = SOURCES["kitti_360"]
+        test = {n for drive, indices in scans.drives.items() if layout.split_of(drive) == "test" for n in indices}
+        order.sort(key=lambda number: number in test)
+    random.Random(0).shuffle(order)  # the permutation depends only on the length
     return sorted(order[:most])
 
 

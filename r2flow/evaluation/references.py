@@ -1,4 +1,4 @@
-"""What a figure of generated scans is read against: real scans among themselves, and baselines made without a model."""
+"""References for distances of generated scans: distances between real scans, and baselines made without a model."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -12,24 +12,24 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator, standard_normal
 
-LEARNED_FROM = 200  # real scans that the mean and the shuffled pixels are made of, evenly spread over the set
+LEARNED_FROM = 200  # number of evenly spaced real scans behind the mean and shuffled pixels
 
 
 def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None) -> dict[str, tuple[ScanSet, ScanSet]]:
-    """Pairs of real sets whose distance a generator cannot be expected to go below: two halves, and two drives if any.
+    """Pairs of real sets, as lower references for a generator's distance: two halves, and two drives if any.
 
     Halves are contiguous blocks: neighbouring scans of a drive are near-duplicates, and random halves would share
-    places. The two drives are those with most scans. Distances fall with the number of scans, so generated scans that
-    need not be sampled again are compared with the first half as well, as many as the second half has.
+    places. The two drives are the largest. Distances decrease with the number of scans; generated scans from files are
+    therefore also compared with the first half, limited to the size of the second half.
     """
     count = len(real)
     if count < 2:
-        raise InputError(f"{real.label} holds {count} scan; --reference needs at least two real ones.")
+        raise InputError(f"{real.label} has {count} scan; --reference needs at least two real ones.")
     half, other = real.part(range(count // 2), "first half"), real.part(range(count // 2, count), "second half")
     pairs = {"real halves": (half, other)}
-    for name, one in (generated or {}).items():
-        if not one.source.drawn and len(one) >= len(other):
-            pairs[f"{name}, as many"] = half, one.limited(len(other))
+    for name, scans in (generated or {}).items():
+        if not scans.source.drawn and len(scans) >= len(other):
+            pairs[f"{name}, as many"] = half, scans.limited(len(other))
     largest = sorted(real.drives, key=lambda drive: -len(real.drives[drive]))[:2]
     if len(largest) == 2:
         a, b = (real.part(list(real.drives[drive]), f"drive {drive}") for drive in sorted(largest))
@@ -38,10 +38,10 @@ def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None
 
 
 class Baseline(ScanSource):
-    """Scans (2 or 1, H, W) made without knowledge of scenes, by their numbers.
+    """Scans (2 or 1, H, W) of a baseline without a model, by index.
 
     Args:
-        name: In `BASELINES`.
+        name: Name in `BASELINES`.
         training: Real scans, (N, 2 or 1, H, W).
     """
 
@@ -65,12 +65,12 @@ class Baseline(ScanSource):
         return {"kind": "baseline", "seed": self.seed, "reflectance": self.training.shape[1] > 1}
 
     def noise(self, number: int) -> np.ndarray:
-        """x_0 ~ N(0, I), decoded as if it were a scan."""
+        """Decoded x_0 ~ N(0, I)."""
         encoding = Encoding(self.sensor, reflectance=self.training.shape[1] > 1)
         return encoding.decode(standard_normal(self.training.shape[1:], self.seed, "evaluation", number)).numpy()
 
     def flat_ground(self, number: int) -> np.ndarray:
-        """r = -height / sin e within the sensor's limits."""
+        """r = -height / sin e within the sensor's range limits."""
         e = self.sensor.rays()[0].numpy().astype(np.float64)
         r = np.where(e < 0, -self.sensor.height / np.sin(np.minimum(e, -1e-6)), 0)
         r = np.where((r >= self.sensor.min_range) & (r <= self.sensor.max_range), r, 0)
@@ -83,11 +83,11 @@ class Baseline(ScanSource):
         return np.where(returned.mean(0) > 0.5, mean, 0).astype(np.float32)
 
     def mean_scan(self, number: int) -> np.ndarray:
-        """The mean of the training scans where over half of them returned."""
+        """Mean of the training scans, at pixels where more than half of them return."""
         return self._mean
 
     def shuffled_pixels(self, number: int) -> np.ndarray:
-        """Each pixel from a training scan of its own."""
+        """Each pixel from a random training scan."""
         rows, columns = np.indices(self.sensor.shape)
         scan = generator(self.seed, "shuffle", number).integers(len(self.training), size=self.sensor.shape)
         return np.moveaxis(self.training[scan, :, rows, columns], -1, 0)
@@ -102,7 +102,7 @@ BASELINES = {
 
 
 def baseline_sets(real: ScanSet, num: int) -> dict[str, ScanSet]:
-    """Each baseline as a set of `num` scans, made of some of the real ones."""
-    some = real.spread(LEARNED_FROM)
-    training = np.concatenate([batch.numpy() for batch in some.batches(range(len(some)), 8)])
+    """Each baseline as a set of `num` scans, computed from a subset of the real scans."""
+    subset = real.spread(LEARNED_FROM)
+    training = np.concatenate([batch.numpy() for batch in subset.batches(range(len(subset)), 8)])
     return {name: ScanSet(name, Baseline(name, training, real.sensor, range(num)), real.sensor) for name in BASELINES}

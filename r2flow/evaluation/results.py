@@ -1,4 +1,4 @@
-"""Results of sampled sets, kept in a folder so that an evaluation that was stopped resumes."""
+"""Results of sampled sets, stored in a folder so that an interrupted evaluation resumes."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -14,11 +14,11 @@ from r2flow.store import checksum
 
 
 class Results:
-    """One file for each sampled set, named by a hash of everything that its results depend on.
+    """Folder with one file per sampled set, named by a hash of everything its results depend on.
 
     Args:
-        folder: None keeps nothing.
-        how: What else the results depend on: bootstrap draws, protocol, device.
+        folder: None: store nothing.
+        how: Other settings that affect results: bootstrap draws, protocol, device.
     """
 
     def __init__(self, folder: Path | None, metrics: Mapping[str, ScanMetric], **how: Any) -> None:
@@ -26,19 +26,19 @@ class Results:
         self.recipe = {"metrics": {name: metric.protocol.asdict() for name, metric in metrics.items()}, **how}
 
     def read(self, real: ScanSet, sampled: ScanSet) -> list[MetricResult] | None:
-        """The results of a sampled set against a real one; None if they are not there or cannot be read."""
+        """Read the results of a sampled set against a real one; None if missing or damaged."""
         if self.folder is None:
             return None
         try:
-            return [MetricResult(**one) for one in read_json(self._path(self.folder, real, sampled))]
+            return [MetricResult(**entry) for entry in read_json(self._path(self.folder, real, sampled))]
         except (OSError, ValueError, TypeError):
             return None
 
     def write(self, real: ScanSet, sampled: ScanSet, results: Sequence[MetricResult]) -> None:
-        """Keep the results of a sampled set."""
+        """Store the results of a sampled set."""
         if self.folder is not None:
             with atomic_write(self._path(self.folder, real, sampled), "w") as file:
-                json.dump([asdict(one) for one in results], file)
+                json.dump([asdict(result) for result in results], file)
 
     def _path(self, folder: Path, real: ScanSet, sampled: ScanSet) -> Path:
         recipe = {"real": real.identity or real.label, "sampled": sampled.about, **self.recipe}

@@ -1,4 +1,4 @@
-"""Sets of scans that a flow draws when they are asked for."""
+"""Sets of scans sampled from a generator on access."""
 
 import copy
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ CHECKPOINTS = (".ckpt", ".pth", ".safetensors")
 
 
 def is_checkpoint(text: str) -> bool:
-    """Whether a name is that of a flow to sample from: a checkpoint file, a run folder or a model."""
+    """Whether a text names a generator to sample: a checkpoint file, a run folder or a model."""
     path = Path(text).expanduser()
     if path.is_dir():
         return bool(checkpoints_of(path)) or any(path.glob("step-*.ckpt"))
@@ -34,9 +34,9 @@ def sampled_set(
     seed: int = 0,
     precision: Precision = "32-true",
 ) -> ScanSet:
-    """Scans 0 to num - 1 of a generator's seed, drawn when they are asked for.
+    """Set of scans 0 to num - 1 of a generator and seed, sampled on access.
 
-    Their noise is that of (seed, "evaluation", i), which no training step and no reflow pair has seen.
+    Their noise (seed, "evaluation", i) is disjoint from the noise of training and reflow pairs.
     """
     sampler = sampler or flow.generator.sampler
     sampler.check(flow.generator)
@@ -49,7 +49,7 @@ def sampled_set(
 
 
 class SampledScans(ScanSource):
-    """Scans of a generator by their numbers; what one is depends on (seed, number) alone."""
+    """Scans of a generator by number; each depends only on (seed, number)."""
 
     drawn = True
 
@@ -57,9 +57,9 @@ class SampledScans(ScanSource):
         self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int, precision: Precision = "32-true"
     ) -> None:
         self.flow, self.numbers, self.sampler, self.seed, self.precision = flow, numbers, sampler, seed, precision
-        self.unsolved = 0  # of those drawn so far, how many are no solution to the tolerance
-        self.evaluations: list[int] = []  # of the network, of each
-        self.seconds: list[float] = []  # a scan, of each batch
+        self.unsolved = 0  # samples so far that missed the tolerance
+        self.evaluations: list[int] = []  # network evaluations per scan
+        self.seconds: list[float] = []  # seconds per scan, for each batch
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -77,11 +77,11 @@ class SampledScans(ScanSource):
         return part
 
     def batch(self, indices: Sequence[int]) -> Tensor:
-        """The scans of a batch together, (B, 2 or 1, H, W). One that is not solved is taken as it is, and counted."""
-        made = draw(
+        """Sample a batch, (B, 2 or 1, H, W); unconverged samples are included and counted."""
+        batch = draw(
             self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler, precision=self.precision
         )
-        self.seconds.append(made.seconds / len(indices))
-        self.evaluations += made.evaluations.tolist()
-        self.unsolved += int((~made.converged).sum())
-        return made.images.nan_to_num(0.0)
+        self.seconds.append(batch.seconds / len(indices))
+        self.evaluations += batch.evaluations.tolist()
+        self.unsolved += int((~batch.converged).sum())
+        return batch.images.nan_to_num(0.0)

@@ -1,4 +1,4 @@
-"""The metrics' statistics of real scans, kept on disk under a hash of everything that they depend on."""
+"""Disk cache of the metrics' statistics of real scans."""
 
 import hashlib
 import json
@@ -19,32 +19,32 @@ from r2flow.metrics.base import ScanMetric
 
 log = logging.getLogger(__name__)
 
-FORMAT = 3  # to be raised when statistics of the same scans change under the same protocol
+FORMAT = 3  # increment if statistics change for the same scans and protocol
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """A metric's states after one set of scans, and how many it has seen."""
+    """A metric's states after a set of scans, and scan counts."""
 
     states: Mapping[str, Tensor] = field(repr=False)  # from `ScanMetric.real_state`
     scans: int
-    empty: int  # how many of them have no return within the mask
-    chosen: str = ""  # how they were chosen from the set
+    empty: int  # scans without a return within the mask
+    chosen: str = ""  # description of their choice from the set
 
 
 class Cache:
-    """Statistics of real scans in a folder, each file named by a hash of everything that it depends on."""
+    """Folder of statistics of real scans; file names are hashes of everything the statistics depend on."""
 
     def __init__(self, folder: str | Path | None = None) -> None:
         self.folder = cache_folder("R2FLOW_CACHE") / "statistics" if folder is None else Path(folder)
 
     def path(self, key: str) -> Path:
-        """The file of a key of `key_of`."""
+        """File of a key from `key_of`."""
         metric = json.loads(key)["protocol"]["metric"]
         return self.folder / f"{metric}-{hashlib.sha256(key.encode()).hexdigest()[:24]}.safetensors"
 
     def read(self, key: str) -> Statistics | None:
-        """The statistics of a key; None where there are none that can be read."""
+        """Read the statistics of a key; None if missing or damaged."""
         path = self.path(key)
         if not path.is_file():
             return None
@@ -56,25 +56,25 @@ class Cache:
                 states = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return Statistics(states, int(notes["scans"]), int(notes["empty"]))
         except (SafetensorError, OSError, KeyError, ValueError):
-            log.warning("%s is damaged; its statistics are gathered again.", path)
+            log.warning("%s is damaged; recomputing its statistics.", path)
             return None
 
     def write(self, key: str, statistics: Statistics) -> None:
-        """Keep statistics; a disk that cannot be written to costs a warning, but no figure."""
+        """Store statistics; only warn if the disk is not writable."""
         notes = {"key": key, "scans": str(statistics.scans), "empty": str(statistics.empty)}
         data = save({name: value.contiguous() for name, value in statistics.states.items()}, metadata=notes)
         try:
             with atomic_write(self.path(key)) as file:
                 file.write(data)
         except OSError as error:
-            log.warning("statistics are not kept: %s: %s", self.folder, error.strerror or error)
+            log.warning("statistics are not cached: %s: %s", self.folder, error.strerror or error)
 
 
 def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
-    """Everything that a metric's statistics of a set depend on, as JSON.
+    """Everything a metric's statistics of a set depend on, as JSON.
 
-    The files of the scans with sizes and times (or seed, or manifest), sensor, projection, mask, subset, the metric's
-    protocol with the hash of its weights, the kind of device, and the format of these files.
+    The key contains scan files with sizes and times (or seed, or manifest), sensor, projection, mask, subset, the
+    metric's protocol with its weights' hash, the device type, and the file format.
     """
     parts = {
         "format": FORMAT, "scans": scans.identity, "subset": rule, "protocol": metric.protocol.asdict(),
@@ -83,4 +83,4 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
     try:
         return json.dumps(parts, sort_keys=True)
     except TypeError as error:
-        raise InputError(f"the protocol of '{metric.name}' is not made of plain values: {error}.") from None
+        raise InputError(f"the protocol of '{metric.name}' must have plain JSON values: {error}.") from None
