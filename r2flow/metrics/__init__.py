@@ -1,9 +1,9 @@
-"""Distances between real and generated scans, by name; a name means one protocol.
+"""Registry of distances between real and generated scans; each name stands for one protocol.
 
-`METRICS[name](keep=..., sensor=...)` builds one. Importing this module loads no metric, no network and not torch.
+`METRICS[name](keep=..., sensor=...)` builds a metric. Importing this module does not import metrics, networks or torch.
 
-Two protocols of the field are not offered: LiDARGen's JSD and MMD keep returns up to 70 m, where all scans here are
-masked to 63 m, and UltraLiDAR's compare voxel centres of real scans with points of generated ones.
+Not implemented: LiDARGen's JSD and MMD, which keep returns up to 70 m (scans are masked to 63 m here), and
+UltraLiDAR's, which compare voxel centres of real scans with points of generated scans.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from r2flow.registry import Registry
 if TYPE_CHECKING:
     from r2flow.metrics.base import ScanMetric
 
-# What the field calls the Frechet distance between a network's features; of other networks it is `frechet_NETWORK`.
+# Published names of Frechet distances by network; other networks have `frechet_NETWORK`.
 FIELD_NAMES = {"rangenet53": "frd", "rangenet21": "frid", "pointnet": "fpd", "spvcnn": "fpvd", "minkowskinet": "fsvd"}
 
 
 def _lazily(where: str, *given: Any) -> Callable[..., ScanMetric]:
-    """The constructor `module:Class` of this package, imported when it is called."""
+    """Constructor `module:Class` of this package, imported on the first call."""
     module, name = where.split(":")
 
     def build(**options: Any) -> ScanMetric:
@@ -47,7 +47,7 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
 
 
 def add_network(name: str) -> None:
-    """Enter the metrics of a network's features: Frechet distance, kernel distance, precision and recall."""
+    """Register a network's metrics: Frechet distance, kernel distance, precision and recall."""
     METRICS.add(FIELD_NAMES.get(name, f"frechet_{name}"), _lazily("frechet:FrechetDistance", name))
     METRICS.add(f"kid_{name}", _lazily("kid:KernelDistance", name))
     METRICS.add(f"manifold_{name}", _lazily("manifold:Manifold", name))
@@ -58,10 +58,10 @@ for _network in EXTRACTORS:
 
 
 def default_metrics(reflectance: bool) -> tuple[str, ...]:
-    """What is measured where nobody names metrics: all of it without a download, the headline first.
+    """Default metrics, which need no downloads; the headline first.
 
-    KID and the unbiased MMD, which few scans do not bias, stand beside the field's Frechet
-    distance and MMD. Docs: metrics.md, "The headline".
+    KID and the unbiased MMD, which are unbiased for few scans, accompany the usual Frechet distance
+    and MMD. Docs: metrics.md, "The headline".
     """
     features = "handcrafted" if reflectance else "handcrafted_range"
     return (f"kid_{features}", f"frechet_{features}", "panel", "jsd", "mmd", "mmd_unbiased")

@@ -1,4 +1,4 @@
-"""What a metric between two sets of scans is, and the protocol under which its figures hold."""
+"""Base class of metrics between two sets of scans, and the protocol of their results."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -21,15 +21,15 @@ SIDES: tuple[Side, Side] = ("real", "generated")
 
 @dataclass(frozen=True)
 class Protocol:
-    """What a figure depends on besides the scans: two protocols that differ never share a name.
+    """Everything a result depends on except the scans; different protocols have different names.
 
     Attributes:
         metric: Name in `r2flow.metrics.METRICS`.
-        representation: What of a scan is compared: "range image", "points", "bird's-eye histogram".
-        mask: Metres between which returns are kept.
-        extractor, weights, layer: Name of the network, first 12 digits of the SHA-256 of its weights, and which
-            features are taken; None without a network.
-        settings: Everything else: bins, bandwidth, neighbours.
+        representation: Data compared per scan: "range image", "points", "bird's-eye histogram".
+        mask: Range limits of returns, in metres.
+        extractor, weights, layer: Network name, first 12 digits of the SHA-256 of its weights, and feature layer;
+            None without a network.
+        settings: Other settings: bins, bandwidth, neighbours.
     """
 
     metric: str
@@ -45,36 +45,36 @@ class Protocol:
 
 
 def blocks(rows: Tensor, size: int) -> Iterator[tuple[slice, Tensor]]:
-    """Rows (N, D), at most `size` at a time: their places, and they in float64."""
+    """Split rows (N, D) into blocks of at most `size`: slices, and rows in float64."""
     for start in range(0, len(rows), size):
         yield slice(start, min(start + size, len(rows))), rows[start : start + size].double()
 
 
 class ScanMetric(Metric):
-    """A distance between real and generated scans, or several figures that are computed together.
+    """A distance between real and generated scans, or several values computed together.
 
-    Both sets are given by `update(scans, real=...)`, as to torchmetrics' FrechetInceptionDistance. It is a torchmetrics
-    Metric in all else too: `forward`, `merge_state`, `reset`, `state_dict` (after `persistent(True)`), device moves,
-    collections, and a compute that all processes share. Sums are float64, whatever dtype is set: the order of the
-    scans and the number of processes change no figure within ten digits.
+    `update(scans, real=...)` adds scans of either set, as in torchmetrics' FrechetInceptionDistance. All of
+    torchmetrics' interface works: `forward`, `merge_state`, `reset`, `state_dict` (after `persistent(True)`), device
+    moves, collections, and a compute across processes. Sums are float64 regardless of the dtype: results agree to ten
+    digits for any order of scans and number of processes.
 
-    A subclass takes a row of numbers from each scan (`rows`), adds the rows up (`accumulate`) or keeps them
-    (`keeping`), and computes `figures`. A row of NaN stands for a scan that has nothing to compare: it is left out and
-    counted, and a remark says so.
+    A subclass computes a row of numbers per scan (`rows`), sums the rows (`accumulate`) or stores them (`keeping`), and
+    computes `figures`. A row of NaN marks a scan without anything to compare: it is left out, counted and mentioned in
+    a remark.
 
     Attributes:
         name, representation, mask, settings: As in `Protocol`.
-        needs_reflectance, uses_reflectance: Whether scans without reflectance are refused; whether it is read where
-            there is some.
-        keeping: Whether the rows are always kept in memory, float32.
-        resamples: Whether it has bootstrap intervals, for which `keep=True` keeps the rows.
-        fewest: Scans of each set that `resampled` takes.
+        needs_reflectance, uses_reflectance: Whether scans without reflectance are refused; whether reflectance is
+            used if present.
+        keeping: Whether rows are always stored in memory, float32.
+        resamples: Whether bootstrap intervals exist; they require rows stored by `keep=True`.
+        fewest: Minimum number of scans per set for `resampled`.
 
     Args:
-        keep: Whether bootstrap intervals are wanted.
-        sensor: Of the images that `update` is given as tensors.
-        name: Where one class has several names.
-        options: Those of torchmetrics' Metric: process_group, sync_on_compute, ...
+        keep: Store rows for bootstrap intervals.
+        sensor: Sensor of images passed to `update` as tensors.
+        name: Name, for classes with several names.
+        options: Options of torchmetrics' Metric: process_group, sync_on_compute, ...
     """
 
     is_differentiable = False
@@ -93,7 +93,7 @@ class ScanMetric(Metric):
     def __init__(
         self, keep: bool = False, *, sensor: Sensor | None = None, name: str | None = None, **options: Any
     ) -> None:
-        # Not cached: torchmetrics would return what was computed before `merge_state`.
+        # Not cached: torchmetrics would return the value from before `merge_state`.
         super().__init__(**{"compute_with_cache": False, **options})
         self.name = name or type(self).name
         self.sensor = sensor
@@ -101,9 +101,9 @@ class ScanMetric(Metric):
         for side in SIDES:
             self.add_state(f"{side}_scans", torch.tensor(0), dist_reduce_fx="sum")
             self.add_state(f"{side}_left_out", torch.tensor(0), dist_reduce_fx="sum")
-            if self.keeps:  # (N, 1 + D): the number of a scan, then its row
+            if self.keeps:  # (N, 1 + D): scan number, then its row
                 self.add_state(f"{side}_rows", [], dist_reduce_fx="cat")
-        # A MetricCollection updates only one of several metrics whose states have equal names and values.
+        # Distinguishes metrics in a MetricCollection, which updates only one of those with equal states.
         self.add_state(f"name_{self.name}", torch.tensor(0), dist_reduce_fx="sum")
         self._remarks: list[str] = []
 
@@ -112,32 +112,32 @@ class ScanMetric(Metric):
         return Protocol(self.name, self.representation, self.mask, settings=self.settings)
 
     def rows(self, scans: Scans) -> Tensor:
-        """What is taken from each scan, (B, D); a row of NaN for a scan that has nothing to compare."""
+        """Numbers of each scan, (B, D); NaN for a scan without anything to compare."""
         raise NotImplementedError
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
-        """Add rows, all finite, to the statistics of a side."""
+        """Add finite rows to the statistics of a side."""
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        """Figures by name, computed from the states, and the remarks on them: as `resampled` unless overridden."""
+        """Compute values by name, and remarks, from the states; default: `resampled` with weights 1."""
         if any(self.count(side) < self.fewest for side in SIDES):
             return {self.name: float("nan")}, [f"{self.name} needs {self.fewest} scans of each set."]
-        once: dict[Side, Tensor] = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
-        return {name: float(value) for name, value in self.resampled(once).items()}, []
+        weights: dict[Side, Tensor] = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
+        return {name: float(value) for name, value in self.resampled(weights).items()}, []
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Figures of resampled sets, (R) for each name that has intervals; `weights` is how much each kept scan counts,
+        """Values for resampled sets, (R,) per name with intervals; `weights` are the weights of the stored scans,
         (R, N)."""
         raise NotImplementedError
 
     def update(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> None:
-        """Take in a batch of real or generated scans.
+        """Add a batch of real or generated scans.
 
         Args:
-            scans: `Scans`, or images (B, 2 or 1, H, W) of the metric's `sensor`: range in metres, reflectance of
-                [0, 1], 0 where a ray has no return. Metrics of one network run it once for one `Scans` object.
-            first: Number of the first scan: kept rows are sorted by it, so that intervals do not depend on the order
-                of the batches. Numbered on if left out.
+            scans: `Scans`, or images (B, 2 or 1, H, W) of the metric's `sensor`: range in metres, reflectance in
+                [0, 1], 0 without a return. Metrics of the same network run it once per `Scans` object.
+            first: Number of the first scan: stored rows are sorted by number, so that intervals do not depend on the
+                order of batches. Default: the number of scans so far.
         """
         side: Side = "real" if real else "generated"
         first = self.given(side) if first is None else first
@@ -167,35 +167,35 @@ class ScanMetric(Metric):
             getattr(self, f"{side}_rows").append(numbered.float().to(self.device))
 
     def forward(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> dict[str, float]:
-        """Take in a batch; a batch has no distance of its own, so there are no figures."""
+        """Update; return no values, since a batch alone has no distance."""
         self.update(scans, real, first)
         return {}
 
     def compute(self) -> dict[str, float]:
-        """Figures by name. A figure that does not exist is NaN, and `remarks` says why."""
+        """Values by name; undefined values are NaN and explained in `remarks`."""
         values, remarks = self.figures()
         self._remarks = self._left_out() + remarks
         return values
 
     def remarks(self) -> list[str]:
-        """What a reader of the last computed figures must know: empty scans, fewer scans than features."""
+        """Remarks on the last computed values: empty scans, fewer scans than features."""
         return list(self._remarks)
 
     def add_scans(self, side: Side, scans: int, left_out: int) -> None:
-        """Count scans of a side, and those among them that have nothing to compare."""
+        """Add to the counts of scans and of left-out scans of a side."""
         getattr(self, f"{side}_scans").add_(scans)
         getattr(self, f"{side}_left_out").add_(left_out)
 
     def given(self, side: Side) -> int:
-        """Scans of a side."""
+        """Number of scans of a side."""
         return int(getattr(self, f"{side}_scans"))
 
     def count(self, side: Side) -> int:
-        """Scans of a side that have something to compare."""
+        """Number of compared scans of a side."""
         return self.given(side) - int(getattr(self, f"{side}_left_out"))
 
     def kept(self, side: Side) -> Tensor:
-        """The kept rows of a side in the order of their scans, (N, D) float32 on the CPU."""
+        """Stored rows of a side in the order of scans, (N, D) float32 on the CPU."""
         return self._numbered(side)[:, 1:]
 
     def _numbered(self, side: Side) -> Tensor:
@@ -206,7 +206,7 @@ class ScanMetric(Metric):
         return table[table[:, 0].argsort(stable=True)]
 
     def real_state(self) -> dict[str, Tensor]:
-        """All statistics of the real set, on the CPU and gathered from all processes: for a cache on disk."""
+        """Statistics of the real set, on the CPU and gathered from all processes, for a disk cache."""
         with self.sync_context():
             names = [name for name in self._defaults if name.startswith("real_") and name != "real_rows"]
             state = {name: getattr(self, name).detach().cpu().clone() for name in names}
@@ -215,7 +215,7 @@ class ScanMetric(Metric):
         return state
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
-        """Take the real set's statistics from `real_state`, after `reset`; of several processes the first has them."""
+        """Load the real set's statistics from `real_state`, after `reset`; only on the first process."""
         if place()[0] > 0:
             return
         for name, value in state.items():
@@ -225,7 +225,7 @@ class ScanMetric(Metric):
                 getattr(self, name).copy_(value)
 
     def _sync_dist(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:
-        for side in SIDES if self.keeps else ():  # a process without rows sends none of the others' width
+        for side in SIDES if self.keeps else ():  # give processes without rows the others' width
             rows = getattr(self, f"{side}_rows")
             width = torch.tensor(rows[0].shape[1] if rows else 0, device=self.device)
             most = max(map(int, dist_sync_fn(width, group=process_group or self.process_group)))
@@ -234,7 +234,7 @@ class ScanMetric(Metric):
         super()._sync_dist(dist_sync_fn, process_group)
 
     def set_dtype(self, dst_type: str | torch.dtype) -> Self:
-        """Nothing: states stay float64, since sums in less would lose the digits of the figures."""
+        """Do nothing: states stay float64, since lower precision would lose digits."""
         return self
 
     def _left_out(self) -> list[str]:
@@ -246,6 +246,6 @@ class ScanMetric(Metric):
             elif compared == 0:
                 remarks.append(f"none of the {scans} {side} scans has anything to compare; are all of them empty?")
             elif compared < scans:
-                left = f"{scans - compared} of {scans} {side} scans"
-                remarks.append(f"{left} are left out: empty, or nothing to compare.")
+                skipped = f"{scans - compared} of {scans} {side} scans"
+                remarks.append(f"{skipped} are left out: empty, or nothing to compare.")
         return remarks

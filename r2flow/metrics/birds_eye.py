@@ -1,4 +1,4 @@
-"""Bird's-eye histograms, which the field's JSD and MMD compare."""
+"""Bird's-eye histograms, for JSD and MMD."""
 
 import math
 
@@ -6,27 +6,27 @@ import numpy as np
 import torch
 from scipy.special import rel_entr
 
-BINS, EXTENT, NEAR, FAR = 100, 80, 3, 70  # bins a side, over +-80 m, of returns of 3 m < r < 70 m
+BINS, EXTENT, NEAR, FAR = 100, 80, 3, 70  # bins per side over +-80 m, returns of 3 m < r < 70 m
 PROTOCOL = {"bins": BINS, "metres": [-EXTENT, EXTENT], "range": [NEAR, FAR]}
 
 
 def birds_eye_histogram(xyz: np.ndarray) -> np.ndarray:
-    """Points (N, 3) from above, counted in 100 x 100 bins over +-80 m where 3 m < r < 70 m, (100, 100).
+    """Histogram of points (N, 3) in the horizontal plane: 100 x 100 bins over +-80 m, 3 m < r < 70 m, (100, 100).
 
-    In float32 and by torch's function, as published: its edge between the middle bins lies at -1.2e-6 m, and points on
-    rays along the axes fall to one side of it or the other.
+    Uses torch's function in float32, as published: its edge between the middle bins lies at -1.2e-6 m, which decides
+    the bin of points on rays along the axes.
     """
     points = torch.from_numpy(np.ascontiguousarray(xyz, dtype=np.float32))
     r = points.norm(dim=1)
-    seen = points[(r > NEAR) & (r < FAR), :2]
+    inside = points[(r > NEAR) & (r < FAR), :2]
     ends = [-float(EXTENT), float(EXTENT)] * 2
-    return torch.histogramdd(seen, bins=[BINS, BINS], range=ends).hist.double().numpy()
+    return torch.histogramdd(inside, bins=[BINS, BINS], range=ends).hist.double().numpy()
 
 
 def js_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """sqrt of the Jensen-Shannon divergence, natural logarithm: 0 for equal, sqrt(ln 2) = 0.833 for disjoint.
+    """Square root of the Jensen-Shannon divergence (natural logarithm): 0 if equal, sqrt(ln 2) = 0.833 if disjoint.
 
-    An empty histogram, of a set without any return, has the largest distance from any other.
+    An empty histogram (a set without returns) has the maximum distance to any other.
     """
     if a.sum() == 0 or b.sum() == 0:
         return 0.0 if a.sum() == b.sum() else math.sqrt(math.log(2))

@@ -16,8 +16,8 @@ class FeatureMetric(ScanMetric):
     """A metric whose rows are a network's features.
 
     Args:
-        extractor: The network, or its name in `EXTRACTORS`: then it is loaded with its weights.
-        keep, options: As `ScanMetric`.
+        extractor: A network, or a name in `EXTRACTORS`, which loads it with its weights.
+        keep, options: As in `ScanMetric`.
     """
 
     representation = "features of a network"
@@ -43,8 +43,8 @@ class FeatureMetric(ScanMetric):
 
 
 def extract(extractor: Extractor, scans: Scans) -> Tensor:
-    """Features of a batch, (B, D), computed once for all metrics of the same network."""
-    # Networks of one name and equal weights are the same; random ones are told apart by the object itself.
+    """Features of a batch, (B, D), computed once per network for all metrics."""
+    # Networks with equal names and weights are the same; random networks are identified by object.
     key = extractor if extractor.weights == "random" else (extractor.name, extractor.weights)
     if key not in scans.features:
         with torch.no_grad():

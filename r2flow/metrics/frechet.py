@@ -1,4 +1,4 @@
-"""Frechet distance between Gaussians that are fitted to features of real and generated scans."""
+"""Frechet distance between Gaussians fitted to features of real and generated scans."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
@@ -11,7 +11,7 @@ from r2flow.metrics.base import SIDES, Side, blocks
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.features import FeatureMetric
 
-BLOCK = 4000  # kept features read at once
+BLOCK = 4000  # stored features per block
 FEW = (
     "fewer scans than features on a side: its covariance has no full rank, and the distance is too large; compare it "
     "only with distances of as many scans."
@@ -19,31 +19,31 @@ FEW = (
 
 
 def frechet_distance(mean_1: Tensor, covariance_1: Tensor, mean_2: Tensor, covariance_2: Tensor) -> float:
-    """d^2 = |mu_1 - mu_2|^2 + tr(S_1 + S_2 - 2 (S_1 S_2)^(1/2)), of Dowson and Landau (1982), in float64.
+    """d^2 = |mu_1 - mu_2|^2 + tr(S_1 + S_2 - 2 (S_1 S_2)^(1/2)) (Dowson and Landau 1982), in float64.
 
-    With S_i = A_i A_i^T, eigenvectors times the roots of their eigenvalues, tr (S_1 S_2)^(1/2) is the sum of the
-    singular values of A_1^T A_2. No complex root appears and singular covariances need no added diagonal. The usual
-    eigenvalues of S_1^(1/2) S_2 S_1^(1/2) have a rounding error of eps |S|^2, and their roots one of sqrt(eps) |S|.
+    With S_i = A_i A_i^T, A_i eigenvectors times square roots of eigenvalues, tr (S_1 S_2)^(1/2) is the sum of the
+    singular values of A_1^T A_2. This avoids complex roots and a regularised diagonal. The usual eigenvalues of
+    S_1^(1/2) S_2 S_1^(1/2) have a rounding error of eps |S|^2, and their roots an error of sqrt(eps) |S|.
 
     Args:
-        mean_1: (D), as mean_2.
-        covariance_1: (D, D), as covariance_2: symmetric, positive semidefinite but for rounding.
+        mean_1: (D,), like mean_2.
+        covariance_1: (D, D), like covariance_2: symmetric, positive semidefinite up to rounding.
     """
     a_1, a_2 = root(covariance_1.double()), root(covariance_2.double())
     return distance_from_roots(mean_1.double(), a_1, mean_2.double(), a_2)
 
 
 def distance_from_roots(mean_1: Tensor, a_1: Tensor, mean_2: Tensor, a_2: Tensor) -> float:
-    """The same from A_1, (D, R_1), and A_2, (D, R_2): tr S_i is the sum of their squares."""
+    """Frechet distance from A_1, (D, R_1), and A_2, (D, R_2); tr S_i is the sum of squares of A_i."""
     common = torch.linalg.svdvals(a_1.T @ a_2).sum()
     d = (mean_1 - mean_2).square().sum() + a_1.square().sum() + a_2.square().sum() - 2 * common
-    return max(float(d), 0.0)  # equal Gaussians: rounding goes either way
+    return max(float(d), 0.0)  # rounding may give negative values for equal Gaussians
 
 
 def root(covariance: Tensor) -> Tensor:
     """A, (D, rank), with A A^T = S.
 
-    Eigenvalues up to D eps times the largest, as numpy's matrix_rank, are rounding errors and left out.
+    Drops eigenvalues up to D eps times the largest, which are rounding errors, as numpy's matrix_rank does.
     """
     values, vectors = torch.linalg.eigh(covariance)
     kept = values > values.abs().max() * len(values) * torch.finfo(values.dtype).eps
@@ -51,15 +51,15 @@ def root(covariance: Tensor) -> Tensor:
 
 
 class Moments(NamedTuple):
-    """The parts of a matrix of moments: n scans, and views of their mean (D) and scatter (D, D), in float64.
+    """Parts of a matrix of moments: count n, and views of the mean (D,) and scatter (D, D), in float64.
 
-    Sums of x x^T would lose the variance of features that lie far from 0. So the scatter is kept about the mean, and
-    two parts are joined by the formula of Chan, Golub and LeVeque (1979), with delta = mean_b - mean_a:
+    Sums of x x^T would lose the variance of features far from 0. The scatter is therefore taken about the mean, and two
+    parts are merged by the formula of Chan, Golub and LeVeque (1979), with delta = mean_b - mean_a:
 
         n = n_a + n_b,  mean = mean_a + n_b / n delta,  M = M_a + M_b + n_a n_b / n delta delta^T.
 
-    One matrix, (1 + D, 1 + D), holds all three, so that processes exchange one tensor: n in the corner, the mean in the
-    rest of the first row, the scatter M = sum (x - mean)(x - mean)^T below it.
+    One matrix, (1 + D, 1 + D), stores all three, so that processes exchange one tensor: n in the corner, the mean in
+    the rest of the first row, the scatter M = sum (x - mean)(x - mean)^T below it.
     """
 
     n: int
@@ -68,12 +68,12 @@ class Moments(NamedTuple):
 
     @property
     def covariance(self) -> Tensor:
-        """M / (n - 1), the unbiased estimate, as numpy.cov; needs two scans."""
+        """Unbiased estimate M / (n - 1), as numpy.cov; needs two scans."""
         return self.scatter / (self.n - 1)
 
 
 def moments(matrix: Tensor) -> Moments:
-    """The parts of a matrix of moments."""
+    """Split a matrix of moments into its parts."""
     return Moments(int(matrix[0, 0]), matrix[0, 1:], matrix[1:, 1:])
 
 
@@ -87,7 +87,7 @@ def add_moments(matrix: Tensor, rows: Tensor) -> None:
 
 
 def merge_moments(parts: Tensor) -> Tensor:
-    """Moments of several processes, (P, 1 + D, 1 + D), as those of one."""
+    """Merge the moments of several processes, (P, 1 + D, 1 + D)."""
     merged = parts[0].clone()
     for part in parts[1:]:
         other = moments(part)
@@ -98,11 +98,11 @@ def merge_moments(parts: Tensor) -> Tensor:
 
 
 def _join(matrix: Tensor, n: int, mean: Tensor, centred: Tensor) -> None:
-    """Add n rows with a mean and the scatter of the `centred` rows, (B, D)."""
+    """Add n rows with the given mean and the scatter of the `centred` rows, (B, D)."""
     old = moments(matrix)
     total = old.n + n
     delta = mean - old.mean
-    # The means' own difference is one more row: one product in place, where D = 4096 makes every copy 134 MB.
+    # The difference of means is one more row, for one product in place: at D = 4096 each copy takes 134 MB.
     rows = torch.cat([centred, delta[None] * (old.n * n / total) ** 0.5])
     old.scatter.addmm_(rows.T, rows)
     old.mean.add_(delta, alpha=n / total)
@@ -110,19 +110,19 @@ def _join(matrix: Tensor, n: int, mean: Tensor, centred: Tensor) -> None:
 
 
 class FrechetDistance(FeatureMetric):
-    """Frechet distance between features of real and generated scans, of Heusel et al. (2017).
+    """Frechet distance between features of real and generated scans (Heusel et al. 2017).
 
-    The Gaussians have the mean and the unbiased covariance of the features, both added up in float64. The distance
-    takes a minute on a core for 4096 features, and next to nothing for 256.
+    The Gaussians have the mean and the unbiased covariance of the features, accumulated in float64. The distance takes
+    a minute on one core for 4096 features, and negligible time for 256.
 
-    The network gives it its name: `frd` (RangeNet-53, Zyrianov et al. 2022), `frid` (RangeNet-21), `fpvd` (SPVCNN) and
-    `fsvd` (MinkowskiNet, all three Ran et al. 2024), `fpd` (PointNet, Shu et al. 2019), `frechet_<network>` for any
-    other, `frechet_<network>_random` for one without trained weights.
+    Names by network: `frd` (RangeNet-53, Zyrianov et al. 2022), `frid` (RangeNet-21), `fpvd` (SPVCNN) and
+    `fsvd` (MinkowskiNet, all three Ran et al. 2024), `fpd` (PointNet, Shu et al. 2019), `frechet_<network>` for
+    others, `frechet_<network>_random` with random weights.
     """
 
     kind = "frechet"
     names = FIELD_NAMES
-    fewest = 100  # intervals of 95 % from 50 scans held what is expected in 91 of 100 cases
+    fewest = 100  # with 50 scans, 95 % intervals had 91 % coverage
     settings: ClassVar[Mapping[str, Any]] = {"covariance": "unbiased, n - 1"}
 
     def __init__(self, extractor: Extractor | str, keep: bool = False, **options: Any) -> None:
@@ -139,11 +139,11 @@ class FrechetDistance(FeatureMetric):
     def figures(self) -> tuple[dict[str, float], list[str]]:
         name, dim = self.name, self.extractor.dim
         both = {side: moments(getattr(self, f"{side}_moments")) for side in SIDES}
-        few = [f"{one.n} {side}" for side, one in both.items() if one.n < 2]
+        few = [f"{part.n} {side}" for side, part in both.items() if part.n < 2]
         if few:
-            return {name: float("nan")}, [f"{name}: {' and '.join(few)} scans have no covariance; it takes two."]
-        value = frechet_distance(*(part for one in both.values() for part in (one.mean, one.covariance)))
-        return {name: value}, [FEW] if min(one.n for one in both.values()) <= dim else []
+            return {name: float("nan")}, [f"{name}: {' and '.join(few)} scans have no covariance; it needs two."]
+        value = frechet_distance(*(term for part in both.values() for term in (part.mean, part.covariance)))
+        return {name: value}, [FEW] if min(part.n for part in both.values()) <= dim else []
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         rows = {side: self.kept(side) for side in SIDES}
@@ -155,9 +155,9 @@ class FrechetDistance(FeatureMetric):
 
 
 def weighted_root(rows: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (D) and A, A A^T = S, of kept features of which number i counts `weights[i]` times.
+    """Weighted mean (D,) and root A, A A^T = S, of stored features.
 
-    Of fewer scans than dimensions the centred features themselves are A, (D, N), and no spectrum is needed.
+    With fewer scans than dimensions, the centred features are A, (D, N), without an eigendecomposition.
     """
     n = weights.sum()
     mean = torch.stack([weights[at] @ x for at, x in blocks(rows, BLOCK)]).sum(0) / n

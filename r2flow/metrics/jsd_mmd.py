@@ -1,4 +1,4 @@
-"""JSD and MMD of the field: bird's-eye histograms of sets and of single scans."""
+"""JSD and MMD of bird's-eye histograms, of whole sets and of single scans."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -13,14 +13,14 @@ from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
 
 SIGMA = 0.5
-BLOCK = 500  # scans: two blocks of histograms and what is made of them take 250 MB
+BLOCK = 500  # scans per block: two blocks of histograms and their kernel take 250 MB
 
 
 class JSD(SumMetric):
-    """Jensen-Shannon distance between the bird's-eye histograms of all real and of all generated scans.
+    """Jensen-Shannon distance between the bird's-eye histograms of all real and all generated scans.
 
-    sqrt((KL(p || m) + KL(q || m)) / 2), m = (p + q) / 2, natural logarithm: the square root of the divergence, as the
-    field prints it (times 100) since Zyrianov et al. (2022). 0 for equal histograms, 0.833 for disjoint ones.
+    sqrt((KL(p || m) + KL(q || m)) / 2), m = (p + q) / 2, natural logarithm: the square root of the divergence,
+    published times 100 since Zyrianov et al. (2022). 0 for equal histograms, 0.833 for disjoint ones.
     """
 
     name = "jsd"
@@ -36,7 +36,7 @@ class JSD(SumMetric):
 
 
 def histograms(scans: Scans) -> Tensor:
-    """Counts from above, (B, BINS^2), float64; NaN for a scan without a return there."""
+    """Bird's-eye histograms, (B, BINS^2), float64; NaN for a scan without returns in them."""
     counts = torch.from_numpy(scans.birds_eye).flatten(1)
     return torch.where(counts.sum(1, keepdim=True) > 0, counts, torch.nan)
 
@@ -45,11 +45,11 @@ class MMD(ScanMetric):
     """Maximum mean discrepancy between bird's-eye histograms of single scans, each normalised to a sum of 1.
 
     MMD^2 = mean k(p, p') + mean k(q, q') - 2 mean k(p, q), k(a, b) = exp(-|a - b|^2 / (2 sigma^2)), sigma = 0.5: the
-    biased estimate of Gretton et al. (2012), without a root and with each scan against itself, as the field prints it
-    (times 10^4) since Zyrianov et al. (2022). Float32 would lose its first digits: all is float64 here.
+    biased estimate of Gretton et al. (2012), without a root and including each scan against itself, published times
+    10^4 since Zyrianov et al. (2022). Computed in float64, since float32 would lose the first digits.
 
-    The histograms are kept: 40 kB a scan. Time grows with the square of the scans: 2 s on a core for 1000 against 1000,
-    2 minutes for 10,000 against 10,000.
+    Histograms are stored: 40 kB per scan. Time is quadratic in the number of scans: 2 s on one core for 1000 against
+    1000, 2 minutes for 10,000 against 10,000.
     """
 
     name = "mmd"
@@ -66,22 +66,22 @@ class MMD(ScanMetric):
         return {self.name: (real + generated - 2 * between).clamp(min=0)}
 
     def terms(self, weights: Mapping[Side, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean kernels, less 1, within the real scans, within the generated ones and between them, (R) each."""
+        """Mean kernels minus 1 within real scans, within generated scans and between both, (R,) each."""
         real, generated = ((self.kept(side), weights[side]) for side in SIDES)
         return mean_kernel(real, real), mean_kernel(generated, generated), mean_kernel(real, generated)
 
 
 class MMDUnbiased(MMD):
-    """The same without the bias of the published estimate, which is large for few scans.
+    """MMD without the bias of the published estimate, which is large for few scans.
 
-    Pairs of a scan and itself are left out of both means, Gretton et al. (2012): two sets of one distribution come to 0
-    on average, whatever their sizes, and often below. Of the published estimate of 1000 : 1000 scans of one simulator
-    nearly all is bias.
+    Both means exclude pairs of a scan with itself (Gretton et al. 2012): for two sets of one distribution the
+    expectation is 0 at any size, and values may be negative. The published estimate for 1000 against 1000 scans of the
+    same simulator is nearly all bias.
     """
 
     name = "mmd_unbiased"
     settings: ClassVar[Mapping[str, Any]] = {**MMD.settings, "estimate": "unbiased"}
-    resamples = False  # scans that are drawn twice would be pairs of equal ones, and the estimate biased
+    resamples = False  # repeated scans would form pairs of equal scans and bias the estimate
     fewest = 2
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
@@ -91,21 +91,21 @@ class MMDUnbiased(MMD):
 
 
 def mean_kernel(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
-    """Weighted mean of k(p, q) - 1 over all scans p of one set and q of another, for every draw of weights, (R).
+    """Weighted mean of k(p, q) - 1 over scans p of one set and q of another, for each draw of weights, (R,).
 
-    A set is its kept histograms and how often each counts, (R, N). The 1 drops out of MMD^2, and k differs so little
-    from it that it would cost four digits. The kernel is computed once for all draws.
+    A set consists of stored histograms and their weights, (R, N). The 1 cancels in MMD^2; including it would cost four
+    digits, since k is close to 1. The kernel is computed once for all draws.
     """
     (x_rows, x_weights), (y_rows, y_weights) = a, b
     total = torch.zeros(len(x_weights), dtype=torch.float64)
     for i, x in blocks(x_rows, BLOCK):
-        held = x.sum(0) > 0
-        p = x[:, held] / x.sum(1, keepdim=True)  # over half of the square lies beyond the mask, or is never seen
+        used = x.sum(0) > 0
+        p = x[:, used] / x.sum(1, keepdim=True)  # over half of the cells are beyond the mask or always empty
         for j, y in blocks(y_rows, BLOCK):
             if a is b and j.start < i.start:
                 continue  # k is symmetric
             q = y / y.sum(1, keepdim=True)
-            d = p.square().sum(1)[:, None] + q.square().sum(1) - 2 * p @ q[:, held].T
+            d = p.square().sum(1)[:, None] + q.square().sum(1) - 2 * p @ q[:, used].T
             kernel = torch.expm1(d.clamp_(min=0).div_(-2 * SIGMA**2))
             twice = 2 if a is b and j.start > i.start else 1
             total += twice * ((x_weights[:, i] @ kernel) * y_weights[:, j]).sum(1)

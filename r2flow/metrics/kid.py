@@ -1,4 +1,4 @@
-"""Kernel distance between features: an unbiased relative of the Frechet distance for few scans."""
+"""Kernel distance between features, unbiased for few scans unlike the Frechet distance."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -8,21 +8,21 @@ from torch import Tensor
 from r2flow.metrics.base import SIDES, blocks
 from r2flow.metrics.features import FeatureMetric
 
-BLOCK = 2000  # scans: their kernel takes 32 MB
+BLOCK = 2000  # scans per block: the kernel takes 32 MB
 
 
 class KernelDistance(FeatureMetric):
-    """Squared MMD with a cubic kernel, the KID of Binkowski et al. (2018), by its unbiased estimate.
+    """Unbiased estimate of squared MMD with a cubic kernel, the KID of Binkowski et al. (2018).
 
     MMD^2 = mean_{i != j} k(x_i, x_j) + mean_{i != j} k(y_i, y_j) - 2 mean k(x_i, y_j), k(a, b) = (a . b / D + 1)^3 on D
-    features. It expects the same value from few scans as from many, and may fall below 0 for that. The field takes the
-    mean over random subsets of 1000 scans; this is the mean over all subsets, exactly, and no draw decides.
+    features. The expectation does not depend on the number of scans; values may be negative. The usual mean over random
+    subsets of 1000 scans is replaced by the exact mean over all subsets.
     """
 
     kind = "kid"
     settings: ClassVar[Mapping[str, Any]] = {"kernel": "(a b / D + 1)^3", "estimate": "unbiased, all pairs"}
     keeping = True
-    resamples = False  # scans that are drawn twice would be pairs of equal ones, and the estimate biased
+    resamples = False  # repeated scans would form pairs of equal scans and bias the estimate
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if any(self.count(side) < 2 for side in SIDES):
@@ -32,14 +32,14 @@ class KernelDistance(FeatureMetric):
 
 
 def _mean(x: Tensor, y: Tensor) -> float:
-    """Mean of k - 1 over all pairs of two sets; of one and the same set, without pairs of a scan and itself."""
+    """Mean of k - 1 over all pairs of two sets; if x is y, without pairs of a scan with itself."""
     within = x is y
     total = sum(_sum(a, b, within and i == j) for i, a in blocks(x, BLOCK) for j, b in blocks(y, BLOCK))
     return total / (len(x) * (len(y) - within))
 
 
-def _sum(x: Tensor, y: Tensor, own: bool) -> float:
-    """Sum of k - 1 over the pairs of features (m, D) and (n, D); the 1 drops out of MMD^2 and would cost digits."""
+def _sum(x: Tensor, y: Tensor, same: bool) -> float:
+    """Sum of k - 1 over pairs of features (m, D) and (n, D); the 1 cancels in MMD^2 and would cost digits."""
     z = x @ y.T / x.shape[1]
     kernel = z * (3 + z * (3 + z))  # (z + 1)^3 - 1
-    return float(kernel.sum() - (kernel.trace() if own else 0))
+    return float(kernel.sum() - (kernel.trace() if same else 0))

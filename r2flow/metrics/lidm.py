@@ -1,8 +1,8 @@
-"""JSD and MMD as the LiDAR Diffusion Models' evaluation toolbox defines them: other quantities of the same names.
+"""JSD and MMD of the LiDAR Diffusion Models' evaluation toolbox, which differ from the usual JSD and MMD.
 
-Ran, Guizilini and Wang (2024). Returns of 1 m < r < 56 m within +-50 m; what counts is which cells of the ground plane
-hold a return, not how many. Its MMD is no maximum mean discrepancy but the minimum matching distance of Achlioptas et
-al. (2018). There 2000 samples are compared with KITTI-360's drive 0003.
+Ran, Guizilini and Wang (2024). Returns of 1 m < r < 56 m within +-50 m; each cell of the ground plane is occupied or
+not, without counts. MMD is the minimum matching distance of Achlioptas et al. (2018), not maximum mean discrepancy. The
+publication compares 2000 samples with KITTI-360's drive 0003.
 """
 
 from collections.abc import Mapping
@@ -18,12 +18,12 @@ from r2flow.metrics.birds_eye import js_distance
 from r2flow.metrics.scans import Scans
 
 NEAR, FAR, EXTENT = 1.0, 56.0, 50  # metres
-FINE, COARSE = 0.05, 0.5  # metres a cell: JSD, MMD
-BLOCK = 500  # scans: two blocks of distance maps, and of cells held, take 640 MB
+FINE, COARSE = 0.05, 0.5  # cell size in metres: JSD, MMD
+BLOCK = 500  # scans per block: two blocks of distance maps and occupied cells take 640 MB
 
 
 def occupied(points: Tensor, cell: float) -> Tensor:
-    """Cells from above that hold a return, as rising numbers (K) of the 2 EXTENT / cell a side."""
+    """Sorted indices (K,) of occupied ground-plane cells, in a grid with 2 EXTENT / cell cells per side."""
     r = points.norm(dim=1)
     inside = (r > NEAR) & (r < FAR) & (points[:, :2].abs() < EXTENT).all(1)
     side = round(2 * EXTENT / cell)
@@ -32,9 +32,9 @@ def occupied(points: Tensor, cell: float) -> Tensor:
 
 
 class JSDLiDM(ScanMetric):
-    """Jensen-Shannon distance (root, natural logarithm) between how many scans of each set hold each 5 cm cell.
+    """Jensen-Shannon distance (root, natural logarithm) between counts of scans that occupy each 5 cm cell.
 
-    Nothing of single scans is kept, of 4 million cells each: there are no intervals.
+    The 4 million cells of single scans are not stored: there are no intervals.
     """
 
     name = "jsd_lidm"
@@ -53,23 +53,23 @@ class JSDLiDM(ScanMetric):
 
     def take_in(self, scans: Scans, side: Side, first: int) -> None:
         cells: Tensor = getattr(self, f"{side}_cells")
-        found = [occupied(points, FINE) for points in scans.points]
-        for one in found:
-            cells[one.to(cells.device)] += 1
-        self.add_scans(side, len(found), sum(not len(one) for one in found))
+        indices = [occupied(points, FINE) for points in scans.points]
+        for index in indices:
+            cells[index.to(cells.device)] += 1
+        self.add_scans(side, len(indices), sum(not len(index) for index in indices))
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         real, generated = (getattr(self, f"{side}_cells").cpu().numpy() for side in SIDES)
-        known = all(self.given(side) for side in SIDES)
-        return {"jsd_lidm": js_distance(real, generated) if known else float("nan")}, []
+        complete = all(self.given(side) for side in SIDES)
+        return {"jsd_lidm": js_distance(real, generated) if complete else float("nan")}, []
 
 
 class MMDLiDM(ScanMetric):
     """Minimum matching distance: mean over real scans of the Chamfer distance to the nearest generated scan.
 
-    A scan is the set A of 0.5 m cells that hold a return, in a square of side 1. With |a - B| the distance of a cell
-    from the nearest one of B, the distance is (mean_a |a - B|^2 + mean_b |b - A|^2) / 2. The squared distance map of
-    every scan is computed once and kept; the Chamfer distances of all pairs are then two matrix products, exactly.
+    A scan is the set A of occupied 0.5 m cells, scaled to a square of side 1. With |a - B| the distance of a cell to
+    the nearest cell of B, the distance is (mean_a |a - B|^2 + mean_b |b - A|^2) / 2. The squared distance map of every
+    scan is computed once and stored; the Chamfer distances of all pairs are then two matrix products, exactly.
     """
 
     name = "mmd_lidm"
@@ -79,15 +79,15 @@ class MMDLiDM(ScanMetric):
         "cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"
     }  # fmt: skip
     keeping = True
-    resamples = False  # which scan is nearest is no smooth function of the scans
+    resamples = False  # the nearest scan is not a smooth function of the scans
 
     def rows(self, scans: Scans) -> Tensor:
         side = round(2 * EXTENT / COARSE)
         maps = torch.empty(len(scans), side * side)
-        for own, points in zip(maps, scans.points, strict=True):
-            held = np.zeros((side, side), dtype=bool)
-            held.flat[occupied(points, COARSE).cpu().numpy()] = True
-            own[:] = torch.from_numpy(squared_distance_map(held)).flatten()
+        for distances, points in zip(maps, scans.points, strict=True):
+            cells = np.zeros((side, side), dtype=bool)
+            cells.flat[occupied(points, COARSE).cpu().numpy()] = True
+            distances[:] = torch.from_numpy(squared_distance_map(cells)).flatten()
         return maps
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
@@ -108,7 +108,7 @@ def _chamfer(x: Tensor, y: Tensor) -> Tensor:
 
 
 def squared_distance_map(held: np.ndarray) -> np.ndarray:
-    """Squared distance of every cell from the nearest that is held, in cells, (H, W); NaN where none is held."""
+    """Squared distance of every cell to the nearest occupied cell, in cells, (H, W); NaN if none is occupied."""
     if not held.any():
         return np.full(held.shape, np.nan)
-    return np.rint(distance_transform_edt(~held) ** 2)  # whole numbers but for the rounding of the root
+    return np.rint(distance_transform_edt(~held) ** 2)  # integers up to rounding of the root

@@ -1,4 +1,4 @@
-"""Whether generated scans lie where real ones do, and real ones where generated ones do."""
+"""Precision, recall, density and coverage of generated scans."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -10,24 +10,24 @@ from r2flow.metrics.base import SIDES, blocks
 from r2flow.metrics.features import FeatureMetric
 
 NEIGHBOURS = 5  # k
-BLOCK = 2000  # scans: their distances take 32 MB
-TIE = 1e-9  # relative: a neighbour at exactly the radius lies inside, however its distance is rounded
+BLOCK = 2000  # scans per block: the distances take 32 MB
+TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
 NAMES = ("precision", "recall", "density", "coverage")
 
 
 class Manifold(FeatureMetric):
-    """Precision, recall, density and coverage of generated scans, in the space of a network's features.
+    """Precision, recall, density and coverage of generated scans in a network's feature space.
 
-    A set is taken for the union of balls around its scans, each with the distance to its k-th nearest neighbour in the
-    set as radius. Kynkaanniemi et al. (2019): precision is the share of generated scans in a ball of a real one, recall
-    that of real scans in a ball of a generated one. Naeem et al. (2020): density is the mean number of real balls that
-    a generated scan lies in, over k (it may exceed 1, and a single outlier cannot raise it), coverage the share of real
-    balls with a generated scan in them.
+    A set is represented by balls around its scans, with the distance to the k-th nearest neighbour in the set as
+    radius. Kynkaanniemi et al. (2019): precision is the share of generated scans inside a real ball, recall the share
+    of real scans inside a generated ball. Naeem et al. (2020): density is the mean number of real balls that contain a
+    generated scan, over k (it may exceed 1 and is robust to outliers), coverage the share of real balls that contain a
+    generated scan.
 
-    There is no bootstrap interval: balls around scans that are drawn twice have no radius, and with the balls held
-    fixed, intervals of 95 % held the mean figure in 76 to 81 of 100 cases.
+    There are no bootstrap intervals: balls around repeated scans have radius 0, and with fixed balls, 95 % intervals
+    had a coverage of 76 to 81 %.
 
-    The figures are named `precision_<network>` and so on.
+    The values are named `precision_<network>` and so on.
     """
 
     kind = "manifold"
@@ -54,12 +54,12 @@ class Manifold(FeatureMetric):
                 covered[i] |= within.any(1)
                 recalled[i] |= (d <= in_generated[j]).any(1)
         values = (balls > 0, recalled, balls / NEIGHBOURS, covered)
-        return {name: float(one.double().mean()) for name, one in zip(names, values, strict=True)}, []
+        return {name: float(value.double().mean()) for name, value in zip(names, values, strict=True)}, []
 
 
 def radii(rows: Tensor, k: int, middle: Tensor) -> Tensor:
-    """Squared distance of every row from its k-th nearest neighbour among the others, (N), about a common middle."""
-    found = []
+    """Squared distance of each row to its k-th nearest neighbour, (N,); `middle` is subtracted for accuracy."""
+    squared = []
     for i, x in blocks(rows, BLOCK):
         nearest = torch.full((len(x), k), torch.inf, dtype=torch.float64)
         for j, y in blocks(rows, BLOCK):
@@ -67,12 +67,12 @@ def radii(rows: Tensor, k: int, middle: Tensor) -> Tensor:
             if i == j:
                 d.fill_diagonal_(torch.inf)
             nearest = torch.cat([nearest, d], 1).topk(k, largest=False).values
-        found.append(nearest.amax(1))
-    return torch.cat(found)
+        squared.append(nearest.amax(1))
+    return torch.cat(squared)
 
 
 def squared_distances(x: Tensor, y: Tensor) -> Tensor:
-    """|x - y|^2 of all pairs, (N, M), from products; the rounding error between equal rows is set to 0."""
+    """|x - y|^2 of all pairs, (N, M), by matrix products; rounding errors of equal rows are set to 0."""
     size = x.square().sum(1)[:, None] + y.square().sum(1)
     d = size - 2 * x @ y.T
     return d.masked_fill_(d <= 1e-12 * size, 0)

@@ -1,7 +1,7 @@
-"""The panel: distances between two sets of scans by twelve plain statistics, which need no network.
+"""The panel: distances between two sets of scans by twelve simple statistics, without networks.
 
-Every statistic looks at more than one pixel at a time: those of single pixels cannot tell a real drive from pixels
-shuffled across the scans of another.
+Every statistic uses several pixels at a time: statistics of single pixels cannot distinguish a real drive from pixels
+shuffled across the scans of another drive.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,14 +27,14 @@ REFLECTANCES = np.linspace(0, 1.0001, 14)
 INCIDENCES = np.cos(np.linspace(np.pi / 2, 0, 11))  # cosines, in steps of 9 degrees
 DENSITIES = np.array([0.5, 1.5, 2.5, 4.5, 8.5, 16.5, 32.5, 64.5, 128.5, 256.5, np.inf])  # points
 NORMALS, COSINES = np.linspace(-1, 1, 21), np.linspace(0, 1, 21)
-APART = 128, 512  # parts of a turn between the two pixels of a pair: of ranges, of reflectances
+APART = 128, 512  # pixels of a pair are 1/128 and 1/512 turn apart: range, reflectance
 DROPS, PAIRS = 12, 16  # bins of range
 MOST_ROWS = 256
 
 
 @dataclass(frozen=True)
 class Scan:
-    """One scan: range and reflectance (H, W) of a sensor, 0 without a return, and its bird's-eye counts, (100, 100)."""
+    """Range and reflectance (H, W) of one scan, 0 without a return, and its bird's-eye histogram, (100, 100)."""
 
     r: np.ndarray
     q: np.ndarray | None
@@ -43,24 +43,24 @@ class Scan:
 
     @cached_property
     def surfaces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Upward parts of the normals, and cosines of the angle of incidence, (1, H, W) each."""
+        """z-components of the normals and cosines of the angle of incidence, (1, H, W) each."""
         return normals(self.r[None], self.sensor)
 
 
 def histogram(x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Counts of values in [a, b) for each bin, (bins,); as numpy's, but faster for few bins."""
+    """Counts of values in [a, b) per bin, (bins,); like numpy's histogram, faster for few bins."""
     place = np.searchsorted(edges[:-1], x, side="right") - 1
-    held = (place >= 0) & (x <= edges[-1])
-    return np.bincount(place[held], None if weights is None else weights[held], len(edges) - 1)
+    inside = (place >= 0) & (x <= edges[-1])
+    return np.bincount(place[inside], None if weights is None else weights[inside], len(edges) - 1)
 
 
 def gradient_azimuth(scan: Scan) -> np.ndarray:
-    """|r(h, w + 1) - r(h, w)| between neighbours that both returned, in logarithmic bins of metres."""
+    """Histogram of |r(h, w + 1) - r(h, w)| over pairs of returns, logarithmic bins in metres."""
     return _differences(np.roll(scan.r, -1, -1), scan.r)
 
 
 def gradient_elevation(scan: Scan) -> np.ndarray:
-    """|r(h + 1, w) - r(h, w)| between neighbours that both returned, in logarithmic bins of metres."""
+    """Histogram of |r(h + 1, w) - r(h, w)| over pairs of returns, logarithmic bins in metres."""
     return _differences(scan.r[1:], scan.r[:-1])
 
 
@@ -69,7 +69,7 @@ def _differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def steps_by_sector(scan: Scan) -> np.ndarray:
-    """r(h, w + 1) - r(h, w) with its sign, in 13 bins, in each of 8 sectors of azimuth, (8, 13): left is not right."""
+    """Histograms of signed r(h, w + 1) - r(h, w) per azimuth sector, (8, 13), which distinguish left and right."""
     after = np.roll(scan.r, -1, -1)
     step, both = after - scan.r, (scan.r > 0) & (after > 0)
     parts = np.array_split(np.arange(scan.r.shape[-1]), SECTORS)
@@ -77,9 +77,9 @@ def steps_by_sector(scan: Scan) -> np.ndarray:
 
 
 def run_lengths(scan: Scan) -> np.ndarray:
-    """Lengths of uninterrupted returns along the rows, weighted by length; a run may pass the ring's first column."""
+    """Histogram of lengths of runs of returns along rows, weighted by length; rows are periodic."""
     returned = (scan.r > 0).astype(np.int8)
-    begin = returned.argmin(1)[:, None]  # at a lost ray, where there is one
+    begin = returned.argmin(1)[:, None]  # at a missing ray, if any
     returned = np.take_along_axis(returned, (begin + np.arange(returned.shape[1])) % returned.shape[1], 1)
     edges = np.diff(np.pad(returned, ((0, 0), (1, 1))), axis=1)
     length = np.nonzero(edges < 0)[1] - np.nonzero(edges > 0)[1]
@@ -87,7 +87,7 @@ def run_lengths(scan: Scan) -> np.ndarray:
 
 
 def changes_row(scan: Scan) -> np.ndarray:
-    """Neighbouring pixels of each row of which only one returned, and all, (2, 256); 0 beyond the image's rows."""
+    """Per row, pairs of neighbours with exactly one return, and all pairs, (2, 256); 0 beyond the image's rows."""
     returned = scan.r > 0
     counts = np.zeros((2, MOST_ROWS))
     counts[0, : len(returned)] = (returned != np.roll(returned, -1, -1)).sum(1)
@@ -96,37 +96,37 @@ def changes_row(scan: Scan) -> np.ndarray:
 
 
 def drop_range(scan: Scan) -> np.ndarray:
-    """Rays lost, and all, in each of 12 logarithmic bins of range from 3 m on, (2, 12): nearer is mostly the own car.
+    """Missing rays and all rays per logarithmic bin of range, (2, 12), from 3 m, beyond the ego vehicle.
 
-    The range of a lost ray is the mean of its neighbours' in the row; longer gaps than 16 columns are not counted.
+    The range of a missing ray is the mean of its neighbours in the row; gaps over 16 columns are not counted.
     """
     edges = np.geomspace(3.0, scan.sensor.max_range, DROPS + 1)
     return drop_rate(bridged(scan.r, scan.r > 0), scan.r == 0, edges)
 
 
 def drop_incidence(scan: Scan) -> np.ndarray:
-    """Rays lost, and all, in each of 10 bins of the angle of incidence, (2, 10), estimated as in `drop_range`."""
+    """Missing rays and all rays per bin of the angle of incidence, (2, 10), estimated as in `drop_range`."""
     cosine = scan.surfaces[1][0]
     return drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, INCIDENCES)
 
 
 def surface_normals(scan: Scan) -> np.ndarray:
-    """Upward parts n_z of the surfaces' normals, -1 to 1, in 20 bins."""
+    """Histogram of n_z of surface normals, 20 bins from -1 to 1."""
     return histogram(scan.surfaces[0].ravel(), NORMALS)
 
 
 def incidence(scan: Scan) -> np.ndarray:
-    """Cosines of the angle at which rays meet surfaces, in 20 bins."""
+    """Histogram of cosines of the angle of incidence, 20 bins."""
     return histogram(scan.surfaces[1].ravel(), COSINES)
 
 
 def range_pairs(scan: Scan) -> np.ndarray:
-    """Ranges of pixels 2.8 degrees of azimuth apart, in 16 x 16 bins of equal logarithmic width."""
+    """Joint histogram of ranges of pixels 2.8 degrees of azimuth apart, 16 x 16 logarithmic bins."""
     return _pairs(scan.r, scan.r > 0, np.geomspace(scan.sensor.min_range, scan.sensor.max_range, PAIRS + 1), APART[0])
 
 
 def reflectance_pairs(scan: Scan) -> np.ndarray:
-    """Reflectances of pixels 0.7 degrees of azimuth apart, in 13 x 13 bins; 0 without reflectance."""
+    """Joint histogram of reflectances of pixels 0.7 degrees of azimuth apart, 13 x 13 bins; 0 without reflectance."""
     if scan.q is None:
         return np.zeros((len(REFLECTANCES) - 1) ** 2)
     return _pairs(scan.q, scan.r > 0, REFLECTANCES, APART[1])
@@ -141,29 +141,29 @@ def _pairs(x: np.ndarray, returned: np.ndarray, edges: np.ndarray, parts: int) -
 
 
 def birds_eye_density(scan: Scan) -> np.ndarray:
-    """How many others of its scan share a point's 1.6 m cell of the bird's-eye view, in 10 bins."""
+    """Histogram over points of the number of points in the same 1.6 m bird's-eye cell, 10 bins."""
     return histogram(scan.birds_eye.ravel(), DENSITIES, scan.birds_eye.ravel())
 
 
 def rate_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean |x - y| of the rates of counts (lost, all) in each bin; 0 where nothing was counted."""
+    """Mean |x - y| over bins, x and y the rates of counts (missing, all); a rate without counts is 0."""
     x, y = (lost / np.maximum(rays, 1) for lost, rays in (a.reshape(2, -1), b.reshape(2, -1)))
     return float(np.abs(x - y).mean())
 
 
 def row_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """The same over the rows that the images have."""
+    """`rate_distance` over the rows of the images."""
     rows = (a + b).reshape(2, -1)[1] > 0
     return rate_distance(a.reshape(2, -1)[:, rows], b.reshape(2, -1)[:, rows])
 
 
 def reflectance_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Jensen-Shannon distance; NaN where a set has no reflectance."""
+    """Jensen-Shannon distance; NaN if a set has no reflectance."""
     return js_distance(a, b) if a.any() and b.any() else float("nan")
 
 
 class Member(NamedTuple):
-    """A statistic of the panel: the counts of one scan, how many they are, and the distance of two sets' sums."""
+    """A statistic of the panel: counts of one scan, their number, and the distance between sums of two sets."""
 
     counts: Callable[[Scan], np.ndarray]
     size: int
@@ -188,7 +188,7 @@ ENDS = np.cumsum([member.size for member in PANEL.values()])
 
 
 def panel_rows(scans: Scans) -> Tensor:
-    """The counts of all members one after the other, of each scan, (B, D) float64."""
+    """Concatenated counts of all members per scan, (B, D) float64."""
     rows = np.zeros((len(scans), ENDS[-1]))
     for row, image, counts in zip(rows, scans.images.cpu().numpy(), scans.birds_eye, strict=True):
         scan = Scan(image[0], image[1] if scans.has_reflectance else None, scans.sensor, counts)
@@ -197,25 +197,25 @@ def panel_rows(scans: Scans) -> Tensor:
 
 
 def panel(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """The counts of a set of range images (N, 2 or 1, H, W), (D,), for `distances`."""
+    """Summed counts (D,) of a set of range images (N, 2 or 1, H, W), for `distances`."""
     batches = torch.from_numpy(np.ascontiguousarray(images)).split(32)
     return np.sum([panel_rows(Scans(batch, sensor)).sum(0).numpy() for batch in batches], axis=0)
 
 
 def distances(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
-    """The distance of each member between the counts of two sets, (D,) each; 0 is equal."""
+    """Distance per member between the counts of two sets, (D,) each; 0 if equal."""
     parts = zip(PANEL.items(), np.split(a, ENDS[:-1]), np.split(b, ENDS[:-1]), strict=True)
     return {name: member.distance(x, y) for (name, member), x, y in parts}
 
 
 def mean_distance(lines: Mapping[str, float]) -> float:
-    """The panel's mean over the members that both sets have."""
+    """Mean over members, without NaN."""
     values = list(lines.values())
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
 class Panel(SumMetric):
-    """The distance of each member of the panel, and their mean as `panel`."""
+    """Distance of each member of the panel, and their mean, `panel`."""
 
     name = "panel"
     representation = "range image"
@@ -224,7 +224,7 @@ class Panel(SumMetric):
     }  # fmt: skip
     width = int(ENDS[-1])
     uses_reflectance = True
-    resamples = False  # |a - b| of rates has a kink where the sets are nearly equal
+    resamples = False  # |a - b| of rates is not smooth for nearly equal sets
 
     def rows(self, scans: Scans) -> Tensor:
         returned = scans.returned.flatten(1).any(1).cpu()

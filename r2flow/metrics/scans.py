@@ -1,4 +1,4 @@
-"""A batch of scans as every metric sees it: checked, masked, in the representation that it asks for."""
+"""Batches of scans for metrics: checked, masked, with derived representations."""
 
 import math
 from collections.abc import Sequence
@@ -14,26 +14,26 @@ from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Convention, Sensor
 from r2flow.metrics.birds_eye import BINS, birds_eye_histogram
 
-FULL = 1 + 1e-3  # reflectance; more is another scale, not rounding
-FAR = 300.0  # metres: no scan's median range
+FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
+FAR = 300.0  # metres, above any scan's median range
 
-# Metres between which the published evaluation keeps returns, on both sides and before every metric.
+# Range limits of returns in metres, for both sets and all metrics, as in the published evaluation.
 MASK = (0.5, 63.0)
 
 
 class Scans:
-    """Range images of one sensor, masked to MASK[0] < r < MASK[1], and what is derived from them when it is asked for.
+    """Range images of one sensor, masked to MASK[0] < r < MASK[1], with lazily derived representations.
 
     Args:
-        images: Range in metres and, where known, reflectance of [0, 1], (B, 2 or 1, H, W); 0 where missing.
+        images: Range in metres and optionally reflectance in [0, 1], (B, 2 or 1, H, W); 0 where missing.
         sensor: The sensor of the images.
-        rays: Where in its bin the ray of a pixel runs, on which its point lies: as `Sensor.rays`.
-        xyz: The points of the pixels where they are known, (B, 3, H, W) in metres: then `rays` are not used.
-        names: What each scan is called in a message; its number in the batch if left out.
+        rays: Position of a pixel's ray, and so its point, in its bin: as in `Sensor.rays`.
+        xyz: Measured points of the pixels, (B, 3, H, W) in metres; `rays` is then unused.
+        names: Names of the scans in messages; default: index in the batch.
 
     Raises:
-        InputError: images of another size than the sensor's; or values that no scan has, with the name of the first
-            such scan: NaN, a range below 0 or in millimetres, a reflectance outside [0, 1].
+        InputError: image size differs from the sensor's; or invalid values, with the name of the first such scan: NaN,
+            a range below 0 or in millimetres, a reflectance outside [0, 1].
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Scans:
 
     @cached_property
     def features(self) -> dict[Any, Tensor]:
-        """Features of networks that were computed for these scans, by network."""
+        """Cached features of networks, by network."""
         return {}
 
     def __len__(self) -> int:
@@ -77,7 +77,7 @@ class Scans:
 
     @cached_property
     def xyz(self) -> Tensor:
-        """Points in metres of every pixel, (B, 3, H, W); the origin where there is no return."""
+        """Points of all pixels in metres, (B, 3, H, W); the origin without a return."""
         if self._measured is not None:
             return self._measured.to(self.images) * self.returned
         if self.rays == "reference":
@@ -86,12 +86,12 @@ class Scans:
 
     @cached_property
     def points(self) -> list[Tensor]:
-        """The returns of each scan in metres, B tensors of (N_i, 3), row after row; N_i may be 0."""
+        """Points of each scan's returns in metres, B tensors of (N_i, 3), row by row; N_i may be 0."""
         return [xyz.flatten(1).T[kept.flatten()] for xyz, kept in zip(self.xyz, self.returned, strict=True)]
 
     @cached_property
     def birds_eye(self) -> np.ndarray:
-        """Counts from above of each scan, (B, 100, 100), float64: see `birds_eye_histogram`."""
+        """Bird's-eye histogram of each scan, (B, 100, 100), float64: see `birds_eye_histogram`."""
         counts = np.zeros((len(self), BINS, BINS))
         for i, points in enumerate(self.points):
             counts[i] = birds_eye_histogram(points.cpu().numpy())
@@ -99,19 +99,19 @@ class Scans:
 
 
 def on_bin_corners(r: Tensor, sensor: Sensor) -> Tensor:
-    """Points (B, 3, H, W) on the rays through the upper left corners of the bins, of ranges (B, 1, H, W).
+    """Points (B, 3, H, W) at ranges (B, 1, H, W) on the rays through the upper left corners of the bins.
 
-    Four of these columns run along the axes, where cells of the bird's-eye view meet: the last bit of float32 decides,
-    and so it is computed here in the order of the published code, degrees first.
+    Four of these columns lie on the axes, where cells of the bird's-eye view meet and the last bit of float32 decides;
+    the computation therefore follows the order of the published code, degrees first.
     """
     degrees = np.meshgrid(sensor.row_edges[:-1], 180 - 360 * np.arange(sensor.columns) / sensor.columns, indexing="ij")
-    e, a = (torch.from_numpy(one).float().deg2rad().to(r.device) for one in degrees)
+    e, a = (torch.from_numpy(angle).float().deg2rad().to(r.device) for angle in degrees)
     return torch.cat([r * e.cos() * a.cos(), r * e.cos() * a.sin(), r * e.sin()], 1)
 
 
 def _wrong_with(image: Tensor) -> str | None:
-    """What is wrong with an image, (2 or 1, H, W), and what to do."""
-    low, high = torch.stack(image.flatten(1).aminmax(dim=1)).tolist()  # NaN where a channel has one
+    """Problem of an image, (2 or 1, H, W), with a hint; None if valid."""
+    low, high = torch.stack(image.flatten(1).aminmax(dim=1)).tolist()  # NaN if a channel contains NaN
     for name, least, most in zip(("range", "reflectance"), low, high, strict=False):
         if not math.isfinite(least) or not math.isfinite(most):
             return f"its {name} is NaN or infinite in places; 0 stands for a ray without a return"

@@ -1,4 +1,4 @@
-"""Metrics whose figures are computed from sums over the scans of a set: histograms, counts."""
+"""Metrics computed from sums over the scans of a set: histograms, counts."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -10,14 +10,14 @@ from torch import Tensor
 
 from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
 
-BLOCK = 1000  # scans at once
+BLOCK = 1000  # scans per block
 
 
 class SumMetric(ScanMetric):
-    """A metric that adds up the rows of a set's scans, in float64: sums of whole numbers are exact in any order.
+    """A metric of the sum of rows of a set, in float64; sums of integers are exact in any order.
 
     Attributes:
-        width: How many numbers a row has.
+        width: Length of a row.
     """
 
     width: ClassVar[int]
@@ -29,7 +29,7 @@ class SumMetric(ScanMetric):
 
     @abstractmethod
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
-        """Figures from the two sums of rows, (width) each; sums of zeros where a set has nothing to compare."""
+        """Compute values from the two sums of rows, (width,) each; zeros if a set has nothing to compare."""
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
         total: Tensor = getattr(self, f"{side}_sum")
@@ -47,4 +47,4 @@ class SumMetric(ScanMetric):
             parts = [weights[side][:, at] @ block for at, block in blocks(self.kept(side), BLOCK)]
             sums[side] = torch.stack(parts).sum(0).numpy()
         drawn = [self.figures_of(real, generated) for real, generated in zip(*sums.values(), strict=True)]
-        return {name: torch.tensor([one[name] for one in drawn], dtype=torch.float64) for name in drawn[0]}
+        return {name: torch.tensor([values[name] for values in drawn], dtype=torch.float64) for name in drawn[0]}

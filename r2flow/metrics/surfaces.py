@@ -1,12 +1,12 @@
-"""Surfaces in a range image: their normals, the angle of incidence, and how often a ray on them is lost."""
+"""Surfaces in range images: normals, angle of incidence, ray-drop rate."""
 
 import numpy as np
 
 from r2flow.lidar.sensors import Sensor
 
-SPAN = 2  # columns to either side over which a surface's direction is taken; over one, the noise of range hides it
-STEP = 0.15  # of the range; neighbours farther apart lie on different objects
-GAP = 16  # columns; longer gaps are sky or hidden, not lost rays
+SPAN = 2  # columns to either side for a surface's direction; range noise dominates for 1
+STEP = 0.15  # relative to range; larger differences separate objects
+GAP = 16  # columns; longer gaps are sky or occluded, not dropped rays
 
 
 def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
@@ -14,11 +14,11 @@ def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 
     Args:
         r: Ranges in metres, (N, H, W); 0 where missing.
-        sensor: Whose image it is.
+        sensor: Sensor of the images.
 
     Returns:
         n_z, the upward part, and |n . d| = cos i, i the angle of incidence, (N, H, W) float32 each; NaN where one
-        of the five pixels is missing or more than 15 % nearer or farther than the middle one.
+        of the five pixels is missing or its range differs by more than 15 % from the centre.
     """
     e, a = sensor.rays().numpy()
     d = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -35,26 +35,26 @@ def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _above_and_below(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each pixel's neighbours in the rows above and below; 0 beyond the image."""
+    """Neighbours of each pixel in the rows above and below; 0 outside the image."""
     wider = np.pad(x, [(0, 0)] * (x.ndim - 2) + [(1, 1), (0, 0)])
     return wider[..., :-2, :], wider[..., 2:, :]
 
 
 def bridged(x: np.ndarray, known: np.ndarray, gap: int = GAP) -> np.ndarray:
-    """Unknown values as the mean of the nearest known ones to their left and right; NaN in long gaps.
+    """Fill unknown values by the mean of the nearest known values to the left and right; NaN in long gaps.
 
     Args:
-        x: (..., W), a ring in W.
+        x: (..., W), periodic in W.
         known: Where x is known, (..., W), bool.
-        gap: Unknown stretches of more columns than this stay unknown.
+        gap: Maximum length of a filled gap, in columns.
     """
     width = x.shape[-1]
     gap = min(gap, width - 1)
-    turn = np.arange(-gap - 1, width + gap + 1) % width  # the ring closes
-    wide, held = x[..., turn], known[..., turn]
+    turn = np.arange(-gap - 1, width + gap + 1) % width  # periodic padding
+    wide, valid = x[..., turn], known[..., turn]
     place, nowhere = np.arange(len(turn)), 2 * len(turn)
-    before = np.maximum.accumulate(np.where(held, place, -nowhere), axis=-1)
-    after = np.minimum.accumulate(np.where(held, place, nowhere)[..., ::-1], axis=-1)[..., ::-1]
+    before = np.maximum.accumulate(np.where(valid, place, -nowhere), axis=-1)
+    after = np.minimum.accumulate(np.where(valid, place, nowhere)[..., ::-1], axis=-1)[..., ::-1]
     short = after - before - 1 <= gap
     low, high = (np.take_along_axis(wide, np.where(short, end, 0), -1) for end in (before, after))
     mean = np.where(short, (low + high) / 2, np.nan)
@@ -62,7 +62,7 @@ def bridged(x: np.ndarray, known: np.ndarray, gap: int = GAP) -> np.ndarray:
 
 
 def drop_rate(value: np.ndarray, missing: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Rays that are missing and rays at all in each bin of a value, (2, bins); unknown values (NaN) are left out."""
-    held = np.isfinite(value) & (value >= edges[0]) & (value <= edges[-1])
-    place, bins = np.searchsorted(edges[1:-1], value[held], side="right"), len(edges) - 1
-    return np.stack([np.bincount(place, weights, bins) for weights in (missing[held], None)])
+    """Counts of missing rays and of all rays per bin of a value, (2, bins); NaN values are left out."""
+    inside = np.isfinite(value) & (value >= edges[0]) & (value <= edges[-1])
+    place, bins = np.searchsorted(edges[1:-1], value[inside], side="right"), len(edges) - 1
+    return np.stack([np.bincount(place, weights, bins) for weights in (missing[inside], None)])

@@ -1,4 +1,4 @@
-"""Things in scans: straight walls, right angles, poles and cars, found by their shape in metres."""
+"""Objects in scans: straight walls, right angles, poles and cars, detected by metric shape."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,37 +15,38 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
 
-# Metres, where no other unit is named; what each is for says the docstring of `Things`.
+# Metres unless noted; see the docstring of `Things`.
 STEP, SLOPE, REACH, FOOT = 0.1, 0.1, 0.5, 0.5
-WALLS, HOLE, PIECE, STRAIGHT, FEWEST = 30.0, 1.0, 4.0, 0.05, 10.0  # the last in square metres
+WALLS, HOLE, PIECE, STRAIGHT, FEWEST = 30.0, 1.0, 4.0, 0.05, 10.0  # FEWEST in square metres
 POLES, THIN, CLEAR, LEAN, TALL = 20.0, 0.4, 1.0, 0.6, 1.0
-CARS, GAP, SEEN, LENGTH, WIDTH, TOP, FACE, CUT = 20.0, 0.7, 1.2, 5.5, 2.4, (1.0, 2.2), 0.3, 1.5  # the last in degrees
+CARS, GAP, SEEN, LENGTH, WIDTH, TOP, FACE, CUT = 20.0, 0.7, 1.2, 5.5, 2.4, (1.0, 2.2), 0.3, 1.5  # CUT in degrees
 TURNS = np.deg2rad(np.arange(0, 90, 3))
 LINES = ("straight walls", "right angles", "poles", "cars")
 
 
 class Things(SumMetric):
-    """What a person would name in a scan: four figures of each set, those of the real one as "NAME, real".
+    """Statistics of objects: four values per set; those of the real set are named "NAME, real".
 
-    All lengths are metres, distances are measured from above, and a ring is a row of the image, which closes. The
-    ground is followed outwards in each column from below the sensor: a return within 0.1 + 0.1 d of the ground's height
-    belongs to it, d being the way from the last ground, which is taken anew every 0.5. All others stand above it.
+    Lengths are in metres and distances horizontal; a ring is a row of the image, which is periodic. The ground is
+    tracked outwards in each column from below the sensor: a return within 0.1 + 0.1 d of the last ground height is
+    ground, with d the distance to the last ground return, updated every 0.5. All other returns are above the ground.
 
-    - `straight walls`: share of wall that is straight to 0.05. Returns within 30 that stand 0.5 or more above the
-      ground are joined along each ring where the next is less than 1 away. A piece begins at any of them and ends at
-      the first one 4 away. A return is wall if a piece holds it, and straight if one of these pieces is within 0.05 rms
-      (over n - 2) of its line. It counts by the width of its bin at its distance. 0 where there is no wall.
-    - `right angles`: mean over scans with 10 square metres of wall or more of |mean of exp(4 i theta)|, theta being the
-      direction of the straightest piece through each wall return, which counts as before. 1 where walls are parallel or
-      at right angles; n independent directions have about 0.9 / sqrt(n).
-    - `poles`, a scan: returns above the ground within 20, each less than 0.4 from the next along a ring and the first
-      from the last, are thin if the next return to either side is 1 farther or 1 aside. Such stretches less than 0.4
-      and two rings or fewer apart are a pole (or trunk) if together less than 0.6 across and 1 tall, edges of rings.
-    - `cars`, a scan: clusters of returns above the ground, each the next of another in its ring or column and less than
-      0.7 and a column's width from it in space. A cluster is car-like if it comes within 20, begins less than 0.5 and
-      ends 1.0 to 2.2 above the ground, 1.5 degrees or more below the image's upper edge, fills columns of 1.2 or more
-      together, and its rectangle from above is up to 5.5 by 2.4. Of 30 directions, the rectangle's is that whose two
-      sides towards the sensor are nearest to the returns; half of these are within 0.3. One visible side is enough.
+    - `straight walls`: share of wall that is straight to 0.05. Returns within 30 and at least 0.5 above the ground are
+      linked along each ring if less than 1 apart. A segment starts at any of them and ends at the first return at a
+      distance of 4. A return is wall if it lies in a segment, and straight if one of these segments has an rms (over
+      n - 2) of up to 0.05 about its line. Returns are weighted by the width of their bin. 0 without walls.
+    - `right angles`: mean of |mean of exp(4 i theta)| over scans with at least 10 square metres of wall, with theta the
+      direction of the straightest segment through each wall return, weighted as before. 1 for parallel and
+      perpendicular walls; about 0.9 / sqrt(n) for n independent directions.
+    - `poles` per scan: returns above the ground within 20, each less than 0.4 from the next along a ring, as are first
+      and last, are thin if the next return on either side is 1 farther or 1 aside. Such runs, less than 0.4 and up to
+      two rings apart, form a pole (or trunk) if less than 0.6 wide and at least 1 tall, from the edges of rings.
+    - `cars` per scan: clusters of returns above the ground, linked to the next return in ring or column if less than
+      0.7 plus a column's width apart. A cluster is car-like if its nearest return is within 20, it starts less than 0.5
+      and ends 1.0 to 2.2 above the ground, at least 1.5 degrees below the image's upper edge, its columns are at least
+      1.2 wide in total, and its bounding rectangle from above is up to 5.5 by 2.4. The rectangle's direction, of 30, is
+      that whose two sides towards the sensor are closest to the returns; half of the returns must be within 0.3. One
+      visible side is enough.
     """
 
     name = "things"
@@ -74,7 +75,7 @@ class Things(SumMetric):
 
 @dataclass(frozen=True)
 class Returns:
-    """The N returns of a scan in order of rings; `above` is NaN on the ground, `bins` are the bins' widths there."""
+    """N returns of a scan, ring by ring; `above` is NaN on the ground, `bins` are the widths of the bins."""
 
     sensor: Sensor
     p: np.ndarray
@@ -86,7 +87,7 @@ class Returns:
 
     @classmethod
     def of(cls, xyz: np.ndarray, returned: np.ndarray, sensor: Sensor) -> "Returns":
-        """From points (3, H, W) and which of them returned, (H, W)."""
+        """Build from points (3, H, W) and a mask of returns, (H, W)."""
         row, column = np.nonzero(returned)
         p = xyz[:, row, column].T.astype(np.float64)
         above, far = heights(xyz, returned, sensor.height)[row, column], np.hypot(p[:, 0], p[:, 1])
@@ -94,7 +95,7 @@ class Returns:
 
 
 def counts(s: Returns) -> tuple[float, ...]:
-    """Straight wall and wall; |mean exp(4 i theta)| and 1, or 0 and 0 in too little wall; poles; cars; 1."""
+    """Straight wall, wall; |mean exp(4 i theta)| and 1, or 0 and 0 with too little wall; poles; cars; 1."""
     at, rms, angle = walls(s)
     width = s.bins[at]
     area = (width * s.far[at] * -np.diff(np.deg2rad(s.sensor.row_edges))[s.row[at]]).sum()
@@ -103,7 +104,7 @@ def counts(s: Returns) -> tuple[float, ...]:
 
 
 def heights(xyz: np.ndarray, returned: np.ndarray, height: float) -> np.ndarray:
-    """Height of each pixel above the ground nearer in its column, (H, W); NaN for the ground and without a return."""
+    """Height of each pixel above the last ground in its column, (H, W); NaN for ground and missing returns."""
     far, z = np.hypot(xyz[0], xyz[1]), xyz[2]
     at, level = np.zeros(z.shape[1]), np.full(z.shape[1], -height)
     above = np.full(z.shape, np.nan)
@@ -111,13 +112,13 @@ def heights(xyz: np.ndarray, returned: np.ndarray, height: float) -> np.ndarray:
         way = far[h] - at
         ground = returned[h] & (np.abs(z[h] - level) <= STEP + SLOPE * np.maximum(way, 0))
         above[h] = np.where(returned[h] & ~ground, z[h] - level, np.nan)
-        taken = ground & (way >= REACH)
-        at, level = np.where(taken, far[h], at), np.where(taken, z[h], level)
+        update = ground & (way >= REACH)
+        at, level = np.where(update, far[h], at), np.where(update, z[h], level)
     return above
 
 
 def walls(s: Returns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The wall returns' places among all, and the straightest piece through each: rms across it, direction."""
+    """Indices of wall returns, and rms and direction of the straightest segment through each."""
     kept = np.flatnonzero((s.above >= FOOT) & (s.far <= WALLS))
     p, row = s.p[kept, :2], s.row[kept]
     after = _after(row)
@@ -137,22 +138,22 @@ def walls(s: Returns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     across = (xx + yy - np.hypot(xx - yy, 2 * xy)) / 2  # smaller eigenvalue of the scatter
     rms, angle = np.sqrt(np.maximum(across, 0) / (n - 2)), np.arctan2(2 * xy, xx - yy) / 2
     best, direction = np.full(len(p), np.inf), np.zeros(len(p))
-    while len(a):  # all pieces together, return by return
+    while len(a):  # walk along all segments in parallel
         better = rms < best[a]
         best[a[better]], direction[a[better]] = rms[better], angle[better]
         on = a != b
         a, b, rms, angle = after[a[on]], b[on], rms[on], angle[on]
-    found = np.isfinite(best)
-    return kept[found], best[found], direction[found]
+    wall = np.isfinite(best)
+    return kept[wall], best[wall], direction[wall]
 
 
 def poles(s: Returns) -> np.ndarray:
-    """Middles from above, (P, 2)."""
+    """Horizontal positions, (P, 2)."""
     after, stands = _after(s.row), s.above > 0
     before = np.argsort(after)
     joined = stands & stands[after] & (np.linalg.norm(s.p[after] - s.p, axis=-1) < THIN)
-    beside = (s.column[after] - s.column) % s.sensor.columns * np.minimum(s.bins, s.bins[after]) < CLEAR
-    free, free_before = ~beside | (s.far[after] > s.far + CLEAR), (~beside | (s.far > s.far[after] + CLEAR))[before]
+    adjacent = (s.column[after] - s.column) % s.sensor.columns * np.minimum(s.bins, s.bins[after]) < CLEAR
+    free, free_before = ~adjacent | (s.far[after] > s.far + CLEAR), (~adjacent | (s.far > s.far[after] + CLEAR))[before]
     first, last = np.flatnonzero(~joined[before]), np.flatnonzero(~joined)
     stretch = _components(len(s.p), np.stack([np.flatnonzero(joined), after[joined]]))
     first, last = first[np.argsort(stretch[first])], last[np.argsort(stretch[last])]
@@ -171,7 +172,7 @@ def poles(s: Returns) -> np.ndarray:
 
 
 def cars(s: Returns) -> np.ndarray:
-    """Middle from above, length and width of what is seen, and height, (C, 5)."""
+    """Horizontal centre, length and width of the visible part, and height, (C, 5)."""
     stands, down = s.above > 0, np.lexsort((s.row, s.column))
     a, b = np.append(np.arange(len(s.p)), down[:-1]), np.append(_after(s.row), down[1:])
     joined = stands[a] & stands[b] & ((s.row[a] == s.row[b]) | (s.column[a] == s.column[b]))
@@ -187,10 +188,10 @@ def cars(s: Returns) -> np.ndarray:
     sides = np.stack([x * np.cos(TURNS) + y * np.sin(TURNS), y * np.cos(TURNS) - x * np.sin(TURNS)], 1)
     low, high = _least(label, sides), -_least(label, -sides)  # (C, 2, turns)
     face = np.where(np.abs(low) < np.abs(high), low, high)  # the two sides towards the sensor
-    apart, off = np.abs(sides - face[label]).min(1), np.zeros((len(number), len(TURNS)))
-    np.add.at(off, label, apart / count[label, None])
+    distance, off = np.abs(sides - face[label]).min(1), np.zeros((len(number), len(TURNS)))
+    np.add.at(off, label, distance / count[label, None])
     turn = off.argmin(1)
-    near_face = np.bincount(label, apart[np.arange(len(at)), turn[label]] <= FACE, len(number)) >= count / 2
+    near_face = np.bincount(label, distance[np.arange(len(at)), turn[label]] <= FACE, len(number)) >= count / 2
     low, high = (np.take_along_axis(end, turn[:, None, None], 2)[..., 0] for end in (low, high))
     (width, length), (u, v) = np.sort(high - low, 1).T, (low + high).T / 2
     middle = (u + 1j * v) * np.exp(1j * TURNS[turn])
@@ -201,19 +202,19 @@ def cars(s: Returns) -> np.ndarray:
 
 
 def _after(row: np.ndarray) -> np.ndarray:
-    """The next return on the ring of each, (N,): after the last of a ring its first."""
+    """Index of the next return on the ring of each return, (N,); the last wraps to the first."""
     place = np.arange(len(row))
     last = np.append(row[1:] != row[:-1], True)[: len(row)]
     return np.where(last, np.searchsorted(row, row), place + 1)
 
 
 def _components(count: int, edges: np.ndarray) -> np.ndarray:
-    """The number of the component of each of `count` nodes, joined by edges (2, E)."""
+    """Component index of each of `count` nodes, for edges (2, E)."""
     return connected_components(coo_array((np.ones(edges.shape[1], bool), tuple(edges)), (count, count)), False)[1]
 
 
 def _least(label: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The least of the values (N, ...) of each label from 0 on, (labels, ...)."""
+    """Minimum of values (N, ...) per label 0, 1, ..., (labels, ...)."""
     least = np.full((label.max(initial=-1) + 1, *values.shape[1:]), np.inf)
     np.fmin.at(least, label, values)
     return least

@@ -1,4 +1,4 @@
-"""A two-sample test: can a classifier tell generated scans from real ones?"""
+"""Classifier two-sample test between generated and real scans."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
@@ -9,24 +9,24 @@ from torch import Tensor
 from r2flow.metrics.base import SIDES, Side
 from r2flow.metrics.features import FeatureMetric
 
-RIDGE = 1.0  # of the squared weights of standardised features
-STEPS = 25  # of Newton's method
-SAME = 1e-5  # scores so near are equal
+RIDGE = 1.0  # L2 penalty on the weights of standardised features
+STEPS = 25  # iterations of Newton's method
+SAME = 1e-5  # relative tolerance of equal scores
 
 
 class TwoSample(FeatureMetric):
     """Area under the ROC curve of a logistic regression between two sets (Lopez-Paz and Oquab 2017).
 
-    Each half of both sets, in the order of the scans, is judged by the classifier of the other half, so that
-    neighbouring scans of a drive do not stand on both sides. 0.5: it cannot tell them apart; 1: it always can. The
-    interval resamples the judged scans.
+    Each contiguous half of both sets is scored by the classifier trained on the other half, so that neighbouring scans
+    of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always distinguished. The interval resamples the
+    scored scans.
     """
 
     kind = "auc"
     names: ClassVar[Mapping[str, str]] = {"handcrafted": "auc", "handcrafted_range": "auc_range"}
     settings: ClassVar[Mapping[str, Any]] = {"classifier": "logistic regression, ridge 1", "folds": "two halves"}
     keeping = True
-    fewest = 4  # two to learn from, two to judge
+    fewest = 4  # two to train on, two to test
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         real, generated = (self.kept(side).double() for side in SIDES)
@@ -44,10 +44,10 @@ class TwoSample(FeatureMetric):
 
 
 def area(negative: Tensor, positive: Tensor, weights: Tensor, others: Tensor) -> Tensor:
-    """P(positive > negative) + P(equal) / 2 for scores, (N,) and (M,), that count (R, N) and (R, M) times: (R,)."""
-    apart = positive[None] - negative[:, None]
-    equal = apart.abs() < SAME * (1 + positive.abs())  # a scan's features differ by rounding from batch to batch
-    above = torch.where(equal, 0.5, (apart > 0).double())
+    """P(positive > negative) + P(equal) / 2, (R,), for scores (N,) and (M,) with weights (R, N) and (R, M)."""
+    difference = positive[None] - negative[:, None]
+    equal = difference.abs() < SAME * (1 + positive.abs())  # features of a scan differ by rounding between batches
+    above = torch.where(equal, 0.5, (difference > 0).double())
     return ((weights @ above) * others).sum(1) / (weights.sum(1) * others.sum(1))
 
 
@@ -56,7 +56,7 @@ def _halves(count: int) -> tuple[slice, slice]:
 
 
 def _classifier(real: Tensor, generated: Tensor) -> Callable[[Tensor], Tensor]:
-    """Scores of features, (N, D) to (N,), by a logistic regression on two sets of equal weight."""
+    """Fit a logistic regression to two sets of equal total weight; return its score function, (N, D) to (N,)."""
     x = torch.cat([real, generated])
     centre, spread = x.mean(0), x.std(0).clamp(min=1e-9)
     x = torch.cat([(x - centre) / spread, x.new_ones(len(x), 1)], 1)

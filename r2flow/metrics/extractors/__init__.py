@@ -1,4 +1,4 @@
-"""Feature networks of the metrics, by name. Importing this loads none of them, nor torch."""
+"""Registry of feature networks. Importing this module does not import networks or torch."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 class Extractors(Registry["type[Extractor]"]):
-    """Networks by name."""
+    """Registry of networks that also registers their metrics."""
 
     def add(self, name: str, entry: type[Extractor]) -> None:
-        """Enter a network of your own, and with it the metrics of its features."""
+        """Register a network and the metrics of its features."""
         from r2flow.metrics import add_network
 
         super().add(name, entry)

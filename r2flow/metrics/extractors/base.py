@@ -1,4 +1,4 @@
-"""What a feature network of the metrics is."""
+"""Base class of feature networks."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self
@@ -11,16 +11,16 @@ from r2flow.metrics.scans import Scans
 
 
 class Extractor(nn.Module):
-    """A network that gives features of scans, for inference only.
+    """A network that computes features of scans, for inference only.
 
-    A subclass defines `features`; and `trained`, unless its weights come by `r2flow weights --add`.
+    A subclass defines `features`, and `trained` unless its weights come from `r2flow weights --add`.
 
     Attributes:
         name: Name in `r2flow.metrics.extractors.EXTRACTORS`.
-        layer: Which features are taken, in words.
-        dim: How many, D.
-        needs_reflectance: Whether reflectance is one of its inputs.
-        weights: First 12 digits of the SHA-256 of its weights; "random" without trained ones.
+        layer: Description of the features.
+        dim: Number of features, D.
+        needs_reflectance: Whether reflectance is an input.
+        weights: First 12 digits of the SHA-256 of its weights; "random" without trained weights.
     """
 
     name: ClassVar[str]
@@ -30,29 +30,29 @@ class Extractor(nn.Module):
     weights: str = "random"
 
     def features(self, scans: Scans) -> Tensor:
-        """(B, D), float32; a row of NaN for a scan without a single return."""
+        """Features (B, D), float32; NaN for a scan without returns."""
         raise NotImplementedError
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
-        """The network with published weights; its sizes are those of the tensors.
+        """Build the network from published weights, with sizes from the tensors.
 
         Args:
-            tensors: By their published names.
-            config: The published archive's config; often empty.
+            tensors: Tensors by published name.
+            config: Config of the published archive; may be empty.
         """
         return cls().filled(tensors)
 
     @classmethod
     def trained(cls) -> Self:
-        """The network with the weights that are on this machine."""
+        """Load the network with the installed weights."""
         from r2flow.metrics.extractors.weights import read_kept
 
         return read_kept(cls)
 
     def filled(self, tensors: Mapping[str, Tensor]) -> Self:
-        """The network with these parameters, none missing and none left over, in evaluation mode."""
-        # A count of training steps that inference does not read; older files lack it.
+        """Load exactly these parameters and switch to evaluation mode."""
+        # num_batches_tracked is not used in inference; older files lack it.
         counts = {name: value for name, value in self.state_dict().items() if name.endswith("num_batches_tracked")}
         try:
             self.load_state_dict({**counts, **tensors})
@@ -69,6 +69,6 @@ class Extractor(nn.Module):
 
 
 def nan_where_empty(features: Tensor, scans: Scans) -> Tensor:
-    """Features (B, D) with a row of NaN for each scan without a single return."""
+    """Features (B, D) with NaN for scans without returns."""
     returned = scans.returned.flatten(1).any(1).to(features.device)
     return torch.where(returned[:, None], features, torch.nan)

@@ -1,10 +1,10 @@
-"""Hand-made features of a scan: no training and no weights, for any sensor and image size.
+"""Hand-made features of scans, without training or weights, for any sensor and image size.
 
-How neighbouring returns differ along rows and columns, where rays are lost, how ranges and reflectances spread: each
-statistic is a mean over the rays of half of the rows, so that turning the scan does not change it. Six of them are
-taken in sectors of azimuth as well, which do change: a scan that is turned or mirrored is another one.
+The statistics describe differences of neighbouring returns along rows and columns, missing rays, and distributions of
+range and reflectance. Each is a mean over half of the rows, invariant to rotation of the scan. Six are also computed
+per azimuth sector, which distinguishes rotated and mirrored scans.
 
-Statistics, bands, sectors and scale were chosen on half of the kinds of damage in docs/metrics.md.
+Statistics, bands, sectors and scale were chosen on half of the corruptions in docs/metrics.md.
 """
 
 from collections.abc import Iterator
@@ -18,18 +18,18 @@ from torch import Tensor
 from r2flow.metrics.extractors.base import Extractor, nan_where_empty
 from r2flow.metrics.scans import Scans
 
-BANDS, SECTORS = 2, 8  # of rows, of azimuth
-PIXELS = 2**16  # computed at once: what stays in a core's cache
-FINE = 0.005  # metres, or of full reflectance: much smaller steps count as this one
-SAME = 0.0025  # metres: neighbours that are equal but for the rounding of a file
-EDGE = 0.5  # metres between neighbours: another object
+BANDS, SECTORS = 2, 8  # bands of rows, sectors of azimuth
+PIXELS = 2**16  # pixels per batch, sized for a core's cache
+FINE = 0.005  # metres, or relative to full reflectance: lower limit of steps
+SAME = 0.0025  # metres: neighbours are equal up to rounding in files
+EDGE = 0.5  # metres between neighbours on different objects
 RANGES = (0, 5, 10, 20, 40, torch.inf)  # metres
 REFLECTANCES = (0, 0.1, 0.25, 0.5, torch.inf)
-FEW = 0.01  # share of the rays of a cell; a statistic of fewer is drawn to its centre
-FAR_OUT = 5.0  # scales from the centre, from where on features grow as a logarithm
+FEW = 0.01  # share of rays in a cell; statistics of fewer rays shrink to the centre
+FAR_OUT = 5.0  # distance from the centre in scales beyond which features grow logarithmically
 
 
-# A statistic is (x - centre) / spread as a feature: its mean and its deviation over simulated hdl64e scans.
+# Features are (x - centre) / spread, by mean and standard deviation over simulated hdl64e scans.
 SPREAD, BEAMS, SECTORED = ", spread", ", beams", ", sectors"
 SCALES = {
     "returns": (0.76, 0.029),
@@ -91,11 +91,11 @@ SCALES = {
 
 
 def statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tensor | None]]:
-    """Names in `SCALES`, a number for each pixel and which pixels count (1, or None for all), (B, H, W) each.
+    """Yield names in `SCALES`, values per pixel, and the mask of pixels (None: all), (B, H, W) each.
 
     Args:
         r: Ranges in metres, (B, H, W); 0 without a return.
-        q: Reflectances.
+        q: Reflectances, or None.
     """
     m = (r > 0).to(r)
     right, left, lower = _right(m), _right(m, -1), _lower(m)
@@ -150,12 +150,12 @@ def statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tenso
 
 
 def _right(x: Tensor, by: int = 1) -> Tensor:
-    """The value of the pixel to the right; the ring closes."""
+    """Value of the pixel to the right; rows are periodic."""
     return x.roll(-by, -1)
 
 
 def _lower(x: Tensor) -> Tensor:
-    """The value of the pixel below; 0 under the last row."""
+    """Value of the pixel below; 0 below the last row."""
     return F.pad(x[:, 1:], (0, 0, 0, 1))
 
 
@@ -168,15 +168,15 @@ def _size(x: Tensor) -> Tensor:
 
 
 def _agreement(a: Tensor, b: Tensor) -> Tensor:
-    """2 a b / (a^2 + b^2): 1 for equal steps, -1 for opposite ones; 0 where one is none, or both are tiny."""
+    """2 a b / (a^2 + b^2): 1 for equal steps, -1 for opposite steps, 0 if one is 0 or both are small."""
     return 2 * a * b / (a * a + b * b + FINE**2)
 
 
 class Handcrafted(Extractor):
     """Features of range and reflectance: means and spreads of `statistics` in 2 bands of rows, some in 8 sectors.
 
-    Beside its mean a statistic of `SPREADS` has its deviation within the band, and one of `BEAMS` how much the mean of
-    a row differs from that of the rows above and below, |x(h - 1) - 2 x(h) + x(h + 1)|, the mean over the band.
+    Names with `SPREAD` are standard deviations within a band; names with `BEAMS` are means over the band of differences
+    between the means of neighbouring rows, |x(h - 1) - 2 x(h) + x(h + 1)|.
     """
 
     name = "handcrafted"
@@ -187,20 +187,20 @@ class Handcrafted(Extractor):
 
     def __init__(self) -> None:
         super().__init__()
-        self.scales = {name: one for name, one in SCALES.items() if self.needs_reflectance or "reflectance" not in name}
+        self.scales = {name: s for name, s in SCALES.items() if self.needs_reflectance or "reflectance" not in name}
         cells = [SECTORS if name.endswith(SECTORED) else BANDS for name in self.scales]
         self.dim = sum(cells)
-        table = torch.tensor([one for one, n in zip(self.scales.values(), cells, strict=True) for _ in range(n)])
+        table = torch.tensor([scale for scale, n in zip(self.scales.values(), cells, strict=True) for _ in range(n)])
         self.register_buffer("table", table, persistent=False)
 
     @classmethod
     def trained(cls) -> Self:
-        """Itself: there is nothing to learn."""
+        """Build the network, which has no weights."""
         return cls()
 
     @torch.no_grad()
     def features(self, scans: Scans) -> Tensor:
-        """(B, D), float32, D = `dim`; a row of NaN for a scan without a single return."""
+        """Features (B, D), float32, D = `dim`; NaN for a scan without returns."""
         h, w = scans.sensor.shape
         parts = scans.images.split(max(PIXELS // (h * w), 1))
         return nan_where_empty(torch.cat([self._features(part) for part in parts]), scans)
@@ -208,48 +208,48 @@ class Handcrafted(Extractor):
     def _features(self, images: Tensor) -> Tensor:
         h, w = images.shape[2:]
         every = torch.ones_like(images[:, 0])
-        found: dict[str, tuple[Tensor, Tensor]] = {}
+        features: dict[str, tuple[Tensor, Tensor]] = {}
         for name, x, where in statistics(images[:, 0], images[:, 1] if self.needs_reflectance else None):
             where = every if where is None else where
-            held, in_rows, in_columns = x * where, where.sum(-1), where.sum(-2)
-            in_row = held.sum(-1)
-            found[name] = mean, share = _cells(in_row, in_rows, BANDS, w)
+            masked, in_rows, in_columns = x * where, where.sum(-1), where.sum(-2)
+            in_row = masked.sum(-1)
+            features[name] = mean, share = _cells(in_row, in_rows, BANDS, w)
             if name + SPREAD in self.scales:
-                square, _ = _cells(torch.linalg.vecdot(held, x), in_rows, BANDS, w)
-                found[name + SPREAD] = (square - mean**2).clamp(min=0).sqrt(), share
+                square, _ = _cells(torch.linalg.vecdot(masked, x), in_rows, BANDS, w)
+                features[name + SPREAD] = (square - mean**2).clamp(min=0).sqrt(), share
             if name + BEAMS in self.scales:
-                found[name + BEAMS] = _unevenness(in_row, in_rows)
+                features[name + BEAMS] = _unevenness(in_row, in_rows)
             if name + SECTORED in self.scales:
-                found[name + SECTORED] = _cells(held.sum(-2), in_columns, SECTORS, h)
-        values, shares = (torch.cat([found[name][k] for name in self.scales], 1) for k in (0, 1))
+                features[name + SECTORED] = _cells(masked.sum(-2), in_columns, SECTORS, h)
+        values, shares = (torch.cat([features[name][k] for name in self.scales], 1) for k in (0, 1))
         centre, spread = self.table.T
         x = (values - centre) / spread * (shares / (shares + FEW))
         return FAR_OUT * torch.asinh(x / FAR_OUT)
 
 
 class HandcraftedRange(Handcrafted):
-    """The same of range alone, for scans without reflectance: another distance."""
+    """Features of range only, for scans without reflectance; not comparable with `Handcrafted`."""
 
     name = "handcrafted_range"
     needs_reflectance = False
 
 
 def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> tuple[Tensor, Tensor]:
-    """Means over equal parts of rows or columns, (B, cells), and the share of their rays that counted.
+    """Means over equal parts of rows or columns, (B, cells), and the share of counted rays.
 
     Args:
-        total: Sums of each row or column, (B, n).
-        count: How many were added up, (B, n).
-        cells: Parts of n; they overlap where n is smaller or no multiple.
-        rays: The most that a row or column can count.
+        total: Sum per row or column, (B, n).
+        count: Number of summands, (B, n).
+        cells: Number of parts; they overlap unless n is a multiple.
+        rays: Maximum count of a row or column.
     """
     n = F.adaptive_avg_pool1d(count, cells)
     return F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays
 
 
 def _unevenness(total: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-    """|x(h - 1) - 2 x(h) + x(h + 1)| of the rows' means x, as `_cells`; of rows where all three have one."""
-    mean, there = total / count.clamp(min=1), (count > 0).to(total)
-    known = F.pad(there[:, 2:] * there[:, 1:-1] * there[:, :-2], (1, 1))
-    apart = F.pad((mean[:, 2:] - 2 * mean[:, 1:-1] + mean[:, :-2]).abs(), (1, 1))
-    return _cells(apart * known, known, BANDS, 1)
+    """|x(h - 1) - 2 x(h) + x(h + 1)| of row means x, as in `_cells`, over rows where all three exist."""
+    mean, valid = total / count.clamp(min=1), (count > 0).to(total)
+    defined = F.pad(valid[:, 2:] * valid[:, 1:-1] * valid[:, :-2], (1, 1))
+    difference = F.pad((mean[:, 2:] - 2 * mean[:, 1:-1] + mean[:, :-2]).abs(), (1, 1))
+    return _cells(difference * defined, defined, BANDS, 1)

@@ -1,22 +1,22 @@
-"""The voxels that the sparse networks take, and the pooling of the features that they give."""
+"""Voxelisation for sparse networks, and pooling of their features."""
 
 import torch
 from torch import Tensor
 
 VOXEL = 0.05  # metres
 SECTORS = 16
-NEAR, FAR = 4.0, 56.0  # metres, between which the edges of the distance sectors are spread evenly; the first is 0
+NEAR, FAR = 4.0, 56.0  # metres: evenly spaced edges of distance sectors, except the first, 0
 
 
 def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Voxels of 5 cm that hold a point, and the first point of each.
+    """Occupied voxels of 5 cm, and the first point of each.
 
     Args:
-        points: Points of one scan in metres, (N, 3), float32; the origin stands for no point.
+        points: Points of one scan in metres, (N, 3), float32; points at the origin are ignored.
 
     Returns:
-        Coordinates round(p / 0.05) less their minimum, (M, 3), int64, in the order of the points; and features
-        (x, y, z, -1), (M, 4), where -1 stands for the reflectance that the networks were trained without.
+        Coordinates round(p / 0.05) minus their minimum, (M, 3), int64, in the order of points; and features
+        (x, y, z, -1), (M, 4), where -1 replaces reflectance, without which the networks were trained.
     """
     points = points[points.norm(dim=1) > 0]
     if not len(points):
@@ -34,11 +34,11 @@ def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
 def mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
     """Means over 16 sectors of distance from the centroid of the voxels, the published "depth"; (16 C,), C fastest.
 
-    A voxel 56 m or farther from the centroid counts in none; a sector without voxels has the mean 0.
+    Voxels 56 m or more from the centroid are ignored; an empty sector has the mean 0.
 
     Args:
-        features: Of each voxel, (M, C).
-        coords: Their integer coordinates, (M, 3).
+        features: Features of voxels, (M, C).
+        coords: Integer coordinates of voxels, (M, 3).
     """
     edges = torch.linspace(NEAR, FAR, SECTORS + 1, device=coords.device)
     edges[0] = 0
@@ -47,7 +47,7 @@ def mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
     sector = torch.bucketize(distance, edges, right=True) - 1
     inside = sector < SECTORS
     sector = sector[inside]
-    # float64: tens of thousands of voxels in one sum.
+    # float64, for sums over tens of thousands of voxels.
     total = torch.zeros(SECTORS, features.shape[1], dtype=torch.float64, device=features.device)
     total.index_add_(0, sector, features[inside].double())
     count = torch.bincount(sector, minlength=SECTORS).clamp(min=1)

@@ -1,7 +1,7 @@
-"""Weights of the published feature networks: where they are published, and how they are added on this machine.
+"""Weights of published feature networks: sources, installation and loading.
 
-Nothing is downloaded. A file from disk is read as tensors only, checked against its network and kept as safetensors in
-the folder of weights, from which `Extractor.trained` reads it.
+r2flow does not download. It reads a file from disk as tensors only, checks it against its network and stores it as
+safetensors in the folder of weights, from which `Extractor.trained` loads it.
 """
 
 import io
@@ -32,7 +32,7 @@ BONN = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/
 R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights/"
 SPARENET = "https://github.com/microsoft/SpareNet/raw/main/Frechet/"
 
-# Where a network's file is published.
+# Published files.
 SOURCES: Registry[str] = Registry(
     "network with published weights",
     rangenet53=f"{BONN}darknet53-1024.tar.gz",
@@ -42,24 +42,24 @@ SOURCES: Registry[str] = Registry(
     spvcnn=f"{R2FLOW}spvcnn_lidm.tar.gz",
 )
 
-# Files of an archive that hold parameters, and its config.
+# Parameter files in an archive, and its config.
 PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
 CONFIG = "arch_cfg.yaml"
-LARGEST = 2**31  # bytes of a file: the largest of these networks has 0.2 GB
+LARGEST = 2**31  # maximum file size in bytes; the largest network has 0.2 GB
 
 
 def weights_folder() -> Path:
-    """The folder of weights: R2FLOW_WEIGHTS, or ~/.cache/r2flow/weights."""
+    """Folder of weights: R2FLOW_WEIGHTS, or ~/.cache/r2flow/weights."""
     return cache_folder("R2FLOW_WEIGHTS", "weights")
 
 
 def kept_file(name: str) -> Path:
-    """Where the weights of a network are kept."""
+    """File of the installed weights of a network."""
     return weights_folder() / f"{name}.safetensors"
 
 
 def kept(name: str) -> str | None:
-    """The weights of a network on this machine, in words; None without any."""
+    """Description of the installed weights of a network; None if not installed."""
     path = kept_file(name)
     if not path.exists():
         return None
@@ -71,10 +71,10 @@ def add(name: str, path: Path) -> str:
     """Copy weights from a file, or an archive or folder of several files, into the folder of weights.
 
     Returns:
-        First 12 digits of the SHA-256 of the parameters, whatever file they come from.
+        First 12 digits of the SHA-256 of the parameters, independent of the file format.
 
     Raises:
-        InputError: no network of that name, a file that cannot be read safely, or weights of another network.
+        InputError: unknown network, unsafe or unreadable file, or weights of another network.
     """
     SOURCES[name]
     tensors, config = read_published(path)
@@ -82,7 +82,7 @@ def add(name: str, path: Path) -> str:
         weights = weights_hash(EXTRACTORS[name].from_tensors(tensors, config))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    whole = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}  # some share their memory
+    whole = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}  # tensors may share memory
     notes = json.dumps({"weights": weights, "source": path.name, "config": config}, default=str)
     with atomic_write(kept_file(name)) as file:
         file.write(save(whole, metadata={"r2flow": notes}))
@@ -90,12 +90,12 @@ def add(name: str, path: Path) -> str:
 
 
 def read_kept(cls: type[E]) -> E:
-    """A network with the weights that are kept for it, in evaluation mode on the CPU."""
+    """Load a network with its installed weights, in evaluation mode on the CPU."""
     path = kept_file(cls.name)
     if not path.exists():
         raise InputError(
             f"no weights of {cls.name} in {path.parent}: get {PurePosixPath(SOURCES[cls.name]).name} and give "
-            f"r2flow weights --add {cls.name} FILE (r2flow weights says where from)."
+            f"r2flow weights --add {cls.name} FILE (r2flow weights lists sources)."
         )
     tensors, notes = read_safetensors(path)
     extractor = cls.from_tensors(tensors, notes["config"])
@@ -113,7 +113,7 @@ def weights_hash(extractor: Extractor) -> str:
 
 
 def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors by name, and the archive's config, of a file or of an archive or folder of several."""
+    """Read tensors by name, and the config, from a file, an archive or a folder."""
     if not path.is_dir():
         refuse_unreadable(path, LARGEST, "file of weights")
         if path.suffix == ".safetensors":
@@ -125,7 +125,7 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     members = _read_members(path)
     parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}") for part in PARTS if part in members]
     if not parts:
-        raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the archive as it was published.")
+        raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the published archive.")
     try:
         config = yaml.safe_load(members.get(CONFIG, b"{}"))
     except (yaml.YAMLError, ValueError, RecursionError):
@@ -136,22 +136,22 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _is_tar(path: Path) -> bool:
-    """Whether a file is a tar archive: a compressed one is nothing else."""
+    """Whether a file is a tar archive; gzip files are assumed to be."""
     with path.open("rb") as file:
         return file.read(2) == b"\x1f\x8b" or tarfile.is_tarfile(path)
 
 
 def _read_members(path: Path) -> dict[str, bytes]:
-    """The files of `PARTS` and `CONFIG` in a folder or a tar archive, by their last name."""
-    wanted = (*PARTS, CONFIG)
+    """Read the files of `PARTS` and `CONFIG` in a folder or tar archive, by file name."""
+    names = (*PARTS, CONFIG)
     if path.is_dir():
-        return {name: (path / name).read_bytes() for name in wanted if (path / name).is_file()}
+        return {name: (path / name).read_bytes() for name in names if (path / name).is_file()}
     members: dict[str, bytes] = {}
     try:
         with tarfile.open(path) as tar:
             for member in tar:
                 name = PurePosixPath(member.name).name
-                if name not in wanted or not member.isreg():
+                if name not in names or not member.isreg():
                     continue
                 if name in members or member.size > LARGEST:
                     raise InputError(f"{path} holds several networks ('{name}' twice), or a file that is too large.")
@@ -166,7 +166,7 @@ def _read_members(path: Path) -> dict[str, bytes]:
 
 
 def _read_torch(file: IO[bytes], name: str) -> dict[str, Tensor]:
-    """The tensors of one of torch's files, by name."""
+    """Read the tensors of a torch file, by name."""
     content = read_torch(file, name)
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
@@ -176,14 +176,14 @@ def _read_torch(file: IO[bytes], name: str) -> dict[str, Tensor]:
 
 
 def _is_plain(name: object, value: object) -> bool:
-    """Whether it is a name and a dense tensor of real numbers."""
+    """Whether an item is a str name with a dense real tensor."""
     if not isinstance(name, str) or not isinstance(value, Tensor) or value.layout != torch.strided:
         return False
     return not (value.is_meta or value.is_quantized or value.is_complex())
 
 
 def read_safetensors(path: Path, with_tensors: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors of a safetensors file, and the notes of `add`."""
+    """Read the tensors of a safetensors file, and the notes of `add`."""
     try:
         with safe_open(path, framework="pt") as file:
             noted = parse_json((file.metadata() or {}).get("r2flow", "{}"))
