@@ -1,4 +1,4 @@
-"""What each backbone costs: the paper's table II, measured here."""
+"""Cost of backbones: the paper's table II, measured."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,11 +23,11 @@ def backbone_costs(
 ) -> Iterator[dict[str, Any]]:
     """Parameters, GMAC and median latency in float32 of every configuration for one image of two channels.
 
-    With no `repeats` the latency is None. A configuration that cannot take the size has no figures and an `error`.
+    The latency is None without `repeats`. A configuration that does not support the size has an `error`.
     """
-    known = configurations()
-    for name in names or known:
-        options = known[name]
+    table = configurations()
+    for name in names or table:
+        options = table[name]
         row: dict[str, Any] = {"name": name, "parameters": None, "gmac": None, "latency_ms": None}
         try:
             with torch.device("cpu" if repeats > 0 else "meta"):  # counting needs no weights
@@ -57,7 +57,7 @@ def _cost_of(model: Backbone, shape: tuple[int, ...], repeats: int, device: str)
 
 
 def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T, float]:
-    """What a call returns, and its seconds, the device's work included."""
+    """Result of a call and its duration in seconds, including work on the device."""
     wait = torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda device: None
     wait(device)
     begin = time.perf_counter()
@@ -67,7 +67,7 @@ def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T,
 
 
 def print_costs(rows: Sequence[dict[str, Any]], sensor: Sensor, device: str) -> None:
-    """The rows as a table, with the counting rule."""
+    """Print the rows as a table, with the counting rule."""
     forms = {"parameters": "{:,}", "gmac": "{:.2f}", "latency_ms": "{:,.0f}"}
     cells = [row | {key: form.format(row[key]) for key, form in forms.items() if row[key] is not None} for row in rows]
     columns = {"name": "backbone", "parameters": "parameters", "gmac": "GMAC", "latency_ms": "latency, ms"}

@@ -1,4 +1,4 @@
-"""What reflow and distillation change: every generator of a chain at few and at many steps, from the same noise."""
+"""Compare the generators of a chain at few and many steps, from the same noise."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -21,7 +21,7 @@ from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import print_table, table
 from r2flow.runs.folder import read_config
 
-MANY = 32  # steps that are taken for the limit of many
+MANY = 32  # steps that approximate the limit of many
 COLUMNS = {
     "flow": "flow", "steps": "steps", "seconds": "seconds a scan", "bend": "bend",
     "mean": "distance to held-out scans",
@@ -69,7 +69,10 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     print_table(rows, COLUMNS)
     before = [row for row in rows if row["flow"] == cells[0][0]][-1]
     ends = [f"{row['flow']} in {row['steps']} ({row['mean']:.3f})" for row in (before, rows[-1])]
-    learned = {**flows[last].config, "data": first.config.get("data", {})}  # the chain's scans are its first link's
+    learned = {
+        **flows[last].config,
+        "data": first.config.get("data", {}),
+    }  # the chain's scans are those of its first run
     print(
         f"""
 pictures      {out / "chain.png"} (every generator, few and many steps), {out / "samples.png"} ({last})
@@ -86,14 +89,14 @@ Open {out / "chain.png"} first.""",
 
 
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
-    """A generator for fixed steps at these; the others at all of these and at many."""
-    fixed = {one.generator.sampler.steps for one in flows if one.generator.fixed}  # type: ignore[attr-defined]
+    """Numbers of steps to sample: a distilled generator's own; for others 1, those of distilled ones and `MANY`."""
+    fixed = {other.generator.sampler.steps for other in flows if other.generator.fixed}  # type: ignore[attr-defined]
     return [flow.generator.sampler.steps] if flow.generator.fixed else sorted({1, *fixed, MANY})  # type: ignore[attr-defined]
 
 
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
-    """The scans that a run was validated on, (N, 2 or 1, H, W) in metres and reflectance."""
-    config = read_config(run) or flow.config  # the folder's own knows where the scans have moved
+    """Validation scans of a run, (N, 2 or 1, H, W) in metres and reflectance."""
+    config = read_config(run) or flow.config  # the folder's config has the current path of the scans
     data = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **config["data"])
     _, held = data.sources()
     numbers = track(range(len(held)), "reading held-out scans", "scans")
@@ -101,7 +104,7 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 
 def bend(flow: Checkpoint, num: int) -> float:
-    """int s(t) dt over |x_1 - x_0|^2, median over scans: 0 is straight; NaN for a generator without paths."""
+    """int s(t) dt over |x_1 - x_0|^2, median over scans: 0 is straight; NaN for generators without paths."""
     followed = flow.generator
     if not isinstance(followed, Flow):
         return math.nan

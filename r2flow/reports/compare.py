@@ -1,4 +1,4 @@
-"""Runs side by side: settings, losses, straightness and cost."""
+"""Comparison of runs: settings, losses, straightness and cost."""
 
 import json
 import logging
@@ -20,7 +20,7 @@ from r2flow.runs.folder import CONFIG, read_config
 
 log = logging.getLogger(__name__)
 
-# Column -> heading: what is equal for all seeds, and what is averaged over them.
+# Column -> heading: equal for all seeds, and averaged over seeds.
 FIXED = {
     "stage": "stage", "backbone": "backbone", "parameters": "parameters", "gmac": "GMAC", "steps": "steps",
     "images": "images",
@@ -45,11 +45,11 @@ class ComparedRun(NamedTuple):
     curves: dict[str, Curve]
 
 
-Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ in their seed alone, or a single run
+Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ only in their seed, or a single run
 
 
 def find_runs(paths: Sequence[Path]) -> list[Path]:
-    """Run folders: those given, and for a folder of runs (a chain's, a sweep's, a sweep's of chains) those in it.
+    """Given run folders, and the runs in folders of runs (a chain, a sweep, a sweep of chains).
 
     Paths that are neither are skipped with a warning where there are others, as in `runs/sweep/*`.
     """
@@ -65,13 +65,13 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     if others and not found:
         raise InputError(f"{others[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
     for path in others:
-        if path.suffix not in (".yaml", ".log"):  # which lie in a sweep's folder
+        if path.suffix not in (".yaml", ".log"):  # files of a sweep's folder
             log.warning("%s holds no run and is skipped.", path)
     return list(dict.fromkeys(found))
 
 
 def labels(folders: Sequence[Path]) -> list[str]:
-    """Each folder's name, with as many parents as it takes to tell them apart."""
+    """Folder names, with as many parents as needed to be unique."""
     parts = [folder.resolve().parts for folder in folders]
     depth = 1
     while depth < max(map(len, parts), default=1) and len({p[-depth:] for p in parts}) < len(set(parts)):
@@ -80,7 +80,7 @@ def labels(folders: Sequence[Path]) -> list[str]:
 
 
 def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
-    """Every run, each backbone built once."""
+    """Read all runs; build each backbone once."""
     folders = find_runs(paths)
     costs: dict[str, dict[str, Any]] = {}
     runs = []
@@ -98,7 +98,7 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
 
 
 def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Curve]) -> dict[str, Any]:
-    """The columns of a run that its network does not decide."""
+    """Columns of a run that do not depend on its network."""
     train, validation, straightness = (curves[name][1].tolist() if name in curves else [] for name in CURVES)
     checkpoints = checkpoints_of(path)
     logged = [int(steps[-1]) for name, (steps, _) in curves.items() if name.endswith("loss")]
@@ -117,7 +117,7 @@ def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Cur
 
 
 def group_runs(runs: Sequence[ComparedRun]) -> Groups:
-    """Runs of one configuration and several seeds together, in the order given."""
+    """Group runs that differ only in their seed, in the given order."""
     groups: dict[str, list[ComparedRun]] = {}
     for run in runs:
         groups.setdefault(configuration(run.config), []).append(run)
@@ -125,9 +125,9 @@ def group_runs(runs: Sequence[ComparedRun]) -> Groups:
 
 
 def configuration(config: Mapping[str, Any]) -> str:
-    """What a run trains, whatever its seed, and what the runs did that it starts from."""
+    """Configuration of a run and its ancestors, without seeds, as text."""
     pairs = config["data"]["name"] == "pairs"
-    # Pairs carry their parent's hash, which differs between seeds.
+    # The parent's hash in pairs differs between seeds.
     ignored = {"seed", "data.pairs.parent", "scans"} if pairs else {"seed"}
     keys = [
         f"{key}={value}"
@@ -142,7 +142,7 @@ def configuration(config: Mapping[str, Any]) -> str:
 
 
 def _common_label(runs: Sequence[ComparedRun]) -> str:
-    """The common part of several runs' names, without the word seed."""
+    """Common prefix of run names, without the word seed."""
     signs = takewhile(lambda signs: len(set(signs)) == 1, zip(*(run.label for run in runs), strict=False))
     common = "".join(sign for sign, *_ in signs)
     if len(runs) > 1:
@@ -151,7 +151,7 @@ def _common_label(runs: Sequence[ComparedRun]) -> str:
 
 
 def rows_of(groups: Groups) -> list[dict[str, Any]]:
-    """A row for each group: means, with the spread and n where there are several runs."""
+    """One row per group: means, with standard deviation and n for several runs."""
     rows = []
     for label, runs in groups.items():
         row: dict[str, Any] = {"name": label, "n": len(runs)}
@@ -167,7 +167,7 @@ def rows_of(groups: Groups) -> list[dict[str, Any]]:
 
 
 def cell(row: Mapping[str, Any], column: str) -> str:
-    """A value for a reader, '0.243 ± 0.004' over several runs, '-' where there is none."""
+    """Format a value: '0.243 ± 0.004' over several runs, '-' if missing."""
     value, deviation = row.get(column), row.get(f"{column}_spread")
     if value is None:
         return "-"
@@ -176,13 +176,13 @@ def cell(row: Mapping[str, Any], column: str) -> str:
 
 
 def tables(groups: Groups) -> dict[str, tuple[list[list[str]], list[str]]]:
-    """(cells, headings) by title: what the runs are, and their results."""
+    """(cells, headings) by title: settings of the runs, and results."""
     rows = rows_of(groups)
     measured = {key: heading for key, heading in MEASURED.items() if any(row[key] is not None for row in rows)}
     parts = {"Runs": {"n": "n", **FIXED}, "Results": measured}
     return {
-        title: ([[row["name"], *(cell(row, key) for key in own)] for row in rows], ["run", *own.values()])
-        for title, own in parts.items()
+        title: ([[row["name"], *(cell(row, key) for key in columns)] for row in rows], ["run", *columns.values()])
+        for title, columns in parts.items()
     }
 
 
@@ -194,7 +194,7 @@ NOTES = (
 
 
 def compare_page(groups: Groups, command: str) -> Page:
-    """`compare.md .csv .json .png`."""
+    """Build the page `compare.md .csv .json .png`."""
     members = [(label, run) for label, runs in groups.items() for run in runs]
     seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
     written = [text for title, parts in tables(groups).items() for text in (f"## {title}", table(*parts))]

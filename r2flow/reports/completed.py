@@ -35,13 +35,13 @@ SHOWN = 4  # answers on a page
 
 @dataclass(frozen=True)
 class Job:
-    """How scans are completed.
+    """Settings of completion.
 
     Attributes:
-        num: Answers to each scan.
-        mask: Of the measured rays of each scan those that are kept; None for all.
-        fill_gaps: Whether rays without a return count as not measured.
-        pictures: How many scans get a picture and a page in 3-D.
+        num: Answers per scan.
+        mask: Measured rays to use; None: all.
+        fill_gaps: Treat rays without a return as unmeasured.
+        pictures: Number of scans with a picture and a 3-D page.
     """
 
     num: int = 1
@@ -61,16 +61,16 @@ def write_completed(
     sampler: Sampler,
     about: Mapping[str, Any],
 ) -> dict[str, np.ndarray | None]:
-    """Complete scans and write their answers, the spread between these, pictures and pages in 3-D.
+    """Complete scans and write answers, their spread, pictures and 3-D pages.
 
-    Scans whose answers are all in the folder are skipped.
+    Skips scans whose answers are all in the folder.
 
     Args:
-        about: What else decides the answers, as plain values.
+        about: Other settings that affect the answers, as plain values.
 
     Returns:
-        The scans that were completed now, by name, with their `hidden_errors` where a mask has hidden some of their
-        rays, else None.
+        The scans completed in this call, by name, with their `hidden_errors` if a mask has hidden rays, else
+        None.
     """
     digits = len(str(job.num - 1))
     numbers = [""] if job.num == 1 else [f"_{answer:0{digits}d}" for answer in range(job.num)]
@@ -97,7 +97,7 @@ def write_completed(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,
                 precision=job.precision, progress=bar.evaluated,
             )  # fmt: skip
-            if not done:  # the first answer shows that the settings can be used
+            if not done:  # the first answer shows that the settings are valid
                 store.write_manifest(inputs={**before, **inputs})
             warn_unsolved(completed.converged)
             if number < job.pictures:
@@ -111,9 +111,9 @@ def write_completed(
 
 
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
-    """Whether most unknown rays of each scan lie in sectors without a known ray; a scan without unknown rays is either.
+    """Whether most unknown rays of each scan lie in sectors without known rays; ignores scans without unknown rays.
 
-    Scans of both kinds are refused.
+    Refuses a mixture of both kinds of scans.
     """
     kinds: dict[bool, str] = {}
     for number, scan in enumerate(track(scans, "looking at", "scans")):
@@ -128,9 +128,9 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
     return True in kinds
 
 
-@lru_cache(maxsize=16)  # the scans of a small folder are read once
+@lru_cache(maxsize=16)  # read the scans of a small folder once
 def hiding(scan: PartialScan, job: Job, number: int) -> tuple[Partial, Partial]:
-    """What is known of scan `number`, and what the job's mask keeps of it, a function of (seed, number)."""
+    """Known rays of scan `number`, and those kept by the job's mask, which depends only on (seed, number)."""
     whole = scan.read()
     if job.fill_gaps:
         gaps = np.where(whole.state == Ray.EMPTY, int(Ray.UNKNOWN), whole.state)
@@ -149,7 +149,7 @@ def hiding(scan: PartialScan, job: Job, number: int) -> tuple[Partial, Partial]:
 def hidden_errors(whole: Partial, given: Partial, completed: Completed) -> np.ndarray:
     """MAE in metres where all return and share of rays wrong in ray-drop, of the answers and of interpolation, (2, 2).
 
-    They are of the rays that a mask has hidden of a scan; of several answers the mean.
+    Errors refer to rays hidden by a mask, averaged over answers.
     """
     known = given.state != Ray.UNKNOWN
     hidden = (whole.state != Ray.UNKNOWN) & ~known
@@ -160,7 +160,7 @@ def hidden_errors(whole: Partial, given: Partial, completed: Completed) -> np.nd
 
 
 def answer_ending(checkpoint: Checkpoint, scan: PartialScan) -> str:
-    """The format of a scan's answers: its own, or .ply where that is not written or needs what the model lacks."""
+    """File format of a scan's answers: the scan's, or .ply if not writable or in need of missing reflectance."""
     if scan.ending not in WRITTEN or (scan.ending == ".bin" and not checkpoint.encoding.reflectance):
         return ".ply"
     return scan.ending
@@ -184,7 +184,7 @@ def _write(
 def _draw(
     checkpoint: Checkpoint, scan: PartialScan, out: Path, given: Partial, completed: Completed, truth: Partial | None
 ) -> None:
-    """`NAME.png` with two answers, `NAME.html` with more."""
+    """Write `NAME.png` with two answers, `NAME.html` with more."""
     rays = checkpoint.sensor.rays()
     whole = [("the whole scan", truth.image)] if truth else []
     answers = [(f"answer {number}", image) for number, image in enumerate(completed.images.numpy()[:SHOWN])]

@@ -1,4 +1,4 @@
-"""Scans of which a part is hidden, completed by models and by interpolation: errors and cost."""
+"""Completion of masked scans by models and interpolation: errors and cost."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,7 +46,7 @@ class Way:
 
 
 def measured_by(task: str, sensor: Sensor, number: int) -> np.ndarray:
-    """The rays of scan `number` that a mask leaves, (H, W) bool, a function of both alone."""
+    """Rays of scan `number` that a mask keeps, (H, W) bool; depends only on both."""
     measured = parse_mask(task)(sensor.shape, noise.generator(0, "condition", number))
     if measured.all() or not measured.any():
         raise InputError(f"the task {task!r} hides {'no' if measured.all() else 'every'} ray; give another mask.")
@@ -63,7 +63,7 @@ def completion_rows(
     batch_size: int = 4,
     progress: Progress = None,
 ) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """A row for each task and method, means over scans and answers, and the first answer to the first scan.
+    """One row per task and method, means over scans and answers, and the first answer to the first scan.
 
     Args:
         truths: Range images, (2 or 1, H, W).
@@ -113,7 +113,7 @@ def _errors(
 
 
 def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The mean of each column without its NaNs; NaN for a column of NaNs."""
+    """Mean of each column without NaN; NaN if all are NaN."""
     columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
     return {key: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for key, x in columns.items()}
 
@@ -121,7 +121,7 @@ def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 def completion_page(
     rows: Sequence[Mapping[str, Any]], figure: Figure, about: str, seed: int, command: str, device: str
 ) -> Page:
-    """The page: a table for each task, and the picture."""
+    """Build the page: a table per task, and the picture."""
     text = [
         f"{about} Figures are of the hidden rays, means over scans and answers, unless their name says otherwise: "
         "`MAE, all pixels` is LiDARGen's and RangeLDM's, IoU and Chamfer are of whole scans with the measured rays "
@@ -136,7 +136,7 @@ def completion_page(
 
 
 def pictured(truth: np.ndarray, shown: Sequence[tuple[Mapping[str, Any], np.ndarray]], sensor: Sensor) -> Figure:
-    """One scan and the first task: what is measured, the answers, the truth."""
+    """Figure of one scan and the first task: measured rays, answers, truth."""
     task = shown[0][0]["task"]
     measured = measured_by(task, sensor, 0)
     answers = [(row["method"], image) for row, image in shown if row["task"] == task]

@@ -1,4 +1,4 @@
-"""What is in a checkpoint, for a reader and as JSON."""
+"""Contents of a checkpoint, as tables and JSON."""
 
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def print_contents(contents: dict[str, Any]) -> None:
-    """Print them as two short tables."""
+    """Print the contents as two short tables."""
     summary = {key: value for key, value in contents.items() if key != "config"}
     summary["image"] = " x ".join(map(str, contents["image"]))
     for name in ("encoding", "sampler", "few"):

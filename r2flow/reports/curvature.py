@@ -1,4 +1,4 @@
-"""How straight the paths of trained flows are: the paper's figure 8."""
+"""Straightness of the paths of trained flows: the paper's figure 8."""
 
 import logging
 import math
@@ -28,7 +28,7 @@ MOST_CURVED = 200  # paths drawn, as in the paper's figure 8 (b)
 
 @dataclass(frozen=True)
 class Paths:
-    """The paths of one checkpoint; an element is a pixel of range or of reflectance.
+    """Paths of one checkpoint; an element is a pixel of range or reflectance.
 
     Attributes:
         t: Times of the Euler steps, (n,).
@@ -45,7 +45,7 @@ class Paths:
 
     @property
     def s_normalised(self) -> np.ndarray:
-        """s(t) / |d|^2, (N, n); NaN where a path has no length."""
+        """s(t) / |d|^2, (N, n); NaN for paths of length 0."""
         with np.errstate(invalid="ignore"):
             return self.s / self.squared_length[:, None]
 
@@ -80,7 +80,7 @@ def measure_paths(
 
 
 def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
-    """s(t) of every checkpoint and time, the mean over the scans, as it is and over |d|^2."""
+    """s(t) per checkpoint and time, mean over scans, unnormalised and over |d|^2."""
     return [
         {"checkpoint": flow.label, "t": float(t), "s": float(s), "s_normalised": float(normalised)}
         for flow in flows
@@ -89,7 +89,7 @@ def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
 
 
 def summary(flow: Paths) -> dict[str, Any]:
-    """One checkpoint in one row."""
+    """One row per checkpoint."""
     mean = flow.s.mean(0)
     whole = mean.sum() or math.nan
     return {
@@ -110,7 +110,7 @@ COLUMNS = {
 
 
 def curvature_text(flows: Sequence[Paths]) -> list[str]:
-    """What s(t) is, and the flows in a table."""
+    """Text: definition of s(t), and the table of flows."""
     about = (
         "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 5), the mean over "
         f"{len(flows[0].s)} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight "
@@ -121,7 +121,7 @@ def curvature_text(flows: Sequence[Paths]) -> list[str]:
 
 
 def curvature_figure(flows: Sequence[Paths]) -> Figure:
-    """s(t), as it is and over |d|^2, every checkpoint a line with the range over its scans."""
+    """Plot s(t), unnormalised and over |d|^2: one line per checkpoint, with the range over scans."""
     figure = blank_figure(10, 4.2)
     panels = {"s": "s(t) = |(x_1 - x_0) - v_t|²", "s_normalised": "s(t) / |x_1 - x_0|²"}
     for axes, (name, label) in zip(figure.subplots(1, 2), panels.items(), strict=True):
@@ -138,7 +138,7 @@ def curvature_figure(flows: Sequence[Paths]) -> Figure:
 
 
 def trajectories_figure(flows: Sequence[Paths]) -> Figure:
-    """The most curved paths, a panel for each checkpoint: the paper's figure 8 (b)."""
+    """Plot the most curved paths, one panel per checkpoint: the paper's figure 8 (b)."""
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
     for axes, flow, title in zip(panels, flows, labels([Path(flow.label) for flow in flows]), strict=True):
@@ -151,7 +151,7 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
 
 
 def curvature_page(flows: Sequence[Paths], seed: int, command: str, device: str = "cpu") -> Page:
-    """The report on one checkpoint or several."""
+    """Build the report on one or several checkpoints."""
     figures = {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)}
     return Page(
         "curvature", "How straight the flows are", curvature_text(flows), curvature_rows(flows), figures, command,

@@ -1,4 +1,4 @@
-"""The figures of an evaluation in the terminal, as JSON and as a page."""
+"""Results of an evaluation in the terminal, as JSON and as a page."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,10 +17,10 @@ from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
 from r2flow.reports.tables import print_table, shown, table
 
 Kind = Literal["judged", "reference", "baseline"]
-ENDS = (" low", " high")  # of the names of an interval's ends
+ENDS = (" low", " high")  # suffixes of interval limits
 AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
 
-# Figures that the field's tables print scaled: heading and factor. The figure itself stays what it is.
+# Values that published tables print scaled: heading and factor, for printing only.
 PRINTED = {
     "jsd": ("JSD x 10^2", 1e2),
     "seconds": ("s a scan", 1.0), "mmd": ("MMD x 10^4", 1e4), "mmd_unbiased": ("MMD x 10^4, unbiased", 1e4),
@@ -29,7 +29,7 @@ PRINTED = {
 
 @dataclass(frozen=True)
 class Comparison:
-    """One set against another, as "generated" or "real halves"; the seconds include gathering the real statistics."""
+    """Results of one set against another; the seconds include gathering the real statistics."""
 
     name: str
     real: ScanSet
@@ -44,12 +44,12 @@ class Comparison:
 
 
 def heading(metric: str, figure: str) -> tuple[str, float]:
-    """The heading of a figure in a table, and the factor that it is printed with."""
+    """Heading of a value in a table, and its printed factor."""
     return PRINTED[figure] if figure in PRINTED and metric in (figure, "speed") else (figure, 1.0)
 
 
 def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
-    """A row for each figure."""
+    """One row per value."""
     return [
         {"comparison": one.name, "kind": one.kind, **row}
         for one in comparisons
@@ -73,7 +73,7 @@ def _rows_of(result: MetricResult) -> list[dict[str, Any]]:
 
 
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
-    """Print one table, its protocol before it, the remarks after it. Sets in columns have numbers: names are long."""
+    """Print the protocol, a table and remarks. Sets in columns are numbered, since names are long."""
     columns, lines = _table(comparisons)
     print(_protocol(comparisons))
     if not columns[0]:
@@ -94,10 +94,10 @@ def evaluation_page(
     nearest: Mapping[str, Nearest] | None = None,
     training: ScanSet | None = None,
 ) -> Page:
-    """The page of an evaluation: table, sets, protocols, and pictures.
+    """Build the page of an evaluation: table, sets, protocols and pictures.
 
     Args:
-        nearest: The nearest training scans of the judged sets, where they were searched; drawn with `training`.
+        nearest: Nearest training scans of the judged sets, if computed; drawn with `training`.
     """
     columns, lines = _table(comparisons)
     remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
@@ -137,7 +137,7 @@ def evaluation_page(
 
 
 def _protocol(comparisons: Sequence[Comparison]) -> str:
-    """The protocol of all figures, and the sensor that the scans are compared under."""
+    """Text of the common protocol and sensor."""
     used = comparisons[0].measured[0].protocol
     points, (top, bottom) = used["points"], used["elevations"]
     return (
@@ -147,8 +147,8 @@ def _protocol(comparisons: Sequence[Comparison]) -> str:
 
 
 def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]]]:
-    """Headings and lines, numbers as the field prints them: comparisons or figures down, whichever are more."""
-    cells: dict[str, dict[tuple[str, str], str]] = {}  # by kind and name: a judged set may be called "noise"
+    """Headings and lines, with published scaling; the longer of comparisons and values runs down."""
+    cells: dict[str, dict[tuple[str, str], str]] = {}  # by kind and name, since a judged set may be named "noise"
     for row in rows_of(comparisons):
         factor = heading(row["metric"], row["figure"])[1]
         text = "none" if math.isnan(row["value"]) else f"{row['printed']:#.4g}"
@@ -168,7 +168,7 @@ def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
-    """Each remark once, with the metrics and the comparisons that it holds for."""
+    """Distinct remarks, with their metrics and comparisons."""
     lines = []
     drawn = [m.protocol["interval"] for one in comparisons for m in one.measured if m.intervals]
     if drawn:
@@ -209,7 +209,7 @@ def _plain_comparison(one: Comparison) -> dict[str, Any]:
 
 
 def _figure(comparisons: Sequence[Comparison]) -> Figure:
-    """A plot for each metric's first figure, with a mark for each comparison."""
+    """Plot each metric's first value, one mark per comparison."""
     measured = [m for one in comparisons for m in one.measured if m.figures and m.metric != "speed"]
     first = {m.metric: next(iter(m.figures)) for m in measured}
     columns = max(min(len(first), 4), 1)
@@ -239,7 +239,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
 
 
 def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each sampled set of a JSON's `comparisons`: flow, weights, speed, METRIC/FIGURE and interval."""
+    """One row per sampled set of a JSON's `comparisons`: flow, weights, speed, METRIC/FIGURE and interval."""
     rows = []
     for one in comparisons:
         if one["kind"] != "judged" or one["generated"].get("kind") != "sampled":
@@ -255,7 +255,7 @@ def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
-    """Each metric's first figure against evaluations (above) and seconds (below), a line for each flow."""
+    """Plot each metric's first value against evaluations (top) and seconds (bottom), one line per flow."""
     first: dict[str, str] = {}
     for name in names:
         first.setdefault(name.split("/", 1)[0], name)
@@ -282,7 +282,7 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
 
 
 def copies_figure(nearest: Mapping[str, Nearest], training: ScanSet, pairs: int = 4) -> Figure:
-    """The scans of each set that are nearest to training scans; right the training scan, turned as they are."""
+    """Draw the scans of each set nearest to training scans, next to the aligned training scan."""
     chosen = [(name, one, int(i)) for name, one in nearest.items() for i in np.argsort(one.distances)[:pairs]]
     figure = blank_figure(14, 0.9 * len(chosen) + 0.2)
     figure.set_facecolor(BACKGROUND)

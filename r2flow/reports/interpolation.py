@@ -1,4 +1,4 @@
-"""From one real scan to another through the noise: the paper's figure 3, and a point cloud for every frame."""
+"""Interpolation of two real scans in noise space: the paper's figure 3, and a point cloud per frame."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,8 +27,8 @@ from r2flow.reports.tables import table
 from r2flow.reports.view import most_images
 from r2flow.reports.view.panels import Panel, write_panels
 
-MOST = 8  # frames in the figure, evenly chosen
-# In rows: the first two are of points, the others of the image.
+MOST = 8  # maximum number of frames in the figure, evenly spaced
+# Rows: the first two show points, the others images.
 PANELS = {
     "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
     "reflectance": draw_reflectance,
@@ -49,7 +49,7 @@ def interpolation(
     sampler: Sampler = TIGHT,
     command: str = "",
 ) -> Page:
-    """Write `frames` scans on the way from one scan to another as `out/frames/NNN.ply` and `.npy`.
+    """Write `frames` interpolated scans as `out/frames/NNN.ply` and `.npy`.
 
     Returns:
         The page with the figure, still to be written.

@@ -30,11 +30,11 @@ from r2flow.store import MANIFEST, FileStore, read_manifest
 log = logging.getLogger(__name__)
 
 FORMATS = ("ply", "bin", "npy")
-OWN = re.compile(r"\d{6}(\.reflectance)?\.(ply|bin|npy|png)|samples\.(png|html)")  # what samples are written to
+OWN = re.compile(r"\d{6}(\.reflectance)?\.(ply|bin|npy|png)|samples\.(png|html)")  # file names of samples
 
 
 def formats_of(checkpoint: Checkpoint, channels: str = "both") -> list[str]:
-    """The output formats that can hold the scans: a .bin needs reflectance, a point needs its range."""
+    """Output formats that suit the channels: .bin needs reflectance, points need range."""
     if channels == "reflectance":
         return ["npy"]
     return [name for name in FORMATS if name != "bin" or (channels == "both" and checkpoint.encoding.reflectance)]
@@ -54,7 +54,7 @@ def write_samples(
     replace: bool = False,
     precision: Precision = "32-true",
 ) -> None:
-    """Draw scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
+    """Sample scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
 
     Scan i of a seed is the same whatever `num` and `batch_size` are. A call that was stopped resumes.
 
@@ -96,7 +96,7 @@ def write_samples(
                     progress=bar.evaluated,
                 )  # fmt: skip
                 warn_unsolved(drawn.converged, first)
-                while stale:  # the first scan shows that the settings can be used
+                while stale:  # the first scan shows that the settings are valid
                     stale.pop().unlink()
                 store.begin()
                 for number, image in zip(numbers, drawn.images.numpy(), strict=True):
@@ -114,7 +114,7 @@ def write_samples(
 
 
 def warn_unsolved(converged: Tensor, first: int = 0) -> None:
-    """Warn of the scans that the sampler has not solved; `first` is the number of the first one."""
+    """Warn about unconverged scans; `first` is the number of the first scan."""
     lost = [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]
     if lost:
         log.warning(
@@ -125,7 +125,7 @@ def warn_unsolved(converged: Tensor, first: int = 0) -> None:
 
 
 def _stale(store: FileStore, replace: bool) -> list[Path]:
-    """The files of samples of other settings, if they are to be replaced; other files are refused."""
+    """Files of samples with other settings, if they may be replaced; refuses other files."""
     files = [file for file in store.folder.glob("*") if OWN.fullmatch(file.name)]
     note = store.folder / MANIFEST
     if replace and note.is_file() and read_manifest(store.folder, store.kind)["recipe"] != store.described:
@@ -136,10 +136,10 @@ def _stale(store: FileStore, replace: bool) -> list[Path]:
 
 
 def recipe_of(checkpoint: Checkpoint, seed: int, sampler: Sampler, **more: Any) -> dict[str, Any]:
-    """What decides samples, and how they are read: the recipe of their store."""
+    """Recipe of the store of samples: settings that affect samples, and how to read them."""
     about = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     about |= {"min_range": checkpoint.sensor.min_range, "max_range": checkpoint.sensor.max_range}
-    # Points lie on rays through the middles of the bins, whatever rays the model was told.
+    # Points lie on rays through bin centres, independent of the rays in the model.
     return {
         "reading": reading_for([], checkpoint).described(), "encoding": about, "seed": seed,
         "sampler": sampler.asdict(), "step": checkpoint.step, "weights": weights_hash(checkpoint), "rays": "centre",
@@ -148,7 +148,7 @@ def recipe_of(checkpoint: Checkpoint, seed: int, sampler: Sampler, **more: Any) 
 
 
 class ScanBar(Bar):
-    """A bar of scans that moves with the network evaluations between two scans.
+    """Progress bar of scans that also advances with network evaluations.
 
     Args:
         evaluations: Network evaluations in all, batches counted as one; 0 where an adaptive solver decides.
@@ -167,7 +167,7 @@ class ScanBar(Bar):
 
 
 def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]) -> None:
-    """One range image as `out/NAME.ENDING`: the image itself in .npy, points in all others."""
+    """Write a range image as `out/NAME.ENDING`: the image in .npy, points in other formats."""
     for path in (out / f"{name}.{ending}" for ending in endings):
         if path.suffix == ".npy":
             save_array(path, image)
@@ -176,13 +176,13 @@ def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, endings: S
 
 
 def write_cloud(path: Path, image: np.ndarray, rays: Tensor, measured: np.ndarray | None = None) -> None:
-    """The points of one range image (`image_to_points`)."""
+    """Write the points of a range image (`image_to_points`)."""
     xyz, reflectance = image_to_points(image, rays, measured)
     write_points(path, xyz, reflectance if len(image) > 1 else None)
 
 
 def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str) -> None:
-    """A picture of each image, `samples.png` of the first 8, and `samples.html` of all that fit, with a title."""
+    """Write a picture per image, `samples.png` of the first 8, and `samples.html` of all that fit."""
     from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 
     for index, image in track(list(enumerate(images)), "drawing", "pages", least=3):
@@ -194,14 +194,14 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str
 
 
 def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> None:
-    """`samples.png` of scans without a range, (1, h, w) each: their reflectance, one under the other."""
+    """Write `samples.png` of scans without range, (1, h, w) each: reflectance images in a column."""
     from r2flow.reports.pictures import dark_figure, draw_reflectance, save_figure
 
     figure = dark_figure(13, 1.2 * len(images) + 0.3)
     figure.set_layout_engine("constrained")
     axes: Any = figure.subplots(len(images), 1, squeeze=False)[:, 0]
     for row, (image, place) in enumerate(zip(images, axes, strict=True)):
-        draw_reflectance(place, np.concatenate([image, image]), label=row == 0)  # a ray without any was dropped
+        draw_reflectance(place, np.concatenate([image, image]), label=row == 0)  # rays without reflectance are dropped
     save_figure(figure, out / "samples.png")
 
 

@@ -1,4 +1,4 @@
-"""How a report writes itself: figures, a CSV, a JSON and a page of Markdown, each with where it comes from."""
+"""Writing of reports: figures, CSV, JSON and Markdown, each with its provenance."""
 
 import csv
 import io
@@ -24,7 +24,7 @@ from r2flow.files import atomic_write
 from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row
 
-# Without colour, too, lines differ by marker and dash.
+# Markers and dashes distinguish lines without colour.
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (7, 2)), (0, (1, 1)), "-", "--", "-.", ":", "-")
 _COLOURS = (
     "#000000", "#1f6fb4", "#b5301c", "#3d7d3a", "#8c4fb0", "#c77c11",
@@ -38,7 +38,7 @@ STYLES: tuple[dict[str, Any], ...] = tuple(
 
 @dataclass(frozen=True)
 class Page:
-    """What a report has to say, before it is written.
+    """Contents of a report.
 
     Attributes:
         name: Of its files, as `solvers`.
@@ -65,7 +65,7 @@ class Page:
 def write_page(page: Page, out: str | Path) -> list[Path]:
     """Write `out/NAME.png ...`, `NAME.csv`, `NAME.json` and `NAME.md`, each whole or not at all; the files in order."""
     out, origin = Path(out), provenance(page)
-    # Figures travel without their page. Latin-1 is all that the notes of a PNG hold.
+    # Figures carry their provenance; PNG notes only support Latin-1.
     note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
     written = [
         save_figure(figure, out / f"{name}.png", 100, Title=page.title, Description=note)
@@ -84,13 +84,13 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
 
 
 def write_json(page: Page, path: Path) -> None:
-    """Write the JSON of a page alone."""
+    """Write only the JSON of a page."""
     with atomic_write(path, "w") as file:
         file.write(_json(page, provenance(page)))
 
 
 def prepare_folder(out: str | Path) -> Path:
-    """Make the folder now: whether it can be written is better known before the measuring than after it."""
+    """Create the folder, to fail before measuring if it is not writable."""
     out = Path(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def prepare_folder(out: str | Path) -> Path:
 
 
 def provenance(page: Page) -> dict[str, Any]:
-    """The machine, the versions, the seeds, the date and the command of a page. No paths but the command's."""
+    """Machine, versions, seeds, date and command of a page, without paths other than the command's."""
     machine = {
         "cpu": _cpu_name(), "cores": os.cpu_count() or 1, "threads": torch.get_num_threads(),
         "system": platform.platform(terse=True),
@@ -121,8 +121,8 @@ def provenance(page: Page) -> dict[str, Any]:
 
 
 def blank_figure(width: float, height: float, title: str = "") -> Figure:
-    """A white page of inches, at least as wide as its title, its parts laid out so that nothing overlaps."""
-    width = max(width, 0.08 * len(title))  # a letter takes about 0.075 inches
+    """Create an empty figure, sized in inches, at least as wide as its title."""
+    width = max(width, 0.08 * len(title))  # a letter is about 0.075 inches wide
     figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
     if title:
         figure.suptitle(title, fontsize=11)
@@ -130,7 +130,7 @@ def blank_figure(width: float, height: float, title: str = "") -> Figure:
 
 
 def few_log_ticks(axis: Any) -> None:
-    """Plain numbers at 1, 2 and 5 of each decade: all nine would print over each other."""
+    """Label only 1, 2 and 5 of each decade, since nine labels would overlap."""
     axis.set_minor_locator(LogLocator(subs=(2, 5)))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda value, _: f"{value:g}")
@@ -139,7 +139,7 @@ def few_log_ticks(axis: Any) -> None:
 def _csv(rows: Sequence[Row], origin: Mapping[str, Any]) -> str:
     columns = list(dict.fromkeys(key for row in rows for key in row))
     text = io.StringIO()
-    # A comment for each line of origin: pandas reads such a file with comment="#".
+    # Provenance as comments: pandas reads the file with comment="#".
     text.writelines(f"# {key}: {_one_line(value)}\n" for key, value in origin.items())
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
@@ -152,7 +152,7 @@ def _json(page: Page, origin: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """For JSON, which has neither NaN nor infinity."""
+    """Convert values for JSON, which has no NaN or infinity."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Reflow pairs made with progress: how many, how fast, how long still."""
+"""Generation of reflow pairs with progress output."""
 
 import os
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ def make_and_tell(
     device: torch.device | str = "cpu",
     wait: bool = True,
 ) -> Made:
-    """`make_pairs` with a bar; with lines where several processes work."""
+    """`make_pairs` with a progress bar, or lines for several processes."""
     generator = checkpoint.generator.to(device)
     who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
     with Bar(f"{who}drawing", store.missing_pairs(), "pairs", lines=ranks > 1) as bar:
@@ -32,12 +32,12 @@ def make_and_tell(
 
 
 def place(environment: Mapping[str, str] = os.environ) -> tuple[int, int, int]:
-    """(rank, processes, rank on this machine) as torchrun or SLURM tell it, arrays included; (0, 1, 0) elsewhere."""
+    """(rank, processes, rank on this machine) from torchrun or SLURM, including arrays; else (0, 1, 0)."""
 
     def number(name: str, default: int = 0) -> int:
         return int(environment.get(name, default))
 
-    # Of a step, not of the job: in the batch script itself, outside srun, there is one process however many were asked.
+    # Variables of the step, not the job: the batch script outside srun is always one process.
     tasks = number("SLURM_STEP_NUM_TASKS", 1)
     task = number("SLURM_PROCID") if tasks > 1 else 0
     jobs = number("SLURM_ARRAY_TASK_COUNT", 1)

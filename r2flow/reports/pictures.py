@@ -26,7 +26,7 @@ RANGES = (2.0, 80.0)  # metres over which range is coloured, on a logarithmic sc
 
 
 def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.ndarray | None = None) -> Figure:
-    """One scan on a page; the semantic ids of its pixels, (H, W), are a row of their own."""
+    """Draw one scan, with an extra row for semantic ids of pixels, (H, W)."""
     figure = dark_figure(13, 8.6 if labels is None else 9.6)
     strips = len(image) + (labels is not None)
     grid = figure.add_gridspec(
@@ -49,7 +49,7 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.nda
 
 
 def contact_sheet(images: Sequence[np.ndarray], rays: Tensor, titles: Sequence[str] = ()) -> Figure:
-    """Several scans, one a row: images on the left, bird's-eye view and perspective on the right."""
+    """Draw several scans, one per row: images on the left, bird's-eye view and perspective on the right."""
     figure, grid = _sheet([2.5] * len(images), space=0.12, top=0.3)
     for row, (image, title) in enumerate(zip_longest(images, titles)):
         first, *_ = _draw_row(figure, grid, row, image, rays)
@@ -68,7 +68,7 @@ def completed_figure(
     title: str = "",
     spread: np.ndarray | None = None,
 ) -> Figure:
-    """What is known of a scan above its answers, and the spread between these.
+    """Draw the known rays of a scan, its answers and their spread.
 
     Args:
         rows: Name and image, (2 or 1, H, W), of each; the first one is what is known.
@@ -104,7 +104,7 @@ def _sheet(heights: Sequence[float], space: float, top: float) -> tuple[Figure, 
 
 
 def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tensor) -> list[Any]:
-    """One scan in a row of a sheet; the axes of its range and reflectance."""
+    """Draw one scan in a row of a sheet; return the axes of range and reflectance."""
     cells = grid[row, 0].subgridspec(len(image), 1, hspace=0.18)
     strips = [figure.add_subplot(cell) for cell in cells]
     for axes, draw in zip(strips, (draw_range, draw_reflectance), strict=False):
@@ -142,7 +142,7 @@ def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
     axes.imshow(shown, aspect="auto", interpolation="nearest")
     _strip(axes, "labels")
     x = 0.05
-    for name, colour in list(entries.items())[:14]:  # as many as the row is wide, the commonest first
+    for name, colour in list(entries.items())[:14]:  # as many as fit, most frequent first
         axes.text(x, 1.03, name, transform=axes.transAxes, color=colour, fontsize=8, va="bottom")
         x += 0.012 + 0.0052 * len(name)
 
@@ -159,7 +159,7 @@ def class_colours(labels: np.ndarray, most: int | None = None) -> dict[int, tupl
 
 
 def _numbered_colour(number: int) -> str:
-    """A colour for a number that has no name; by the golden ratio, neighbours lie far apart in hue."""
+    """Colour of an unnamed id; the golden ratio separates the hues of neighbouring ids."""
     red, green, blue = hsv_to_rgb((number * 0.618034 % 1, 0.45 + 0.4 * (number % 3 > 0), 1 - 0.25 * (number % 2)))
     return to_hex((red, green, blue))
 
@@ -193,7 +193,7 @@ def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
 
 
 def take_names_as_they_are(figure: Figure) -> None:
-    """Let texts of which a file's name is part hold any sign: a dollar begins no formula but in the labels of ticks."""
+    """Show dollar signs in file names literally: only tick labels parse formulas."""
     for text in figure.findobj(Text):
         if isinstance(text, Text) and not text.get_text().isascii():
             text.set_text(printable(text.get_text()))
@@ -202,7 +202,7 @@ def take_names_as_they_are(figure: Figure) -> None:
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: int = 110, **notes: str) -> Path:
-    """Write a PNG with notes in it, whole or not at all."""
+    """Write a PNG with notes, atomically."""
     path = Path(path)
     take_names_as_they_are(figure)
     with atomic_write(path) as file:
@@ -211,7 +211,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 110, **notes: str) 
 
 
 def figure_pixels(figure: Figure, dpi: int = 80) -> np.ndarray:
-    """The figure as (height, width, 3) uint8."""
+    """Render the figure as (height, width, 3) uint8."""
     take_names_as_they_are(figure)
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
@@ -220,7 +220,7 @@ def figure_pixels(figure: Figure, dpi: int = 80) -> np.ndarray:
 
 
 def dark_figure(width: float, height: float) -> Figure:
-    """An empty figure of inches for scans."""
+    """Create an empty figure for scans, sized in inches."""
     return Figure(figsize=(width, height), facecolor=BACKGROUND)
 
 

@@ -1,4 +1,4 @@
-"""The figures that the paper prints: its tables I and II.
+"""Values printed in the paper: tables I and II.
 
 *Fast LiDAR Data Generation with Rectified Flows* (R2Flow, ICRA 2025): KITTI-360, 10,000 generated scans of 64 x 1024
 against all real ones, Euler steps, NVIDIA RTX 6000 Ada.

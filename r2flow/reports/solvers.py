@@ -26,12 +26,12 @@ from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import Row, shown, table
 
 METHODS = (*SOLVERS, f"{TORCHDIFFEQ}dopri5")
-TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of the adaptive methods
-MOST_EVALUATIONS = 1000  # of an adaptive method for a scan; one that needs more is of no use here
-REPEATS, PATIENCE = 5, 0.5  # timed solutions of a scan; seconds after which a configuration is not timed again
-TRUST = 3.0  # an error can be measured when it is this many times the reference's own
-ROUNDING = 1e-9  # the least error that is told apart from rounding in float64
-WANTED = (0.2, 0.05, 0.01)  # RMS errors of the range, m
+TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of adaptive methods
+MOST_EVALUATIONS = 1000  # maximum per scan for adaptive methods
+REPEATS, PATIENCE = 5, 0.5  # maximum timed solutions per scan; seconds after which timing stops
+TRUST = 3.0  # minimum ratio of a measurable error to the reference's error
+ROUNDING = 1e-9  # smallest error distinguishable from rounding in float64
+WANTED = (0.2, 0.05, 0.01)  # target RMS errors of range, m
 
 
 class Configuration(NamedTuple):
@@ -45,7 +45,7 @@ class Configuration(NamedTuple):
 def configurations(
     methods: Sequence[str], budgets: Sequence[int], tolerances: Sequence[float] = TOLERANCES
 ) -> list[Configuration]:
-    """Every fixed-step method at the numbers of steps that fit the budgets, every adaptive one at the tolerances."""
+    """All fixed-step methods at numbers of steps that fit the budgets, all adaptive methods at the tolerances."""
     chosen: list[Configuration] = []
     for method in methods:
         how = method_of(method)
@@ -116,7 +116,7 @@ def checkpoint_subject(
 def measure(
     subjects: Sequence[Subject], chosen: Sequence[Configuration], progress: Progress = None
 ) -> list[dict[str, Any]]:
-    """Error, evaluations and seconds of every configuration on every subject, a row each.
+    """Measure error, evaluations and seconds of each configuration on each subject, one row each.
 
     The configurations take turns, so that whatever else the machine does slows all of them alike; the error is that of
     the first turn.
@@ -172,13 +172,13 @@ def reached(row: Row) -> float:
 
 
 def best_within(rows: Sequence[Row], budget: float) -> Row | None:
-    """The row of least error within a number of evaluations; of equals, the one of fewest."""
+    """Row of smallest error within a number of evaluations; ties: fewest evaluations."""
     within = [row for row in rows if row["evaluations"] <= budget and math.isfinite(reached(row))]
     return min(within, key=lambda row: (reached(row), row["evaluations"]), default=None)
 
 
 def cheapest(rows: Sequence[Row], metres: float) -> Row | None:
-    """The row of fewest evaluations whose range is within so many metres (RMS, the median over scans)."""
+    """Row of fewest evaluations with a range error within a limit in metres (RMS, median over scans)."""
     near = [row for row in rows if math.isfinite(reached(row)) and row["range_rms_m"] <= metres]
     return min(near, key=lambda row: (row["evaluations"], reached(row)), default=None)
 
@@ -221,7 +221,7 @@ def solvers_page(
 
 
 def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> list[str]:
-    """Which solver for which budget and which error on a trained flow."""
+    """Recommended solvers per budget and error on a trained flow."""
     by_budget = [{"budget": budget, **(best_within(rows, budget) or {"label": "none"})} for budget in sorted(budgets)]
     by_error = []
     for metres in WANTED:
@@ -240,7 +240,7 @@ def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> 
 
 
 def problems_table(groups: Mapping[str, Sequence[Row]], budgets: Sequence[int]) -> str:
-    """The most accurate solver of every exact problem within every budget."""
+    """Table of the most accurate solver per exact problem and budget."""
     lines = []
     for name, own in groups.items():
         best = [best_within(own, budget) for budget in sorted(budgets)]
@@ -278,7 +278,7 @@ def _figure(panels: Sequence[tuple[str, Sequence[Row], str, str]], columns: int)
 
 
 def _by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
-    """The rows of each value of a key."""
+    """Group rows by a key."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row[key], []).append(row)

@@ -1,4 +1,4 @@
-"""Tables, in a page's Markdown and in the terminal."""
+"""Tables in Markdown and in the terminal."""
 
 import math
 import re
@@ -18,7 +18,7 @@ NUMBER = re.compile(r"[-+]?\d|-?$|none$|inf$")  # how cells of a right-aligned c
 
 
 def table(rows: Rows, columns: Columns) -> str:
-    """Rows as a Markdown table; numbers are printed to three digits."""
+    """Format rows as a Markdown table, numbers with three digits."""
     headings, cells = _text(rows, columns)
     lines = ["| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
     lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in cells]
@@ -26,7 +26,7 @@ def table(rows: Rows, columns: Columns) -> str:
 
 
 def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
-    """Rows as a table in the terminal: numbers to the right, no cell cut short; all headings "": no line of them."""
+    """Print rows as a table: numbers right-aligned, cells not truncated, no heading line if all headings are ""."""
     headings, cells = _text(rows, columns)
     cells = [[printable(cell) for cell in line] for line in cells]
     lines = [headings, *cells] if any(headings) else cells
@@ -41,7 +41,7 @@ def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
 
 
 def shown(value: Any) -> str:
-    """A value for a reader: 0.00123, 1.2e-05, 128, '' for nothing."""
+    """Format a value: 0.00123, 1.2e-05, 128, '' for None."""
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""The end of a training: its loss curve, its samples, and its files."""
+"""Report at the end of training: loss curve, samples and files."""
 
 import csv
 import logging
@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 Curve = tuple[np.ndarray, np.ndarray]
 
-# As logged, and the titles of the panels.
+# Logged names and panel titles.
 CURVES = {
     "train/loss": "training loss", "val/loss": "validation loss", "curvature/s_normalised": "straightness, s / length²",
 }  # fmt: skip
@@ -38,9 +38,9 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
         for row in csv.DictReader(lines):
             for name in names:
                 if row.get(name):
-                    try:  # Lightning logs the number of the step that was being taken.
+                    try:  # Lightning logs the index of the current step.
                         values[name][int(row["step"]) + 1] = float(row[name])
-                    except (TypeError, ValueError):  # what a power cut leaves
+                    except (TypeError, ValueError):  # a damaged line
                         damaged += 1
         if damaged:
             log.warning("%s: left out %d values that are no numbers", path, damaged)
@@ -52,7 +52,7 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
 
 
 def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> "Figure":
-    """A panel for each of `CURVES` that was logged, a line for each run; runs of one label have one style."""
+    """Plot one panel per logged curve of `CURVES`, one line per run; runs of one label share a style."""
     from r2flow.reports.pages import STYLES, blank_figure
 
     names = [name for name in CURVES if any(name in curves for _, curves in runs)]
@@ -73,7 +73,7 @@ def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> "Figure":
 
 
 def smooth(steps: np.ndarray, values: np.ndarray) -> Curve:
-    """The running mean over a twentieth of the points, each at the middle of its steps."""
+    """Running mean over a twentieth of the points, at the centre of its steps."""
     width = max(len(values) // 20, 1)
     kernel = np.full(width, 1 / width)
     return np.convolve(steps, kernel, "valid"), np.convolve(values, kernel, "valid")

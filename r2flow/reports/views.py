@@ -1,4 +1,4 @@
-"""Scans and range images, ready to be drawn."""
+"""Scans and range images prepared for drawing."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from r2flow.lidar.scan_files import read_range_image
 
 
 class View(NamedTuple):
-    """One scan to be drawn: its path, and its number in an opened set."""
+    """One scan to draw: its path, and its index in an opened set."""
 
     path: Path
     scans: ScanSet
@@ -49,7 +49,7 @@ class View(NamedTuple):
 
 
 def scans_of(path: Path) -> list[Path]:
-    """The file itself, or the scans of a folder."""
+    """A scan file, or the scans of a folder."""
     if not path.exists():
         raise InputError(f"{path} does not exist.")
     if not path.is_dir():
@@ -77,7 +77,7 @@ def views_of(spec: str, reading: Reading, most: int) -> list[View]:
         warn_of_other_sensor(loose, reading, spec)
         return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]
     opened = open_scans(spec, reading)
-    if options.name != SIMULATED:  # which has as many as one likes
+    if options.name != SIMULATED:  # simulated sets have any size
         _say_how_many(spec, len(opened), most)
     scans = opened.spread(most)
     return [View(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
