@@ -1,4 +1,4 @@
-"""A diffusion: a network that predicts noise or data, sampled step by step or as the flow that it also is."""
+"""Diffusion models: a network that predicts noise or data, sampled by diffusion steps or as a flow."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,27 +21,27 @@ from r2flow.systems.diffusion.sampling import repaint, walk
 
 
 class Diffusion(NetworkFlow):
-    """y(z_t, lambda_t) by a backbone whose time is the log-SNR lambda, as R2DM (Nakashima and Kurazume 2024).
+    """y(z_t, lambda_t) by a backbone with the log-SNR lambda as time, as in R2DM (Nakashima and Kurazume 2024).
 
-    Its samplers are `DDPM`, `DDIM` and a flow's; `Repaint` completes scans by ancestral steps.
+    Samplers: `DDPM`, `DDIM` and those of flows; `Repaint` completes scans by ancestral steps.
 
-    As a flow it follows the diffusion's probability-flow ODE along straight lines: a line's state x_s = s x_1 +
-    (1 - s) x_0 is z_t / (alpha_t + sigma_t) at the t where alpha_t / (alpha_t + sigma_t) = s, so that
+    The flow is the diffusion's probability-flow ODE on straight lines: a line's state x_s = s x_1 + (1 - s) x_0 is
+    z_t / (alpha_t + sigma_t) at the t with alpha_t / (alpha_t + sigma_t) = s, so that
 
         v(s, x_s) = x(z_t, lambda_t) - eps(z_t, lambda_t).
 
-    Nearer to an end than the schedule goes, lambda stays at that end.
+    Beyond the ends of the schedule, lambda is constant.
 
     Args:
-        space: The images it makes.
+        space: Space of the images.
         backbone: Name and options, as in conf/backbone.
-        prediction: What y is, a name in `r2flow.systems.diffusion.objectives.PREDICTIONS`.
+        prediction: Meaning of y, a name in `r2flow.systems.diffusion.objectives.PREDICTIONS`.
         schedule: Name and options of a log-SNR schedule in `r2flow.systems.diffusion.log_snr.SCHEDULES`.
-        clip: Expected data are clamped to [-clip, clip] whenever scans are made; null leaves them as they are.
+        clip: Clamp expected data to [-clip, clip] in sampling; null: no clamping.
     """
 
     plain = "ddpm"
-    completers = MMPS(), Repaint(steps=32, grid="uniform", repeats=16)  # the latter as the published script
+    completers = MMPS(), Repaint(steps=32, grid="uniform", repeats=16)  # Repaint as in the published script
 
     def __init__(
         self,
@@ -56,8 +56,8 @@ class Diffusion(NetworkFlow):
             raise InputError("a pyramid needs the time of straight lines, and a diffusion has another: choose hdit.")
         self.prediction, self.clip, self.answer = PREDICTIONS[prediction], clip, f"{prediction}(z, log-SNR)"
         self.schedule = SCHEDULES.build(schedule or {"name": "cosine"})
-        self.run_by(DDPM(256))  # as the published scripts
-        ends = torch.tensor([1.0, 0.0], dtype=torch.float64, device="cpu")  # numbers, also under the meta device
+        self.run_by(DDPM(256))  # as in the published scripts
+        ends = torch.tensor([1.0, 0.0], dtype=torch.float64, device="cpu")  # real values, also under the meta device
         self._ends = straight_time(self.schedule(ends)).tolist()
 
     def predict(self, z: Tensor, log_snr: Tensor) -> Tensor:
@@ -66,9 +66,9 @@ class Diffusion(NetworkFlow):
         return y
 
     def denoise(self, z: Tensor, log_snr: Tensor) -> Tensor:
-        """The data that are expected behind z, clamped."""
+        """Expected data given z, clamped."""
         x, _ = self.prediction.split(z, self.predict(z, log_snr), log_snr)
-        return x if self.clip is None else x.clamp(-self.clip, self.clip) + 0 * x  # NaN of what is not finite
+        return x if self.clip is None else x.clamp(-self.clip, self.clip) + 0 * x  # keeps NaN
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         assert condition is None
@@ -89,7 +89,7 @@ class Diffusion(NetworkFlow):
         jump: int,
         progress: Call,
     ) -> Tensor:
-        """x_1 from noise z given the image where it is known, by the published RePaint at times from 0 to 1."""
+        """Sample x_1 from noise z given the known part of an image, by the published RePaint at times from 0 to 1."""
 
         def denoise(z: Tensor, log_snr: Tensor) -> Tensor:
             progress()
@@ -101,10 +101,10 @@ class Diffusion(NetworkFlow):
 
 @dataclass(frozen=True)
 class DDIM(OnGrid):
-    """Steps from log-SNR to log-SNR of the schedule (Song et al. 2021).
+    """DDIM steps along the schedule (Song et al. 2021).
 
     Attributes:
-        eta: Share of fresh noise: 0 without, 1 for ancestral steps.
+        eta: Share of fresh noise: 0: deterministic, 1: ancestral steps.
     """
 
     paired: ClassVar[bool] = False

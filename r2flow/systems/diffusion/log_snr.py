@@ -1,6 +1,6 @@
-"""Log-SNR schedules: how the noise grows with time t in [0, 1], from data at t = 0 to noise at t = 1.
+"""Log-SNR schedules as functions of t in [0, 1], from data at t = 0 to noise at t = 1.
 
-They compute in the precision of t.
+Schedules compute in the precision of t.
 """
 
 import math
@@ -14,7 +14,7 @@ from r2flow.registry import Positive, Registry
 
 LogSNR = Callable[[Tensor], Tensor]
 
-FARTHEST = 20  # |lambda| to which the tangent in float32 leaves an error of at most 0.005
+FARTHEST = 20  # largest |lambda|: up to it, the float32 tangent has an error of at most 0.005
 
 
 class Cosine:
@@ -34,7 +34,7 @@ class Cosine:
                 f"a log-SNR schedule falls from highest to lowest, both within {FARTHEST} of 0; found {highest:g} and "
                 f"{lowest:g}."
             )
-        self.start, self.end = (math.atan(math.exp(-one / 2)) for one in (highest, lowest))
+        self.start, self.end = (math.atan(math.exp(-end / 2)) for end in (highest, lowest))
 
     def __call__(self, t: Tensor) -> Tensor:
         return -2 * torch.tan(self.start + t * (self.end - self.start)).log()
@@ -53,9 +53,9 @@ class CosineInterpolated(Cosine):
 
     Args:
         image_d: Side of the images.
-        noise_d_low: Side at which images would be as noisy under the cosine schedule, towards t = 1.
+        noise_d_low: Image side with the same noise under the cosine schedule, towards t = 1.
         noise_d_high: The same towards t = 0.
-        options: Of `Cosine`, before the shift.
+        options: Options of `Cosine`, before the shift.
     """
 
     def __init__(self, image_d: Positive, noise_d_low: Positive, noise_d_high: Positive, **options: float) -> None:
@@ -74,9 +74,9 @@ class CosineShifted(CosineInterpolated):
 
 
 def square_root_linear(first: float, last: float, steps: int) -> Tensor:
-    """lambda_t at t = 0 .. steps - 1, (steps,) float64, of beta_t whose square roots rise in equal steps: LiDM's.
+    """lambda_t at t = 0 .. steps - 1, (steps,) float64, of beta_t with evenly spaced square roots, as in LiDM.
 
-    beta_t is the share of the variance that step t replaces by noise; alpha_t^2 is the product of 1 - beta.
+    beta_t is the share of variance that step t replaces by noise; alpha_t^2 is the product of 1 - beta.
     """
     beta = torch.linspace(first**0.5, last**0.5, steps, dtype=torch.float64) ** 2
     return torch.logit((1 - beta).cumprod(0))
@@ -97,13 +97,13 @@ def alpha_sigma(log_snr: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def for_images(log_snr: Tensor, z: Tensor) -> Tensor:
-    """lambda of shape () or (B,), in a shape and type that multiplies z, (B, ...)."""
+    """Reshape and cast lambda, () or (B,), to broadcast with z, (B, ...)."""
     log_snr = log_snr.to(z)
     return log_snr.reshape(-1, *(1,) * (z.ndim - 1)) if log_snr.ndim else log_snr
 
 
 def straight_time(log_snr: Tensor) -> Tensor:
-    """alpha / (alpha + sigma) = sigmoid(lambda / 2): the time at which a straight line from noise to data is as noisy.
+    """alpha / (alpha + sigma) = sigmoid(lambda / 2): the time of a straight line from noise to data with equal log-SNR.
 
     z_t = (alpha + sigma) [s x + (1 - s) eps] with this s, so a diffusion's states, rescaled, are those of a flow.
     """

@@ -1,4 +1,4 @@
-"""What a network of a diffusion predicts, and the loss by which it learns that."""
+"""Predictions of diffusion networks, and their losses."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ Coefficients = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class Prediction:
-    """A prediction y = p x + q eps, from which x and eps follow, because z = alpha x + sigma eps is known.
+    """A prediction y = p x + q eps, which with z = alpha x + sigma eps determines x and eps.
 
         x = (sigma y - q z) / d,    eps = (p z - alpha y) / d,    d = p sigma - q alpha
 
@@ -32,16 +32,16 @@ class Prediction:
         return p * x + q * eps
 
     def split(self, z: Tensor, y: Tensor, log_snr: Tensor) -> tuple[Tensor, Tensor]:
-        """x and eps, (B, ...) each, of a state and what was predicted there."""
+        """x and eps, (B, ...) each, from a state z and its prediction y."""
         alpha, sigma = alpha_sigma(for_images(log_snr, z))
         p, q = self.coefficients(alpha, sigma)
         d = p * sigma - q * alpha
         return (sigma * y - q * z) / d, (p * z - alpha * y) / d
 
     def weight(self, log_snr: Tensor, min_snr: float | None = 5.0) -> Tensor:
-        """min(SNR, gamma) over the squared factor between the errors of y and x, in the shape of log_snr.
+        """min(SNR, gamma) over the squared ratio of the errors of y and x, in the shape of log_snr.
 
-        The loss of y is then min(SNR, gamma) times that of x, whatever y is (Hang et al. 2023, "Efficient diffusion
+        The loss of y is then min(SNR, gamma) times that of x for any prediction (Hang et al. 2023, "Efficient diffusion
         training via min-SNR weighting strategy").
 
         Args:
@@ -61,7 +61,7 @@ PREDICTIONS: Registry[Prediction] = Registry(
     x=Prediction(lambda alpha, sigma: (torch.ones_like(alpha), torch.zeros_like(alpha))),
 )
 
-Error = Callable[[Tensor, Tensor], Tensor]  # of each element
+Error = Callable[[Tensor, Tensor], Tensor]  # per element
 
 ERRORS: Registry[Error] = Registry(
     "error of an element",
@@ -72,17 +72,17 @@ ERRORS: Registry[Error] = Registry(
 
 
 def mean_errors(errors: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The mean of each sample's elements, (B, ...) to (B,), of those where a mask of 0 and 1 is 1; 0 if none is."""
+    """Mean over each sample's elements, (B, ...) to (B,), optionally where a 0/1 mask is 1; 0 for an empty mask."""
     if mask is None:
         return errors.flatten(1).mean(1)
     return (errors * mask).flatten(1).sum(1) / mask.expand_as(errors).flatten(1).sum(1).clamp(min=1)
 
 
 def weighted_mean(errors: Tensor, weights: Tensor, paired: bool = True) -> Tensor:
-    """The mean of weight times error, (B,) each.
+    """Mean of weights times errors, (B,) each.
 
     Args:
-        paired: False for the mean of the errors times the mean of the weights, as the published code of R2DM has it: a
-            sample's weight is then that of the whole batch, and of its own only where B = 1.
+        paired: False: mean of errors times mean of weights, as in the published code of R2DM, which weights samples
+            by the mean over the batch.
     """
     return (errors * weights).mean() if paired else errors.mean() * weights.mean()

@@ -10,8 +10,8 @@ from r2flow.model.published import published_config as flow_config
 
 RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
 PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}
-NETWORK = "model."  # of the network's weights in the file; what lies beside it is empty
-MIN_RANGE, MAX_RANGE = 1.45, 80.0  # metres; the published code has them as class attributes and does not save them
+NETWORK = "model."  # prefix of the network's weights in the file; other entries are empty
+MIN_RANGE, MAX_RANGE = 1.45, 80.0  # metres; class attributes in the published code, not saved
 
 
 def holds(content: Any) -> bool:
@@ -19,7 +19,7 @@ def holds(content: Any) -> bool:
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
-    """A published diffusion, sampled by 256 ancestral steps, as its scripts do."""
+    """Load a published diffusion, sampled by 256 ancestral steps as in its scripts."""
     config = published_config(content["cfg"], path)
     state = content["ema_weights" if averaged else "weights"]
     weights = {
@@ -30,7 +30,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Our config of a published checkpoint's `cfg`, which holds data, model, diffusion and training."""
+    """Convert a published checkpoint's `cfg` (data, model, diffusion, training) to our config."""
     data, diffusion = cfg["data"], cfg["diffusion"]
     if diffusion["timestep_type"] != "continuous":
         raise InputError(f"{path}: its diffusion is of discrete steps; only those of continuous time are read.")

@@ -1,6 +1,6 @@
-"""From noise to data step by step: ancestral steps (DDPM), DDIM and everything between, and RePaint.
+"""Sampling of diffusions: ancestral steps (DDPM), DDIM and interpolations of both, and RePaint.
 
-Noise comes in as a tensor or a function, so that a sampler is a function of it.
+Noise is passed as a tensor or function, so that samplers are deterministic functions of noise.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ from torch import Tensor
 from r2flow.samplers.base import Noise
 from r2flow.systems.diffusion.log_snr import alpha_sigma, for_images
 
-Denoise = Callable[[Tensor, Tensor], Tensor]  # the data expected behind (z, log-SNR), the latter of shape ()
+Denoise = Callable[[Tensor, Tensor], Tensor]  # expected data given (z, log-SNR), the latter of shape ()
 
 
 def noised(x: Tensor, log_snr: Tensor, eps: Tensor) -> Tensor:
@@ -22,38 +22,38 @@ def noised(x: Tensor, log_snr: Tensor, eps: Tensor) -> Tensor:
 
 
 def step(z: Tensor, x: Tensor, log_snr: Tensor, next_log_snr: Tensor, eta: float, noise: Tensor | None) -> Tensor:
-    """z_s from z_t and the data x that is expected behind it, s < t:
+    """z_s from z_t and expected data x, s < t:
 
         z_s = alpha_s x + sigma_s [sqrt(1 - eta^2 c) eps + eta sqrt(c) noise]
 
     with eps = (z_t - alpha_t x) / sigma_t and c = 1 - e^(lambda_t - lambda_s), the share of new noise. eta = 1 is
     DDPM's ancestral step, eta = 0 is DDIM (Song et al. 2021, "Denoising diffusion implicit models", eq. 12 and 16).
-    Written by log-SNRs lambda, () or (B,), it loses no digits where alpha is near 1. Without noise eta must be 0.
+    In log-SNRs lambda, () or (B,), no digits are lost for alpha near 1. Without noise eta must be 0.
     """
-    here, there = for_images(log_snr, z), for_images(next_log_snr, z)
-    (alpha, sigma), (next_alpha, next_sigma) = alpha_sigma(here), alpha_sigma(there)
-    c = -torch.expm1(here - there)
+    lambda_t, lambda_s = for_images(log_snr, z), for_images(next_log_snr, z)
+    (alpha, sigma), (next_alpha, next_sigma) = alpha_sigma(lambda_t), alpha_sigma(lambda_s)
+    c = -torch.expm1(lambda_t - lambda_s)
     z_s = next_alpha * x + next_sigma * (1 - eta**2 * c).sqrt() * ((z - alpha * x) / sigma)
     return z_s if noise is None else z_s + next_sigma * eta * c.sqrt() * noise
 
 
 def forward_step(z: Tensor, log_snr: Tensor, next_log_snr: Tensor, noise: Tensor) -> Tensor:
     """z_t from z_s, s < t: (alpha_t / alpha_s) z_s + sigma_t sqrt(1 - e^(lambda_t - lambda_s)) noise."""
-    here, there = for_images(log_snr, z), for_images(next_log_snr, z)
-    (alpha, _), (next_alpha, next_sigma) = alpha_sigma(here), alpha_sigma(there)
-    return next_alpha / alpha * z + next_sigma * (-torch.expm1(there - here)).sqrt() * noise
+    lambda_s, lambda_t = for_images(log_snr, z), for_images(next_log_snr, z)
+    (alpha, _), (next_alpha, next_sigma) = alpha_sigma(lambda_s), alpha_sigma(lambda_t)
+    return next_alpha / alpha * z + next_sigma * (-torch.expm1(lambda_t - lambda_s)).sqrt() * noise
 
 
 def walk(
     denoise: Denoise, z: Tensor, log_snrs: Tensor, eta: float, noise: Noise | None, times: Tensor | None = None
 ) -> Iterator[Tensor]:
-    """The states from noise z, (B, ...), to data, one after each step.
+    """Yield the states from noise z, (B, ...), to data, after each step.
 
     Args:
         log_snrs: Rising, (N + 1,) for N steps.
         eta: See `step`.
-        noise: That of step 1, 2, ..., asked in the last step too; None where eta = 0.
-        times: What `denoise` is given in each step, (N,); None: the log-SNR.
+        noise: Noise of step 1, 2, ..., also called in the last step; None if eta = 0.
+        times: Time argument of `denoise` per step, (N,); None: the log-SNR.
     """
     times = log_snrs if times is None else times
     for j, (t, (here, there)) in enumerate(zip(times, pairwise(log_snrs), strict=False), start=1):
@@ -71,22 +71,22 @@ def repaint(
     repeats: int = 1,
     jump: int = 1,
 ) -> Iterator[Tensor]:
-    """Complete images of which a part is known: that part is noised to each level, the rest is walked (RePaint).
+    """Complete partially known images by RePaint: the known part is noised to each level, the rest sampled.
 
-    Each step goes down in `jump` parts, whose known pixels are drawn afresh, then back up by forward steps and down
-    again, `repeats` times in all, so that the two parts come to agree (Lugmayr et al. 2022, algorithm 1, with
-    resampling inside each step). The last step is taken once. Evaluations: jump (repeats (N - 1) + 1).
+    Each step denoises in `jump` parts with resampled known pixels, then returns by forward steps and denoises again,
+    `repeats` times in total, to harmonise both parts (Lugmayr et al. 2022, algorithm 1, with resampling inside each
+    step). The last step is not repeated. Evaluations: jump (repeats (N - 1) + 1).
 
     Args:
         z: Noise, (B, ...).
         image: Data, (B, ...).
-        known: Where they are known, bool or 0 and 1.
+        known: Mask of known pixels, bool or 0 and 1.
         log_snrs: Rising, (N jump + 1,) for N steps.
-        noise: Asked, in each part of a step, for the known pixels and for the ancestral step, and once in each
-            part on the way up.
+        noise: Called in each part of a step for the known pixels and for the ancestral step, and once per
+            forward step.
 
     Returns:
-        The state at the end of each step, repeated ones too; the last is the completed image.
+        The state after each step, including repetitions; the last is the completed image.
     """
     j = count(1)
     for first in range(0, len(log_snrs) - 1, jump):
@@ -97,6 +97,6 @@ def repaint(
                 for here, there in pairwise(levels.flip(0)):
                     z = forward_step(z, here, there, noise(next(j)))
             for here, there in pairwise(levels):
-                seen = noised(image, there, noise(next(j)))
-                z = torch.where(known > 0, seen, step(z, denoise(z, here), here, there, 1.0, noise(next(j))))
+                measured = noised(image, there, noise(next(j)))
+                z = torch.where(known > 0, measured, step(z, denoise(z, here), here, there, 1.0, noise(next(j))))
             yield z

@@ -1,4 +1,4 @@
-"""A diffusion, learned on noised scans."""
+"""Training of diffusion models."""
 
 from typing import Any
 
@@ -13,16 +13,16 @@ from r2flow.systems.diffusion.sampling import noised
 
 
 class LearnDiffusion(SingleLoss):
-    """Regress y(z_t, lambda_t) onto what the generator predicts, at t ~ Uniform[0, 1] (Kingma et al. 2021).
+    """Regression of the prediction y(z_t, lambda_t) at t ~ Uniform[0, 1] (Kingma et al. 2021).
 
     Args:
-        generator: A diffusion.
+        generator: A `Diffusion`.
         loss: Name in `r2flow.systems.diffusion.objectives.ERRORS`.
-        min_snr: gamma of the weight min(SNR, gamma) on the error of the expected data; None for the SNR itself, which
-            is equal weights of the noise's error.
+        min_snr: gamma of the weight min(SNR, gamma) on the error of expected data; None: the SNR, which weights the
+            noise's error equally.
         paired: Whether a sample's error has its own weight; False as published, see
             `r2flow.systems.diffusion.objectives.weighted_mean`.
-        options: Those of `Stage`.
+        options: Options of `Stage`.
     """
 
     learns = Diffusion
@@ -41,7 +41,7 @@ class LearnDiffusion(SingleLoss):
         self.error, self.min_snr, self.paired = ERRORS[loss], min_snr, paired
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        """The weighted mean error at t = u, where t = 0 is data and t = 1 noise."""
+        """Weighted mean error at t = u (t = 0: data, t = 1: noise)."""
         diffusion, x, eps = self.generator, batch["x_1"], batch["x_0"]
         log_snr = diffusion.schedule(u)
         y = diffusion.predict(noised(x, log_snr, eps), log_snr)

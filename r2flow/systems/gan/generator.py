@@ -1,4 +1,4 @@
-"""GANs: x = G(z) in one evaluation, with a mask of dropped rays or without."""
+"""GANs: x = G(z) in one evaluation, with or without a mask of dropped rays."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ from r2flow.systems.gan.layers import LatentGenerator
 class Gan(Generator):
     """x = G(z) clamped to [-1, 1], with z of N(0, I).
 
-    Its sampler is `Direct`.
+    The sampler is `Direct`.
 
     Attributes:
         network: G.
-        drops: Whether a mask of dropped rays is drawn: logistic noise of `draws.step(shape, 1)`.
-        angle: Elevation and azimuth of every pixel, (1, 2, H, W), for a network that asks for them; its scans are
-            turned by random angles in training.
+        drops: Whether a ray-drop mask is sampled: logistic noise of `draws.step(shape, 1)`.
+        angle: Elevation and azimuth of every pixel, (1, 2, H, W), for networks that use them; training rotates
+            scans by random angles.
     """
 
     drops: ClassVar[bool] = True
@@ -42,7 +42,7 @@ class Gan(Generator):
     def made(
         self, z: Tensor, uniform: Tensor | None = None, shift: Tensor | None = None, truncation: float = 1.0
     ) -> dict[str, Tensor]:
-        """The network's outputs, see `LatentGenerator`."""
+        """Outputs of the network, see `LatentGenerator`."""
         made: dict[str, Tensor] = self.network(z, self.angle, truncation=truncation, uniform=uniform, shift=shift)
         return made
 
@@ -55,8 +55,8 @@ class Direct(Sampler):
     """One evaluation.
 
     Attributes:
-        truncation: psi of w <- w_avg + psi (w - w_avg): less makes plainer scans that are closer to each other (0.7 in
-            DUSty's published demo).
+        truncation: psi of w <- w_avg + psi (w - w_avg): smaller values reduce diversity (0.7 in DUSty's
+            published demo).
     """
 
     needs: ClassVar[str] = "made"
@@ -78,7 +78,7 @@ class Direct(Sampler):
 
 
 class VanillaGan(Gan):
-    """A convolutional GAN whose image says itself which rays are dropped: `r2flow.systems.gan.dcgan`.
+    """A convolutional GAN whose image encodes dropped rays: `r2flow.systems.gan.dcgan`.
 
     Args:
         space: The images it makes.
@@ -110,7 +110,7 @@ class VanillaGan(Gan):
 
 
 class DustyV1(VanillaGan):
-    """The same with a second output, from which a mask of the rays that return is drawn (Nakashima and Kurazume 2021).
+    """`VanillaGan` with a second output, the logits of a mask of returns (Nakashima and Kurazume 2021).
 
     Args:
         temperature: Of the relaxed mask.
@@ -131,7 +131,7 @@ class DustyV1(VanillaGan):
 
 
 class DustyV2(Gan):
-    """A style-based GAN that makes each pixel of its ray's angles: `r2flow.systems.gan.style_gan`.
+    """A style-based GAN that generates each pixel from its ray's angles: `r2flow.systems.gan.style_gan`.
 
     Args:
         code: Width of w; null for `latent`.
@@ -162,5 +162,5 @@ class DustyV2(Gan):
         self.angle = space.rays[None].clone()
 
     def start_from(self, parent: Generator) -> None:
-        """Take over a trained generator's weights; the angles are this one's."""
+        """Load a trained generator's weights; keep these angles."""
         self._take(parent, {**parent.state_dict(), "angle": self.angle})  # type: ignore[dict-item]

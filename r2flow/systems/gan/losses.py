@@ -1,4 +1,4 @@
-"""A GAN's losses and R1, and the rules of a run: learning rates, average, warm-up."""
+"""GAN losses and R1, and schedules: learning rates, weight average, warm-up."""
 
 import math
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float)
 
 
 def lazy_adam(learning_rate: float, betas: tuple[float, float], every: int) -> tuple[float, tuple[float, float]]:
-    """Adam's learning rate and betas where every `every` steps one more is taken for a penalty.
+    """Adam's learning rate and betas with an additional penalty step every `every` steps.
 
     With c = every / (every + 1): c times the rate, and betas to the power of c (Karras et al. 2020, StyleGAN2,
     appendix B). 0 for no such steps.
@@ -54,7 +54,7 @@ def lazy_adam(learning_rate: float, betas: tuple[float, float], every: int) -> t
 
 @dataclass(frozen=True)
 class Warmup:
-    """What is made harder for the discriminator at first: pixels dropped and images blurred, both less and less.
+    """Decreasing degradation of the discriminator's inputs: dropped pixels and blur.
 
     Attributes:
         images: Images seen until nothing is changed any more; 0 for no warm-up.
@@ -71,7 +71,7 @@ class Warmup:
         return max(1 - images / self.images, 0.0) if self.images else 0.0
 
     def __call__(self, x: Tensor, images: int, uniform: Tensor | None) -> Tensor:
-        """x (B, C, H, W) in model space after so many images of the run.
+        """Degrade x (B, C, H, W) in model space, after a number of images of the run.
 
         Args:
             uniform: For each value of x, in [0, 1); None is enough once the warm-up is over.

@@ -1,4 +1,4 @@
-"""A GAN: a generator and a discriminator that learn from each other."""
+"""Training of GANs."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,11 +19,11 @@ DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
 )
 
 
-GENERATOR, FAKE, REAL, PENALTY = range(1, 5)  # parts of a step, each with draws of its own for every image
+GENERATOR, FAKE, REAL, PENALTY = range(1, 5)  # parts of a step, with separate random draws per image
 
 
 class LearnGan(Stage):
-    """G and D in turn: a step of G, one of D on fresh G(z) and the scans, and every `r1_every` steps one of R1.
+    """Alternating steps of G and D (on new G(z) and scans), and a step of R1 every `r1_every` steps.
 
     All that D sees is warmed up (`r2flow.systems.gan.losses.Warmup`) and augmented (`AdaptiveAugment`). Both learn by
     Adam at a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is
@@ -107,20 +107,20 @@ class LearnGan(Stage):
         self.log("train/discriminator", wrong, prog_bar=True, sync_dist=True)
 
     def make(self, z: Tensor, draws: BatchDraws) -> Tensor:
-        """G(z), (B, C, H, W), with the mask and the turn that are drawn."""
+        """G(z), (B, C, H, W), with random mask and rotation."""
         rows, columns = self.generator.space.shape[1:]
         uniform = draws.uniform((1, rows, columns)) if self.generator.drops else None
         shift = None if self.generator.angle is None else draws.uniform((1,))[:, 0]
         return self.generator.made(z, uniform, shift)["image"]
 
     def shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:
-        """x as D sees it after so many images of the run."""
+        """Input x of D after a number of images of the run."""
         uniform = draws.uniform(tuple(x.shape[1:])) if self.warmup.left(images) else None
         x = self.warmup(x, images, uniform)
         return x if self.augment is None else self.augment(x, self.augment.draw(draws))
 
     def penalty(self, real: Tensor, images: int, draws: BatchDraws) -> Tensor:
-        """R1 by the scans themselves, through warm-up and augmentation; float32 whatever autocast does."""
+        """R1 with gradients by the scans, through warm-up and augmentation; in float32 without autocast."""
         with torch.autocast(real.device.type, enabled=False):
             x = real.detach().requires_grad_()
             return r1(self.discriminator(self.shown(x, images, draws)), x)

@@ -1,4 +1,4 @@
-"""A discriminator of patches, and the reconstruction that it sharpens (Esser et al. 2021, "Taming transformers")."""
+"""Patch discriminator and reconstruction losses (Esser et al. 2021, "Taming transformers")."""
 
 import torch
 import torch.nn.functional as F
@@ -22,7 +22,7 @@ class PatchDiscriminator(nn.Module):
 
     def __init__(self, channels: Count = 1, width: Count = 64, layers: Count = 3) -> None:
         super().__init__()
-        self.smallest = 3 * 2**layers  # halved so often, and two convolutions of 4 without stride
+        self.smallest = 3 * 2**layers  # after `layers` halvings, two 4 x 4 convolutions without stride
         parts: list[nn.Module] = [nn.Conv2d(channels, width, 4, 2, 1), nn.LeakyReLU(0.2)]
         here = width
         for layer in range(1, layers + 1):

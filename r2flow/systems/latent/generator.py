@@ -1,4 +1,4 @@
-"""Generators in a smaller space than the image's: LiDM's autoencoder, and the diffusion of its latents."""
+"""Latent-space generators: LiDM's autoencoder, and the diffusion of its latents."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
 
 
 def build_autoencoder(space: ModelSpace, options: Mapping[str, Any] | None) -> Autoencoder:
-    """The autoencoder of a config's `generator.autoencoder`, for the images of a space."""
+    """Build the autoencoder of a config's `generator.autoencoder` for an image space."""
     check_options("generator.autoencoder", Autoencoder, options or {}, given=1)
     return Autoencoder(space.shape[0], **(options or {}))
 
 
 class VQAutoencoder(Generator):
-    """An autoencoder by itself, on the way to a `LatentDiffusion`. It makes no scans of noise.
+    """An autoencoder, the first stage of a `LatentDiffusion`. It cannot sample scans from noise.
 
     Args:
         space: The images that it learns.
@@ -92,19 +92,19 @@ class LatentDiffusion(Generator):
         return network
 
     def expected(self, z: Tensor, t: Tensor) -> Tensor:
-        """The latents that are expected behind z (B, ...) at step t, ()."""
+        """Expected latents given z (B, ...) at step t, ()."""
         x, _ = PREDICTIONS["eps"].split(z, self.unet(z, t.to(z.device).expand(len(z))), self.log_snr[t])
         return x
 
     def start_from(self, parent: Generator) -> None:
-        """Take over an autoencoder's weights, or another latent diffusion's."""
+        """Load the weights of an autoencoder or another latent diffusion."""
         new = self.state_dict() if isinstance(parent, VQAutoencoder) else {}
         self._take(parent, {**new, **parent.state_dict()})
 
 
 @dataclass(frozen=True)
 class LatentDDIM(Sampler):
-    """DDIM by every (N // steps)-th of the diffusion's N steps, and the decoder.
+    """DDIM on every (N // steps)-th of the diffusion's N steps, then the decoder.
 
     The last step goes to lambda_0 and not to the data, as in the published code, and adds noise too.
 
@@ -133,13 +133,13 @@ class LatentDDIM(Sampler):
         times = some_of(len(generator.log_snr), self.steps)
         log_snrs = generator.log_snr[[*times.tolist(), 0]]
         z = last_of(walk(generator.expected, noise, log_snrs, self.eta, draws, times), progress)
-        with torch.autocast(z.device.type, enabled=False):  # what it answers is the scan, and no step follows
+        with torch.autocast(z.device.type, enabled=False):  # its output is the scan, without later corrections
             scans = generator.first_stage_model.decode(z)
         return Generated.after(scans, len(times))
 
 
 def some_of(total: int, steps: int) -> Tensor:
-    """Every (total // steps)-th number below total, from 1 on, falling: more than `steps` if it does not divide."""
+    """Every (total // steps)-th number below total from 1, decreasing; more than `steps` if not divisible."""
     if not 1 <= steps < total:
         raise InputError(f"a diffusion of {total} steps is sampled in 1 to {total - 1}, found {steps}.")
     return torch.arange(1, total, total // steps).flip(0)

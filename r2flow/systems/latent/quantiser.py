@@ -1,4 +1,4 @@
-"""A codebook: vectors become the nearest of some learned ones (van den Oord et al. 2017, "Neural discrete
+"""Vector quantisation by a learned codebook (van den Oord et al. 2017, "Neural discrete
 representation learning")."""
 
 from typing import NamedTuple
@@ -6,14 +6,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-AT_ONCE = 4096  # vectors whose distances to all codes are held at a time
+AT_ONCE = 4096  # vectors per block of distances to all codes
 
 
 class Quantised(NamedTuple):
-    """What a quantiser makes of z, (B, C, H, W)."""
+    """Output of a quantiser for z, (B, C, H, W)."""
 
     codes: Tensor  # the nearest codes, (B, C, H, W), with the gradient of z (straight through)
-    loss: Tensor  # what draws codes and vectors to each other, ()
+    loss: Tensor  # codebook and commitment loss, ()
     indices: Tensor  # of the codes, (B H W,) int64
 
 
@@ -52,7 +52,7 @@ class Quantiser(nn.Module):
         """The index of the code nearest to each vector, (N, C) to (N,)."""
         codes = self.embedding.weight.float()
         lengths = codes.square().sum(1)
-        with torch.autocast(vectors.device.type, enabled=False):  # a difference of large numbers: it needs the digits
+        with torch.autocast(vectors.device.type, enabled=False):  # full precision, for differences of large numbers
             parts = [
                 (part.square().sum(1, keepdim=True) + lengths - 2 * part @ codes.T).argmin(1)
                 for part in vectors.float().split(AT_ONCE)

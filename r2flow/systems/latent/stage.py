@@ -1,4 +1,4 @@
-"""LiDM's two stages: an autoencoder that a discriminator sharpens, and the diffusion of its latents."""
+"""Training of LiDM: an adversarial autoencoder, and the diffusion of its latents."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,11 +23,11 @@ from r2flow.systems.latent.discriminator import (
 from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
 
 LEAST = 1 / 255  # metres: shorter ranges are not returns
-SHIFT = 1e-4  # metres that the published threshold lacks under the logarithm, and `ShiftedLog` adds
+SHIFT = 1e-4  # metres; added by `ShiftedLog`, missing in the published threshold
 
 
 def returns(x: Tensor, encoding: Encoding) -> Tensor:
-    """1 where a ray of images in model space returns and -1 where it does not, (B, 1, H, W)."""
+    """Mask of returns of images in model space, 1 or -1, (B, 1, H, W)."""
     metres = LEAST - SHIFT if isinstance(encoding.format, ShiftedLog) else LEAST
     least = encoding.format.forward(torch.full((1, 1, 1), metres, device=x.device))
     return torch.where(x[:, :1] < 2 * least - 1 + 1e-6, -1.0, 1.0)
@@ -138,9 +138,9 @@ class LearnLatentDiffusion(SingleLoss):
         return self.optimizers_for(self.generator.unet.parameters())
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        """Mean over images at the steps that u in [0, 1) falls on, (B,)."""
+        """Mean loss over images at the steps selected by u in [0, 1), (B,)."""
         diffusion, eps = self.generator, batch["x_0"]
         with torch.no_grad():
-            z = diffusion.first_stage_model.eval().encode(batch["x_1"]).float()  # for noise levels of all digits
+            z = diffusion.first_stage_model.eval().encode(batch["x_1"]).float()  # full precision for small noise levels
         t = (u * len(diffusion.log_snr)).to(torch.int64)
         return F.mse_loss(diffusion.unet(noised(z, diffusion.log_snr[t], eps), t), eps)

@@ -1,4 +1,4 @@
-"""Generators that follow a score down a ladder of noise levels: LiDARGen."""
+"""Score-based generators: LiDARGen."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ class ScoreModel(Generator):
     """Annealed Langevin dynamics by a learned score (Zyrianov et al. 2022, "Learning to generate realistic LiDAR point
     clouds").
 
-    It works in [0, 1] and starts from uniform noise, which is made of ours by the normal distribution function. Its
-    sampler's `steps` are those at each noise level. A condition pulls the scan to what is known: densification.
+    Images are in [0, 1]; the initial uniform noise is the normal distribution function of Gaussian noise. A sampler's
+    `steps` are per noise level. A condition pulls the scan to the known rays: densification.
 
     Args:
-        space: The images it makes.
+        space: Space of the images.
         backbone: Not used: the network is a `RefineNet`.
-        rate: Of `r2flow.systems.score.langevin.step_sizes`.
-        pull: Strength of the pull to known pixels, a step.
-        width: The network's, see `RefineNet`.
+        rate: Rate of `r2flow.systems.score.langevin.step_sizes`.
+        pull: Strength of the pull to known pixels per step.
+        width: Width of the network, see `RefineNet`.
         sigma_first, sigma_last, levels, spacing: The noise levels, see `r2flow.systems.score.langevin.noise_levels`.
     """
 

@@ -1,4 +1,4 @@
-"""Scores of noised data at a ladder of noise levels, and annealed Langevin dynamics down the ladder.
+"""Scores of data at decreasing noise levels, and annealed Langevin dynamics.
 
 Song and Ermon 2019, "Generative modeling by estimating gradients of the data distribution", and 2020, "Improved
 techniques for training score-based generative models". The score s(x, i) is the gradient by x of the log density of
@@ -16,7 +16,7 @@ from r2flow.errors import InputError
 from r2flow.registry import Registry
 
 Score = Callable[[Tensor, Tensor], Tensor]
-"""s(x, i): images (B, C, H, W) and the number of each one's noise level, (B,) int64, to (B, C, H, W)."""
+"""s(x, i): maps images (B, C, H, W) and their noise-level indices, (B,) int64, to (B, C, H, W)."""
 
 SPACINGS: Registry[Callable[[float, float, int], np.ndarray]] = Registry(
     "spacing of noise levels", geometric=np.geomspace, uniform=np.linspace
@@ -31,14 +31,14 @@ def noise_levels(first: float, last: float, levels: int, spacing: str = "geometr
 
 
 def step_sizes(sigmas: Tensor, rate: float) -> Tensor:
-    """e_i = rate (sigma_i / sigma_{L-1})^2, (L,): every level then has the same signal to noise in a step."""
+    """e_i = rate (sigma_i / sigma_{L-1})^2, (L,), which gives each level the same signal-to-noise ratio per step."""
     return rate * (sigmas / sigmas[-1]).square()
 
 
 def score_loss(score: Score, x: Tensor, noise: Tensor, labels: Tensor, sigmas: Tensor, power: float = 2.0) -> Tensor:
     """Denoising score matching, sigma^power / 2 |s(x + sigma n, i) + n / sigma|^2 of each image, (B,).
 
-    With power 2 every level weighs the same (2019, eq. 6). Noise n is standard normal, labels i are (B,) int64.
+    Power 2 weights all levels equally (2019, eq. 6). Noise n is standard normal, labels i are (B,) int64.
     """
     sigma = sigmas[labels][:, None, None, None]
     error = score(x + sigma * noise, labels) + noise / sigma
@@ -54,19 +54,19 @@ def annealed_langevin(
     steps: int = 5,
     pull: Callable[[Tensor], Tensor] | None = None,
 ) -> Iterator[Tensor]:
-    """The states of annealed Langevin dynamics (2019, algorithm 1), after each evaluation of the score.
+    """Yield the states of annealed Langevin dynamics (2019, algorithm 1) after each evaluation of the score.
 
     `steps` times at each level i, from the first to the last: x <- x + e_i s(x, i) + sqrt(2 e_i) z with e_i of
-    `step_sizes`. Then the noise that the last level leaves is taken off (2020, section 3.3):
+    `step_sizes`. A last step removes the remaining noise (2020, section 3.3):
     x <- x + sigma_{L-1}^2 s(x, L-1).
 
     Args:
-        x: Where it starts, (B, C, H, W).
-        sigmas: Of all levels, (L,).
+        x: Initial state, (B, C, H, W).
+        sigmas: Noise levels, (L,).
         noise: z of step k = 1, 2, ..., counted over all levels, of x's shape.
-        pull: Added in every step, a function of the state before it: the gradient of a likelihood, as `toward`. The
-            last denoising adds that of the step before once more, and the state after it is pulled once again: so
-            LiDARGen completes scans.
+        pull: Likelihood gradient as a function of the state before a step, such as `toward`, added in every step.
+            As in LiDARGen, the last denoising adds the previous pull again, and the final state is pulled once
+            more.
     """
     number, pulled = 0, torch.zeros_like(x)
     for level, size in enumerate(step_sizes(sigmas, rate).tolist()):

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from r2flow.model.published import Format, Published
 
-NETWORK = "network."  # in the generator
-WRAPPED = "module."  # by torch's DataParallel
+NETWORK = "network."  # prefix in the generator
+WRAPPED = "module."  # prefix of torch's DataParallel
 FIRST, LAST = "begin_conv.weight", "end_conv.weight"
 SENSOR = {"name": "hdl64e", "rows": 64, "columns": 1024, "min_range": 0.5, "max_range": 63.0}
 
@@ -27,7 +27,7 @@ def holds(content: Any) -> bool:
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
-    """A published score model; its averaged weights lack the buffers, and files without them have the raw ones."""
+    """Load a published score model; averaged weights lack buffers, files without averages have raw weights."""
     weights: dict[str, Tensor] = {name.removeprefix(WRAPPED): value for name, value in content[0].items()}
     sigmas = weights["sigmas"]
     config = {

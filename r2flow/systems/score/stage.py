@@ -1,4 +1,4 @@
-"""Score matching: a network learns the gradient of the log density of noised scans."""
+"""Training by denoising score matching."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ class MatchScore(SingleLoss):
         self.power = power
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        """Mean over images at the noise levels that u in [0, 1) falls on, (B,)."""
+        """Mean loss over images at the noise levels selected by u in [0, 1), (B,)."""
         network = self.generator.network
         labels = (u * len(network.sigmas)).to(torch.int64)
         x = (batch["x_1"] + 1) / 2
