@@ -48,7 +48,7 @@ def naming(path: str | Path) -> Iterator[None]:
         raise type(error)(f"{path}: {error}") from None
 
 
-# Oddities of scan files, told once for a folder: files by folder and kind, with how many values of each are odd.
+# Oddities of scan files, logged once per folder: files by folder and kind, with how many values of each are odd.
 _odd: defaultdict[tuple[Path, str], dict[Path, int]] = defaultdict(dict)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_odd.clear)

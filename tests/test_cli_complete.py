@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from r2flow.data.opening import open_scans
 from r2flow.data.partial import open_partial
@@ -14,8 +15,10 @@ from r2flow.lidar.known import Ray, parse_mask
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.lidar.transfer import image_through
+from r2flow.lidar.transfer import Partial, image_through
+from r2flow.model.completion import Completed
 from r2flow.noise import generator
+from r2flow.reports.completed import hidden_errors
 from r2flow.simulator import simulate
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.data.conftest import prepare_folder
@@ -364,22 +367,31 @@ def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path
     assert "1 scans completed" in said
 
 
+def test_the_errors_of_hidden_rays_stand_next_to_those_of_interpolation():
+    """Hidden between two rings at 10 m: rays at 12 m and without a return. Interpolation says 10 m of both."""
+    whole = np.full((1, 3, 2), 10, np.float32)
+    whole[0, 1] = 12, 0
+    state = np.where(whole[0] > 0, int(Ray.RETURN), int(Ray.EMPTY)).astype(np.uint8)
+    given, left = whole.copy(), state.copy()
+    given[0, 1], left[1] = 0, int(Ray.UNKNOWN)
+    answers = torch.from_numpy(np.stack([whole, whole]))
+    answers[0, 0, 1, 0], answers[1, 0, 1, 0] = 11, 15  # off by 1 m and by 3 m
+    completed = Completed(answers, 0, torch.ones(2), torch.ones(2, dtype=torch.bool), 0.0)
+    errors = hidden_errors(Partial(whole, state), Partial(given, left), completed)
+    assert errors.tolist() == [[pytest.approx((1 + 3) / 2), 2], [0, 0.5]]
+
+
 def test_a_wrong_sensor_of_the_scans_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    sensor = SENSORS["os1_64"].resized(columns=128)
-    image = np.stack([np.full(sensor.shape, 9.0), np.full(sensor.shape, 0.5)]).astype(np.float32)
-    write_points(tmp_path / "points" / "0.ply", *image_to_points(image, sensor.rays()))
-    open_partial([str(tmp_path / "points")], Reading(sensor), sensor)
+    sparse_scan(tmp_path / "0.ply")
+    open_partial([str(tmp_path)], Reading(VLP16), VLP16)
     assert not caplog.text
-    open_partial([str(tmp_path / "points")], Reading(sensor), SENSORS["vlp16"])
-    assert "--from vlp16 does not fit" in caplog.text
-    assert "--from os1_64" in caplog.text
+    open_partial([str(tmp_path)], Reading(VLP16), SENSORS["os1_64"])
+    assert all(words in caplog.text for words in ("--from os1_64 does not fit", "they fit --from vlp16"))
 
 
 def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
-    sensor = SENSORS["vlp16"].resized(columns=64)
-    image = np.stack([np.full(sensor.shape, 9.0), np.full(sensor.shape, 0.5)]).astype(np.float32)
-    write_points(tmp_path / "points" / "0.ply", *image_to_points(image, sensor.rays()))
-    ((scan,), (said,)) = open_partial([str(tmp_path / "points")], Reading(sensor.resized(64, 64)))
+    sparse_scan(tmp_path / "0.ply")
+    ((scan,), (said,)) = open_partial([str(tmp_path)], Reading(VLP16.resized(64, 900)))
     assert "16 of the 64 rows of vlp16 are measured" in said
     assert (scan.read().state != Ray.UNKNOWN).any(1).sum() == 16
 

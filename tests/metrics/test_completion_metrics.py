@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.completion import common_mae, errors, spread_errors
+from r2flow.metrics.completion import errors, spread_errors
 
 SENSOR = SENSORS["hdl64e"].resized(2, 4)
 
@@ -34,14 +34,6 @@ def test_every_figure_of_a_case_worked_out_by_hand():
     theirs = (2 + min(moved, 10 * math.sqrt(2))) / 7
     ours = (2 + apart) / 7  # the answer's (0, 2) is 2 m away, its (1, 1) a row from truth's (0, 1)
     assert found["chamfer_m"] == pytest.approx(theirs + ours, rel=1e-5)
-
-
-def test_the_common_error_leaves_out_rays_that_any_answer_lacks():
-    truth = scan([[10, 10, 10, 10], [10, 0, 10, 10]])
-    whole, careful = scan([[11, 13, 10, 9], [10, 5, 10, 10]]), scan([[12, 0, 10, 9], [10, 0, 10, 10]])
-    hidden = np.array([[True, True, False, True], [False, True, False, False]])
-    assert common_mae(truth, [whole, careful], hidden) == pytest.approx([(1 + 1) / 2, (2 + 1) / 2])
-    assert np.isnan(common_mae(truth, [whole, careful], hidden & (truth[0] == 0))).all()
 
 
 def test_an_equal_scan_has_no_error():

@@ -129,12 +129,8 @@ def test_a_run_goes_on_with_other_workers_and_threads(
 ):
     """Bit-equal with any number of loader workers, and with as many threads: sums of another number round otherwise."""
     checkpoints_of(copied)[0].unlink()
-    set_threads, here = torch.set_num_threads, os.getpid()  # in a loader's worker threads of OpenMP would wait for ever
-    monkeypatch.setattr(
-        torch,
-        "set_num_threads",
-        lambda number: set_threads(threads if number == 1 and os.getpid() == here else number),
-    )
+    limit, here = torch.set_num_threads, os.getpid()  # in a loader's worker threads of OpenMP would wait for ever
+    monkeypatch.setattr(torch, "set_num_threads", lambda n: limit(threads if n == 1 and os.getpid() == here else n))
     train("name=copied", f"data.workers={workers}", "data.memory_gib=0")
     if threads == 1:
         assert_bit_equal(alone[0], copied)
