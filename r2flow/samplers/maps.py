@@ -27,7 +27,10 @@ class Jump(OnGrid):
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         u, x, alive, times = generator.map(condition), noise, finite(noise), self.times().to(noise)
         for j, (t, s) in enumerate(pairwise(times), start=1):
-            e = draws(j) if self.draws and draws is not None and s < 1 else torch.zeros_like(x)
+            e = x.new_zeros(())
+            if self.draws and s < 1:
+                assert draws is not None
+                e = draws(j)
             x, alive = stepped(x, self.step(u, t, x, s, e), alive)
             progress()
         return Generated.after(x, self.steps, alive)

@@ -79,7 +79,8 @@ def sde(estimate: Estimate, x: Tensor, times: Tensor, c: float, noise: Noise | N
         x = step.keep * x + step.now * x_1
         if previous is not None and step.before:
             x = x + step.before * previous[1]
-        if step.fresh and noise is not None:  # the ODE, c = 0, takes none
+        if step.fresh:  # c > 0
+            assert noise is not None
             x = x + step.fresh * noise(j)
         previous = t, x_1
         yield x
