@@ -43,13 +43,10 @@ class Chord(Jump):
     This is DDIM's step (Song et al. 2021) with X_{t->1}(x_t) as the estimate of the scan: the next jump starts with
     less of the same noise and corrects the estimate. It is exact if paths are straight. Otherwise x_s does not have
     the flow's density at s, even for the exact map, and each jump adds grain to the reflectance.
-
-    Attributes:
-        grid: None: `late`.
     """
 
     steps: Steps = 2
-    grid: Grid | None = None  # type: ignore[assignment]
+    grid: Grid | None = None  # type: ignore[assignment]  # None: `late`
 
     def times(self, *args: Any, **options: Any) -> Tensor:
         return late(self.steps) if self.grid is None else super().times(*args, **options)
