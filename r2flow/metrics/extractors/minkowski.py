@@ -1,10 +1,9 @@
 """MinkowskiNet (Choy et al., CVPR 2019), a sparse U-Net on voxels of 5 cm: FSVD's feature network.
 
-Layers, widths and parameter names are those of the evaluation of the LiDAR generative papers (LiDM, R2DM, R2Flow), from
-2DPASS, on torchsparse. Checked: the convolutions against dense ones, the order of the weights by hand, voxels and
-pooling against figures of the published evaluation. Not checked, as the weights are not at hand: that they load by
-these names, the widths below (768 features of 16 sectors leave 48 for the last one, half of 2DPASS's; sizes are taken
-from the weights anyway), and the features.
+Layers, widths and parameter names follow the evaluation of the LiDAR generative papers (LiDM, R2DM, R2Flow), which uses
+2DPASS and torchsparse. Tests compare convolutions with dense ones, the order of weights with manual results, and voxels
+and pooling with values of the published evaluation. The published weights were not available: their names, the widths
+below (48 follows from 768 features of 16 sectors; sizes are read from the weights) and the features are not verified.
 """
 
 from collections.abc import Mapping
@@ -39,7 +38,7 @@ class Block(nn.Module):
 
 
 class Residual(nn.Module):
-    """ReLU(x + f(x)), x through a matrix where the width changes."""
+    """ReLU(x + f(x)), with a linear map of x where the width changes."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -52,10 +51,7 @@ class Residual(nn.Module):
 
 
 class MinkowskiNet(Extractor):
-    """FSVD's network; its features are the means of the last map over 16 sectors of distance.
-
-    The widths are those of the stem, of four levels down and of four up. Features are taken before the classifier.
-    """
+    """FSVD's network; features are means of the last map before the classifier over 16 sectors of distance."""
 
     name = "minkowskinet"
     layer = "last map of voxels, mean over 16 sectors of distance"
@@ -71,25 +67,25 @@ class MinkowskiNet(Extractor):
             )
             self.add_module(f"stage{level}", down)
         for level in range(1, 5):
-            width, kept = c[4 + level], c[4 - level]
-            blocks = nn.Sequential(Residual(width + kept, width), Residual(width, width))
+            width, skip = c[4 + level], c[4 - level]
+            blocks = nn.Sequential(Residual(width + skip, width), Residual(width, width))
             self.add_module(f"up{level}", nn.ModuleList([Block(c[3 + level], width, transposed=True), blocks]))
         self.classifier = nn.Sequential(nn.Linear(c[8], num_classes))
 
     def down(self, x: Sparse) -> list[Sparse]:
-        """The maps of the four levels below x, which has the stem's width; x first."""
+        """The stem's map x and the maps of the four levels below."""
         maps = [x]
         for level in range(1, 5):
             maps.append(self.get_submodule(f"stage{level}")(maps[-1]))
         return maps
 
-    def up(self, level: int, x: Sparse, kept: Sparse) -> Sparse:
-        """One level up, joined with the map that was kept of that level."""
+    def up(self, level: int, x: Sparse, skip: Sparse) -> Sparse:
+        """One level up, concatenated with the skip map of that level."""
         x = self.get_submodule(f"up{level}.0")(x)
-        return self.get_submodule(f"up{level}.1")(x.with_features(torch.cat([x.features, kept.features], 1)))
+        return self.get_submodule(f"up{level}.1")(x.with_features(torch.cat([x.features, skip.features], 1)))
 
     def forward(self, coords: Tensor, features: Tensor) -> Tensor:
-        """The last map, (N, 48), of voxels at scan, x, y, z, (N, 4) int64, with x, y, z in metres and -1, (N, 4)."""
+        """Last map, (N, 48); `coords` (N, 4) int64 as in `VoxelGrid`, `features` (N, 4): x, y, z in metres and -1."""
         maps = self.down(self.stem(Sparse(features, VoxelGrid(coords))))
         y = maps[4]
         for level in range(1, 5):
@@ -98,7 +94,7 @@ class MinkowskiNet(Extractor):
 
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
-        # One scan at a time saves memory and is as fast as a batch.
+        # One scan at a time, since a batch is no faster and needs more memory.
         return torch.stack([self._scan(points.to(self.device)) for points in scans.points])
 
     def _scan(self, points: Tensor) -> Tensor:
@@ -117,5 +113,5 @@ class MinkowskiNet(Extractor):
         except (KeyError, IndexError):
             raise InputError(f"not the weights of {cls.name}: other parameters.") from None
         # Files saved in training may also hold parameters of the loss.
-        known = {name for name, _ in extractor.named_children()}
-        return extractor.filled({name: tensor for name, tensor in tensors.items() if name.split(".")[0] in known})
+        modules = {name for name, _ in extractor.named_children()}
+        return extractor.filled({name: tensor for name, tensor in tensors.items() if name.split(".")[0] in modules})

@@ -1,4 +1,4 @@
-"""PointNet (Qi et al., CVPR 2017) as a feature network: FPD's, trained on ShapeNet's 16 kinds of objects."""
+"""PointNet (Qi et al., CVPR 2017), the feature network of FPD, trained on 16 classes of ShapeNet."""
 
 import torch
 from torch import Tensor, nn
@@ -6,14 +6,14 @@ from torch import Tensor, nn
 from r2flow.metrics.extractors.base import Extractor, nan_where_empty
 from r2flow.metrics.scans import Scans
 
-SCALE = 80.0  # metres: points are divided by it, whichever sensor they come from
-CHUNK = 16384  # points at once: 1024 channels of them take 64 MiB
+SCALE = 80.0  # metres: divisor of points, for every sensor
+CHUNK = 16384  # points per pass: 1024 channels of them take 64 MiB
 
 
 class Points(nn.Module):
-    """Three layers on each point alone, then the maximum over the points: (B, 3, N) -> (B, 1024)."""
+    """Three layers per point, then the maximum over points: (B, 3, N) -> (B, 1024)."""
 
-    rectified = True  # the last layer too
+    rectified = True  # whether a ReLU follows the last layer
 
     def __init__(self) -> None:
         super().__init__()
@@ -36,7 +36,7 @@ class Points(nn.Module):
 
 
 class Transform(Points):
-    """The 3 x 3 matrix that the points are multiplied with first: (B, 3, N) -> (B, 3, 3)."""
+    """The matrix that transforms the input points: (B, 3, N) -> (B, 3, 3)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class Transform(Points):
 
 
 class Cloud(Points):
-    """One feature of the whole cloud, (B, 3, N) -> (B, 1024)."""
+    """Global feature of a cloud, (B, 3, N) -> (B, 1024)."""
 
     rectified = False
 
@@ -66,7 +66,7 @@ class Cloud(Points):
 
 
 class PointNet(Extractor):
-    """FPD's network; its features are the cloud's and those of the three layers of a classifier of k classes."""
+    """FPD's network; features are the global feature and the outputs of three layers of a classifier of k classes."""
 
     name = "pointnet"
     layer = "global feature and the classifier's three layers, 1024 + 512 + 256 + 16"
@@ -82,7 +82,7 @@ class PointNet(Extractor):
         self.bn2 = nn.BatchNorm1d(256)
 
     def forward(self, points: Tensor) -> Tensor:
-        """(B, 3, N), any N of at least 1, in units of 80 m -> (B, 1808)."""
+        """Points (B, 3, N) in units of 80 m, N >= 1 -> features (B, 1808)."""
         x = self.feat(points)
         y = torch.relu(self.bn1(self.fc1(x)))
         z = torch.relu(self.bn2(self.fc2(y)))
@@ -90,8 +90,8 @@ class PointNet(Extractor):
 
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
-        """As in the field, each pixel gives a point; a ray without a return gives the origin.
+        """As published, each pixel is a point, and rays without a return are points at the origin.
 
-        Features are maxima over the points, so that one origin counts as much as many.
+        Features are maxima over points, so the number of points at the origin does not matter.
         """
         return nan_where_empty(self(scans.xyz.flatten(2).to(self.device) / SCALE), scans)

@@ -1,7 +1,7 @@
 """RangeNet++ (Milioto et al., IROS 2019) as a feature network: FRD's RangeNet-53 and FRID's RangeNet-21.
 
-Darknet on range images: the width is halved five times, the height never, and every level is added back on the way up.
-Parameters have the names of the generative papers' evaluation, `stem.0.weight` ... `head.1.bias`; those of the original
+Darknet on range images: a U-Net with additive skips that halves the width five times and keeps the height. Parameters
+are named as in the evaluation of the generative papers, `stem.0.weight` ... `head.1.bias`; names of the original
 release (`conv1.weight`, `enc1.residual_0.bn2.bias` ...) are translated.
 """
 
@@ -18,10 +18,10 @@ from r2flow.errors import InputError
 from r2flow.metrics.extractors.base import Extractor, nan_where_empty
 from r2flow.metrics.scans import Scans
 
-BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}  # residual blocks of each level, by number of layers
+BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}  # number of layers -> residual blocks per level
 BANDS = 16
 
-# Of range, x, y, z in metres and reflectance on SemanticKITTI, with which the published networks were trained.
+# Statistics of SemanticKITTI, the training set of the published networks: range, x, y, z in metres, reflectance.
 MEAN = (12.12, 10.88, 0.23, -1.04, 0.21)
 STD = (12.32, 11.47, 6.91, 0.86, 0.16)
 
@@ -31,7 +31,7 @@ def _convolution(convolution: nn.Module, channels: int) -> nn.Sequential:
 
 
 class Residual(nn.Module):
-    """x + f(x), f a bottleneck."""
+    """x + f(x) with a bottleneck f."""
 
     def __init__(self, channels: int, inner: int) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Residual(nn.Module):
 
 
 class Level(nn.Module):
-    """A convolution that halves or doubles the number of columns, and residual blocks."""
+    """A convolution that halves or doubles the number of columns, then residual blocks."""
 
     def __init__(self, channels: int, out: int, blocks: int) -> None:
         super().__init__()
@@ -65,11 +65,11 @@ class Level(nn.Module):
 
 
 class RangeNet(Extractor):
-    """RangeNet of 21 or 53 layers on range, x, y, z and, where it is needed, reflectance.
+    """RangeNet of 21 or 53 layers on range, x, y, z and optionally reflectance.
 
     Args:
-        num_classes: Classes of the segmentation head, None without a head: features are taken before it.
-        mean, std: Of each channel; what exceeds the number of channels is ignored.
+        num_classes: Classes of the segmentation head, which features precede; None: no head.
+        mean, std: Statistics of the channels; further values are ignored.
     """
 
     layers: ClassVar[int]
@@ -90,22 +90,22 @@ class RangeNet(Extractor):
         self.head = (
             nn.Sequential(nn.Identity(), nn.Conv2d(widths[0], num_classes, 3, padding=1)) if num_classes else None
         )
-        # Not persistent: the published files hold only parameters.
+        # Not persistent, since the published files hold only parameters.
         self.register_buffer("mean", torch.tensor(mean[:channels]).view(-1, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(std[:channels]).view(-1, 1, 1), persistent=False)
 
     def normalise(self, image: Tensor) -> Tensor:
-        """(image - mean) / std where the range, its first channel, is above 0, else 0; (B, 4 or 5, H, W)."""
+        """(image - mean) / std at pixels with a return, else 0; (B, 4 or 5, H, W), range first."""
         return (image - self.mean) / self.std * (image[:, :1] > 0)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The decoder's last map, (B, 32, H, W), of a normalised image; W a multiple of 32."""
-        kept = [self.stem(x)]
+        """Last decoder map, (B, 32, H, W), of a normalised image; W must be a multiple of 32."""
+        skips = [self.stem(x)]
         for level in range(1, 6):
-            kept.append(self.get_submodule(f"enc{level}")(kept[-1]))
-        x = kept.pop()
+            skips.append(self.get_submodule(f"enc{level}")(skips[-1]))
+        x = skips.pop()
         for level in range(5, 0, -1):
-            x = self.get_submodule(f"dec{level}")(x) + kept.pop()
+            x = self.get_submodule(f"dec{level}")(x) + skips.pop()
         return x
 
     @torch.inference_mode()
@@ -118,7 +118,7 @@ class RangeNet(Extractor):
         return nan_where_empty(self.pool(self(self.normalise(image))), scans)
 
     def pool(self, maps: Tensor) -> Tensor:
-        """Decoder maps (B, C, H, W) to features (B, D)."""
+        """Map decoder maps (B, C, H, W) to features (B, D)."""
         raise NotImplementedError
 
     @classmethod
@@ -130,7 +130,7 @@ class RangeNet(Extractor):
 
 
 class RangeNet53(RangeNet):
-    """FRD's: 4096 values of the decoder map, drawn once, over range and reflectance."""
+    """FRD's network on range and reflectance; features are a fixed random choice of 4096 values of the decoder map."""
 
     name = "rangenet53"
     layer = "decoder map, 4096 of its values by a fixed draw"
@@ -140,13 +140,13 @@ class RangeNet53(RangeNet):
 
     def pool(self, maps: Tensor) -> Tensor:
         flat = maps.flatten(1)
-        # The published draw is Python's own generator's; with another one it would be another metric.
-        drawn = random.Random(0).sample(range(flat.shape[1]), self.dim)
-        return flat[:, torch.tensor(drawn, device=maps.device)]
+        # The published choice, made by Python's random generator, is part of the metric.
+        indices = random.Random(0).sample(range(flat.shape[1]), self.dim)
+        return flat[:, torch.tensor(indices, device=maps.device)]
 
 
 class RangeNet21(RangeNet):
-    """FRID's: the decoder map's mean over 16 bands of rows, the published "depth", over range alone."""
+    """FRID's network on range; features are means of the decoder map over 16 bands of rows (published as "depth")."""
 
     name = "rangenet21"
     layer = "decoder map, mean over 16 bands of rows"
@@ -158,7 +158,7 @@ class RangeNet21(RangeNet):
 
 
 def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Mean and standard deviation of each channel as the release's arch_cfg.yaml has them."""
+    """Mean and standard deviation of each channel from the release's arch_cfg.yaml."""
     try:
         sensor = config["dataset"]["sensor"]
         mean, std = (tuple(float(value) for value in sensor[key])[:channels] for key in ("img_means", "img_stds"))
@@ -169,8 +169,8 @@ def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[floa
     return mean, std
 
 
-# The original release's names, in the order in which they are tried. The head's file says "1.weight" alone.
-NAMES = [(re.compile(pattern), ours) for pattern, ours in (
+# Substitutions from names of the original release, applied in order. The head's file uses the bare name "1.weight".
+NAMES = [(re.compile(pattern), replacement) for pattern, replacement in (
     (r"^(backbone|decoder)\.", ""),
     (r"^1\.", "head.1."),
     (r"^conv1\.", "stem.0."),
@@ -185,7 +185,7 @@ NAMES = [(re.compile(pattern), ours) for pattern, ours in (
 
 
 def translate(name: str) -> str:
-    """Our name of a parameter of the original release; a name of ours as it is."""
-    for pattern, ours in NAMES:
-        name = pattern.sub(ours, name)
+    """Translate a parameter name of the original release; keep names of r2flow."""
+    for pattern, replacement in NAMES:
+        name = pattern.sub(replacement, name)
     return name

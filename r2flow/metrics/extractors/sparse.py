@@ -1,9 +1,9 @@
-"""Sparse convolution, on occupied voxels only: gather, multiply, scatter; for inference, in plain PyTorch.
+"""Sparse convolution in plain PyTorch, for inference: gather, multiply, scatter on occupied voxels.
 
     out(q) = sum_k W_k^T x(s q + o_k)
 
-over the voxels s q + o_k that exist, with stride s of 1 or 2 and offsets o_k. Offsets and their order are
-torchsparse's (1.4 and 2.0), so that its weights, (K, C_in, C_out), mean the same here: see `offsets`.
+over the existing voxels s q + o_k, with stride s of 1 or 2 and offsets o_k. Offsets and their order are those of
+torchsparse (1.4 and 2.0), so that its weights, (K, C_in, C_out), fit: see `offsets`.
 """
 
 import math
@@ -15,15 +15,14 @@ from typing import Self, cast
 import torch
 from torch import Tensor, nn
 
-# For each offset: numbers of the input voxels, and of the output voxels that they contribute to. Where both are one
-# tensor, every voxel contributes to itself.
+# Indices of input and output voxels per offset; the same tensor twice for the kernel's centre.
 KernelMap = list[tuple[Tensor, Tensor]]
 
 
 def offsets(size: int) -> list[tuple[int, int, int]]:
     """(x, y, z) of each weight of a kernel of size^3, in torchsparse's order.
 
-    Odd kernels are centred and x runs fastest; even ones begin at the voxel itself and z runs fastest.
+    Odd kernels are centred, with x fastest; even kernels start at the voxel, with z fastest.
     """
     if size % 2:
         along = range(-(size // 2), size // 2 + 1)
@@ -33,11 +32,11 @@ def offsets(size: int) -> list[tuple[int, int, int]]:
 
 
 class VoxelGrid:
-    """Voxels of one size: distinct integer coordinates, and the neighbours of each within a kernel.
+    """Voxels of one size: distinct integer coordinates, and their neighbours within a kernel.
 
     Args:
-        coords: Scan, x, y, z of each voxel, (N, 4), int64, in voxels of this size.
-        finer: The grid of voxels half as large that this one was made from, None where it is the first.
+        coords: Scan, x, y, z of each voxel, (N, 4), int64, in units of the voxel size.
+        finer: The grid of half the voxel size that `coarser` was called on; None for the finest.
     """
 
     def __init__(self, coords: Tensor, finer: Self | None = None) -> None:
@@ -54,32 +53,32 @@ class VoxelGrid:
         return len(self.coords)
 
     def _keys(self, coords: Tensor) -> Tensor:
-        """The numbers of cells of the bounding box, the last axis fastest."""
+        """Indices of cells in the bounding box, with the last axis fastest."""
         scan, x, y, z = (coords - self.low).unbind(-1)
         return ((scan * self.sizes[1] + x) * self.sizes[2] + y) * self.sizes[3] + z
 
     def find(self, coords: Tensor) -> Tensor:
-        """Numbers of the voxels at coordinates (..., 4), -1 where there is none."""
+        """Indices of the voxels at coordinates (..., 4); -1: no voxel."""
         key = self._keys(coords)
         position = torch.searchsorted(self.keys, key).clamp_(max=len(self) - 1)
         inside = ((coords >= self.low) & (coords <= self.high)).all(-1)
         return torch.where(inside & (self.keys[position] == key), self.order[position], -1)
 
     def coarser(self) -> "VoxelGrid":
-        """Voxels twice as large, each around at least one of this grid's."""
+        """The grid of twice the voxel size that covers this grid."""
         coords = self.coords.clone()
         coords[:, 1:] = coords[:, 1:].div(2, rounding_mode="floor")
         return VoxelGrid(coords.unique(dim=0), finer=self)
 
     def around(self, size: int) -> KernelMap:
-        """The map of a kernel of size^3 and stride 1 on this grid."""
+        """Kernel map of a kernel of size^3 with stride 1."""
         if size not in self._around:
             self._around[size] = self._map(self, size, 1)
         return self._around[size]
 
     @cached_property
     def inside(self) -> KernelMap:
-        """Which voxels of the finer grid lie in each of this one's: a kernel of 2^3 and stride 2."""
+        """Kernel map from the finer grid: a kernel of 2^3 with stride 2."""
         assert self.finer is not None
         return self._map(self.finer, 2, 2)
 
@@ -88,18 +87,18 @@ class VoxelGrid:
         entries = []
         for offset in offsets(size):
             if inputs is self and not any(offset):
-                every = torch.arange(len(self), device=scaled.device)
-                entries.append((every, every))
+                indices = torch.arange(len(self), device=scaled.device)
+                entries.append((indices, indices))
                 continue
-            found = inputs.find(scaled + torch.tensor([0, *offset], device=scaled.device))
-            outputs = (found >= 0).nonzero()[:, 0]
-            entries.append((found[outputs], outputs))
+            neighbours = inputs.find(scaled + torch.tensor([0, *offset], device=scaled.device))
+            outputs = (neighbours >= 0).nonzero()[:, 0]
+            entries.append((neighbours[outputs], outputs))
         return entries
 
 
 @dataclass(frozen=True)
 class Sparse:
-    """Features (N, C) of a grid's voxels."""
+    """Features (N, C) of the voxels of a grid."""
 
     features: Tensor
     grid: VoxelGrid
@@ -111,14 +110,14 @@ class Sparse:
 class SparseConv3d(nn.Module):
     """A sparse convolution without bias.
 
-    Stride 1: onto the same voxels. Stride 2, with a kernel of 2: onto voxels twice as large. Transposed: back onto
-    the voxels that these were made from, with the same map read the other way. A kernel of 1 is a matrix.
+    Stride 1 keeps the voxels; stride 2, with a kernel of 2, doubles their size; a transposed convolution returns to the
+    finer voxels by the inverse map. A kernel of 1 is a linear map.
 
     Args:
         channels, out: C_in, C_out.
         size: Voxels of the kernel along each axis.
         stride: 1, or 2 with a kernel of 2.
-        transposed: Undo a stride.
+        transposed: Whether to invert a stride.
     """
 
     def __init__(self, channels: int, out: int, size: int = 3, stride: int = 1, transposed: bool = False) -> None:
@@ -143,28 +142,28 @@ class SparseConv3d(nn.Module):
 
 
 def convolve(features: Tensor, kernel: Tensor, where: KernelMap, num: int) -> Tensor:
-    """Features (N, C_in) through weights (K, C_in, C_out) onto `num` voxels, (num, C_out)."""
+    """Convolve features (N, C_in) with weights (K, C_in, C_out) onto `num` voxels, (num, C_out)."""
     out = features.new_zeros(num, kernel.shape[2])
     for weight, (inputs, outputs) in zip(kernel, where, strict=True):
-        if inputs is outputs:  # a kernel's own voxel: nothing to gather or scatter
+        if inputs is outputs:  # the kernel's centre needs no gather or scatter
             out.addmm_(features, weight)
             continue
-        # For one offset an output occurs at most once, so that reading and writing back adds correctly. Unlike
-        # index_add_ on a GPU it is deterministic.
+        # An output occurs at most once per offset, so that copies add correctly and, unlike index_add_ on a GPU,
+        # deterministically.
         part = torch.addmm(out.index_select(0, outputs), features.index_select(0, inputs), weight)
         out.index_copy_(0, outputs, part)
     return out
 
 
 class SparseNorm(nn.BatchNorm1d):
-    """Batch normalisation of the voxels' features."""
+    """Batch normalisation of voxel features."""
 
     def forward(self, x: Sparse) -> Sparse:  # type: ignore[override]
         return x.with_features(super().forward(x.features))
 
 
 class SparseReLU(nn.Module):
-    """max(0, x) of the voxels' features."""
+    """ReLU of voxel features."""
 
     def forward(self, x: Sparse) -> Sparse:
         return x.with_features(torch.relu(x.features))

@@ -1,8 +1,7 @@
 """SPVCNN (Tang et al., ECCV 2020), FPVD's feature network: MinkowskiNet's sparse U-Net with a second branch of points.
 
-The published evaluation voxelises first and takes the corners of the voxels as points, so that points and voxels of
-5 cm are the same. At 0.8 m and at 0.2 m, where the branches meet, points are averaged in a voxel and voxels
-interpolated to a point. What is checked and what is not: see minkowski.py.
+The published evaluation voxelises first and takes the corners of the 5 cm voxels as points. The branches meet at 0.8 m
+and 0.2 m: points are averaged per voxel, and voxels are interpolated at points. Verification: see minkowski.py.
 """
 
 import torch
@@ -13,7 +12,7 @@ from r2flow.metrics.extractors.sparse import Sparse, VoxelGrid, offsets
 
 
 class SPVCNN(MinkowskiNet):
-    """FPVD's network; its features are the means of the points' over 16 sectors of distance."""
+    """FPVD's network; features are means of the point features over 16 sectors of distance."""
 
     name = "spvcnn"
     layer = "last features of points, mean over 16 sectors of distance"
@@ -27,7 +26,7 @@ class SPVCNN(MinkowskiNet):
         )
 
     def forward(self, coords: Tensor, features: Tensor) -> Tensor:
-        """The points' last features: as MinkowskiNet's `forward`."""
+        """Last features of points; arguments as in `MinkowskiNet.forward`."""
         x = self.stem(Sparse(features, VoxelGrid(coords)))
         points = x.features
         maps = self.down(x)
@@ -45,14 +44,14 @@ class SPVCNN(MinkowskiNet):
 
 
 class Corners:
-    """Points at scan, x, y, z, (N, 4) int64, among voxels `scale` times as large, with one around each point."""
+    """Points at `coords` (scan, x, y, z; (N, 4) int64) in a grid of voxels that are `scale` times as large."""
 
     def __init__(self, coords: Tensor, grid: VoxelGrid, scale: int) -> None:
         self.num = len(grid)
         around = coords.clone()
         around[:, 1:] = coords[:, 1:].div(scale, rounding_mode="floor")
-        share = (coords[:, 1:] - around[:, 1:] * scale).float() / scale  # of the way to the next voxel
-        self.own = grid.find(around)
+        share = (coords[:, 1:] - around[:, 1:] * scale).float() / scale  # relative position within the voxel
+        self.voxels = grid.find(around)
         self.corners = []
         total = torch.zeros(len(coords), device=coords.device)
         for offset in offsets(2):
@@ -64,13 +63,13 @@ class Corners:
         self.total = total + 1e-8
 
     def to_points(self, features: Tensor) -> Tensor:
-        """Features (M, C) of the voxels, interpolated between the eight around each point that exist: (N, C)."""
-        out = features.new_zeros(len(self.own), features.shape[1])
+        """Interpolate voxel features (M, C) at the points over the existing ones of eight corners: (N, C)."""
+        out = features.new_zeros(len(self.voxels), features.shape[1])
         for voxel, weight in self.corners:
             out.addcmul_(features.index_select(0, voxel), (weight / self.total)[:, None])
         return out
 
     def to_voxels(self, features: Tensor) -> Tensor:
-        """Features (N, C) of the points, their mean in each voxel: (M, C)."""
-        total = features.new_zeros(self.num, features.shape[1]).index_add_(0, self.own, features)
-        return total / torch.bincount(self.own, minlength=self.num)[:, None]
+        """Average point features (N, C) per voxel: (M, C)."""
+        total = features.new_zeros(self.num, features.shape[1]).index_add_(0, self.voxels, features)
+        return total / torch.bincount(self.voxels, minlength=self.num)[:, None]
