@@ -1,8 +1,8 @@
 """Adaptive discriminator augmentation (ADA) on a ring (Karras et al. 2020, "Training generative adversarial networks
 with limited data", section 3 and appendix B).
 
-All that the discriminator sees, real or generated, is changed at random, each transformation with probability p. p
-follows how sure the discriminator is of real images.
+Each transformation is applied with probability p to the discriminator's inputs, real and generated. p adapts to the
+discriminator's scores of real images.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,50 +17,50 @@ from r2flow.noise import generator
 from r2flow.processes import summed
 from r2flow.registry import Natural, NonNegative, Portion, did_you_mean
 
-# Low-pass filter of the wavelet sym6 (Daubechies 1992), which images are doubled and halved with.
+# Low-pass filter of the wavelet sym6 (Daubechies 1992), for up- and downsampling.
 SYM6 = (
     0.015404109327027373, 0.0034907120842174702, -0.11799011114819057, -0.048311742585633, 0.4910559419267466,
     0.787641141030194, 0.3379294217276218, -0.07263752278646252, -0.021060292512300564, 0.04472490177066578,
     0.0017677118642428036, -0.007800708325034148,
 )  # fmt: skip
-MARGIN = len(SYM6) // 4  # pixels computed beyond each edge, which the filter needs
+MARGIN = len(SYM6) // 4  # pixels beyond each edge that the filter needs
 
 
 class BatchDraws:
-    """Random numbers of each image in one part of a step: a function of (seed, number of the image, part)."""
+    """Random numbers per image for one part of a step: a function of (seed, image number, part)."""
 
     def __init__(self, seed: int, batch: Mapping[str, Tensor], part: int) -> None:
         self.streams = [generator(seed, "training", k, part) for k in batch["k"].tolist()]
         self.device = batch["x_1"].device
 
     def uniform(self, shape: tuple[int, ...]) -> Tensor:
-        """In [0, 1), (B, *shape)."""
-        rows = [torch.from_numpy(one.random(shape, dtype="float32")) for one in self.streams]
+        """Uniform in [0, 1), (B, *shape)."""
+        rows = [torch.from_numpy(stream.random(shape, dtype="float32")) for stream in self.streams]
         return torch.stack(rows).to(self.device)
 
     def normal(self, shape: tuple[int, ...]) -> Tensor:
-        """N(0, 1), (B, *shape)."""
-        rows = [torch.from_numpy(one.standard_normal(shape, dtype="float32")) for one in self.streams]
+        """Standard normal, (B, *shape)."""
+        rows = [torch.from_numpy(stream.standard_normal(shape, dtype="float32")) for stream in self.streams]
         return torch.stack(rows).to(self.device)
 
 
 Draw = tuple[Tensor, Tensor]
-"""One transformation of a batch: how much, (B,), or (2, B) for rows and columns; whether at all, (B,), 0 or 1."""
+"""A transformation of a batch: its magnitude, (B,) or (2, B) for rows and columns, and whether it applies, (B,) 0/1."""
 
 
 def _flip(source: BatchDraws) -> Tensor:
     return (source.uniform((1,))[:, 0] < 0.5).float()
 
 
-# In the order in which they are drawn and applied: what is drawn, for a batch.
+# Magnitudes for a batch, in the order of drawing and application.
 GEOMETRY: dict[str, Callable[[BatchDraws], Tensor]] = {
     "lr_flip": _flip,
     "ud_flip": _flip,
-    "int_trans": lambda source: (source.uniform((2,)).mT - 0.5) / 4,  # of the height and of the width
+    "int_trans": lambda source: (source.uniform((2,)).mT - 0.5) / 4,  # relative to height and width
     "iso_scale": lambda source: torch.exp2(0.2 * source.normal((1,))[:, 0]),
     "frac_trans": lambda source: 0.125 * source.normal((2,)).mT,
 }
-# Of the published ones hue and saturation are left out: they change nothing in images of one or two channels.
+# The published hue and saturation do not affect images of one or two channels.
 COLOUR: dict[str, Callable[[BatchDraws], Tensor]] = {
     "brightness": lambda source: 0.2 * source.normal((1,))[:, 0],
     "contrast": lambda source: torch.exp2(0.5 * source.normal((1,))[:, 0]),
@@ -70,19 +70,18 @@ TRANSFORMATIONS = GEOMETRY | COLOUR
 
 
 class AdaptiveAugment(nn.Module):
-    """Random transformations of probability p, and p's rule.
+    """Random transformations with an adaptive probability p.
 
-    Every `every` steps p moves by (images since) / (1000 kimg), up where the mean sign of D's scores of real images is
+    Every `every` steps p changes by (images since) / (1000 kimg), up if the mean sign of D's scores of real images is
     above `target`, else down, within [0, highest].
 
     Args:
-        target: Mean sign of scores of real images that p aims at; None leaves p as it is.
-        kimg: Thousands of images in which p goes from 0 to 1.
-        initial: p at first.
-        highest: Largest p.
-        every: Steps between two moves.
-        policy: By what each transformation's probability differs from p, as a factor; a transformation that is not
-            named has 1, and 0 leaves it out. Names: `TRANSFORMATIONS`.
+        target: Target mean sign of scores of real images; None: constant p.
+        kimg: Thousands of images in which p can rise from 0 to 1.
+        initial: Initial p.
+        highest: Maximum p.
+        every: Steps between updates of p.
+        policy: Factor on p for each transformation in `TRANSFORMATIONS`; default 1; 0: disabled.
     """
 
     p: Tensor
@@ -102,21 +101,21 @@ class AdaptiveAugment(nn.Module):
         self.target, self.images, self.highest, self.every = target, 1000 * kimg, highest, every
         for name in policy or {}:
             if name not in TRANSFORMATIONS:
-                known, hint = ", ".join(TRANSFORMATIONS), did_you_mean(name, TRANSFORMATIONS)
-                raise InputError(f"no augmentation named {name!r}; known: {known}.{hint}")
+                names, hint = ", ".join(TRANSFORMATIONS), did_you_mean(name, TRANSFORMATIONS)
+                raise InputError(f"no augmentation named {name!r}; known: {names}.{hint}")
         self.policy = {name: float((policy or {}).get(name, 1)) for name in TRANSFORMATIONS}
-        # The names of the published state.
+        # Named as in published checkpoints.
         self.register_buffer("p", torch.tensor(float(initial)))
         self.register_buffer("sign_cum", torch.zeros(1))
         self.register_buffer("n_pred_cum", torch.zeros(1))
 
     def count(self, real: Tensor) -> None:
-        """Remember D's scores of real images, of all processes."""
+        """Accumulate D's scores of real images over all processes."""
         self.sign_cum += summed(real.detach().float().sign().sum())
         self.n_pred_cum += summed(torch.tensor(float(len(real)), device=real.device))
 
     def move(self) -> Tensor:
-        """Let p follow the remembered scores, and forget them; their mean sign r_t."""
+        """Update p by the accumulated scores, reset them, and return their mean sign r_t."""
         sign = self.sign_cum / self.n_pred_cum
         if self.target is not None and self.images:
             step = torch.sign(sign - self.target) * self.n_pred_cum / self.images
@@ -126,7 +125,7 @@ class AdaptiveAugment(nn.Module):
         return sign
 
     def draw(self, source: BatchDraws) -> dict[str, Draw]:
-        """The transformations of a batch, by name. How many numbers are drawn does not depend on p."""
+        """Draw the transformations of a batch, by name; the number of draws does not depend on p."""
         draws, p = {}, float(self.p)
         for name, values in TRANSFORMATIONS.items():
             value, u = values(source), source.uniform((1,))[:, 0]
@@ -135,17 +134,16 @@ class AdaptiveAugment(nn.Module):
         return draws
 
     def forward(self, x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
-        """x (B, C, H, W) transformed, differentiable twice, in float32 at least."""
+        """Transform x (B, C, H, W) in at least float32; twice differentiable."""
         with torch.autocast(x.device.type, enabled=False):
             x = x.to(torch.promote_types(x.dtype, torch.float32))
             return coloured(transformed(x, *affine(draws, x.shape[-2], x.shape[-1])), draws)
 
 
 def affine(draws: Mapping[str, Draw], height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Scale and shift of pixels about the image's middle by all of `GEOMETRY`, (2, B) each, rows before columns.
+    """Scale and shift of pixels about the image centre by all of `GEOMETRY`, (2, B) each, rows before columns.
 
-    Flips, shifts of an eighth of the image at most, in whole pixels, a scale of the rows (a scale of the columns would
-    open the ring), and normal shifts.
+    Only rows are scaled, since a scale of columns would open the ring.
     """
     one = torch.ones_like(draws["lr_flip"][1])
     scale, shift = torch.stack([one, one]), torch.stack([0 * one, 0 * one])
@@ -167,10 +165,10 @@ def affine(draws: Mapping[str, Draw], height: int, width: int) -> tuple[Tensor, 
 
 
 def transformed(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
-    """x (B, C, H, W) scaled and then shifted as `affine` says: circular in azimuth, mirrored at the edge rows.
+    """Scale and shift x (B, C, H, W) by the result of `affine`: circular in azimuth, reflected at the edge rows.
 
-    Each axis is doubled by the filter `SYM6`, read between two pixels, and halved by the filter again: all of it linear
-    in x, one matrix for each axis of each image.
+    Each axis is upsampled by the filter `SYM6`, interpolated linearly, and downsampled by the filter: one matrix per
+    axis and image.
     """
     inverse = 1 / scale.double()
     rows, columns = (
@@ -182,39 +180,39 @@ def transformed(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
 
 @torch.no_grad()
 def resampling(size: int, scale: Tensor, shift: Tensor, edge: str) -> Tensor:
-    """Weights of all pixels of a line in each pixel of the line read at scale n + shift, (B, size, size).
+    """Matrix that resamples a line at scale n + shift, (B, size, size).
 
     Args:
-        size: Pixels of the line; n counts them from its middle.
-        scale: (B,), float64, as is `shift`.
-        edge: What is beyond the ends: "circular" or "reflect".
+        size: Pixels of the line; n counts from its centre.
+        scale, shift: (B,), float64.
+        edge: Padding: "circular" or "reflect".
     """
     device = scale.device
     taps = torch.tensor(SYM6, device=device)
     lines = F.pad(torch.eye(size, device=device)[:, None], (size - 1, size - 1), mode=edge)
-    doubled = F.conv_transpose1d(lines, taps[None, None], stride=2, padding=len(SYM6) // 2 - 1)[:, 0].T  # (there, size)
-    there, here = len(doubled), 2 * (size + 2 * MARGIN)
-    pixel = (torch.arange(here, device=device, dtype=torch.float64) + 1 - here / 2) / 2
-    place = 2 * (scale[:, None] * pixel + shift[:, None]) - 1 + there / 2
+    doubled = F.conv_transpose1d(lines, taps[None, None], stride=2, padding=len(SYM6) // 2 - 1)[:, 0].T
+    inputs, outputs = len(doubled), 2 * (size + 2 * MARGIN)
+    pixel = (torch.arange(outputs, device=device, dtype=torch.float64) + 1 - outputs / 2) / 2
+    place = 2 * (scale[:, None] * pixel + shift[:, None]) - 1 + inputs / 2
     first = place.floor().long()
     share = (place - first).float()[..., None]
-    read = _row(doubled, first) * (1 - share) + _row(doubled, first + 1) * share
-    halved = [tap * read[:, 1 + m : 1 + m + 2 * size : 2] for m, tap in enumerate(SYM6)]
+    values = _row(doubled, first) * (1 - share) + _row(doubled, first + 1) * share
+    halved = [tap * values[:, 1 + m : 1 + m + 2 * size : 2] for m, tap in enumerate(SYM6)]
     return sum(halved[1:], halved[0])
 
 
 def _row(lines: Tensor, index: Tensor) -> Tensor:
-    """Rows of `lines`, 0 beyond the ends."""
-    held = (index >= 0) & (index < len(lines))
-    return lines[index.clamp(0, len(lines) - 1)] * held[..., None].to(lines)
+    """Rows of `lines`; 0 beyond the ends."""
+    inside = (index >= 0) & (index < len(lines))
+    return lines[index.clamp(0, len(lines) - 1)] * inside[..., None].to(lines)
 
 
 def coloured(x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
-    """x of one channel changed by all of `COLOUR`; range and reflectance stay as they are, as in the published code."""
+    """Apply all of `COLOUR` to x of one channel; images of two channels are unchanged, as in the published code."""
     if x.shape[1] != 1:
         return x
     for name in COLOUR:
-        value, chosen = (one[:, None, None, None] for one in draws[name])
+        value, chosen = (tensor[:, None, None, None] for tensor in draws[name])
         changed = x + value if name == "brightness" else x * (value if name == "contrast" else 1 - 2 * value)
         x = torch.where(chosen > 0, changed, x)
     return x

@@ -1,5 +1,5 @@
-"""Convolutional GANs (Radford et al. 2016): the vanilla GAN and DUSty v1 (Nakashima and Kurazume
-2021, in the form that DUSty v2's authors compare with)."""
+"""Convolutional GANs (Radford et al. 2016): the vanilla GAN and DUSty v1 (Nakashima and Kurazume 2021), as the
+baselines in the code of DUSty v2."""
 
 from itertools import pairwise
 
@@ -26,7 +26,7 @@ def _doubling(in_channels: int, out_channels: int, ring: bool, bias: bool) -> li
 
 
 class Heads(nn.Module):
-    """One last doubling for each output."""
+    """A final upsampling layer per output."""
 
     def __init__(self, in_channels: int, made: dict[str, int], ring: bool) -> None:
         super().__init__()
@@ -39,14 +39,14 @@ class Heads(nn.Module):
 
 
 class Generator(LatentGenerator):
-    """z, projected to a small map, doubled by 4 x 4 transposed convolutions to the image; w is z.
+    """Projection of z to a small map, upsampled to the image by 4 x 4 transposed convolutions; w is z.
 
     Args:
         shape: Rows and columns of the image.
-        channels: Of the image.
-        drops: Whether a second head says which rays return (DUSty v1); else the vanilla GAN.
+        channels: Image channels.
+        drops: Whether a second head predicts ray-drop (DUSty v1); else the vanilla GAN.
 
-    See `r2flow.systems.gan.generator.VanillaGan` for the others.
+    See `r2flow.systems.gan.generator.VanillaGan` for other arguments.
     """
 
     def __init__(
@@ -80,14 +80,14 @@ class Generator(LatentGenerator):
 
 
 class Discriminator(nn.Sequential):
-    """x (B, C, H, W) to scores (B, 1, 1, 1): blurred, halved by 4 x 4 convolutions, then one number.
+    """Scores (B, 1, 1, 1) of images (B, C, H, W): blur, strided 4 x 4 convolutions and a linear layer.
 
     Args:
         shape: Rows and columns of the image.
-        channels: Of the image.
-        base_channels: Width of the first map; it doubles inwards.
-        max_channels: Widest.
-        halvings: From the image to the last map; 4 as published.
+        channels: Image channels.
+        base_channels: Width of the first layer; each further layer doubles it.
+        max_channels: Maximum width.
+        halvings: Number of strided convolutions; published: 4.
     """
 
     def __init__(

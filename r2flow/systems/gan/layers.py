@@ -1,4 +1,4 @@
-"""What the GANs' networks are made of: layers of equalised learning rate, edges, filters, and latent codes."""
+"""Layers of GANs: equalised learning rate, padding, filters, ray-drop masks and latent codes."""
 
 import math
 from collections.abc import Sequence
@@ -12,17 +12,16 @@ from r2flow.backbones.layers import ExactBuffers, at_least_float32, wrapped
 from r2flow.errors import InputError
 from r2flow.processes import averaged
 
-DROPPED = -1.0  # a dropped ray in model space
+DROPPED = -1.0  # value of a dropped ray in model space
 EPS = torch.finfo(torch.float32).eps
 IMAGE, LOGIT, MASK, ORIGINAL, CODE = "image", "raydrop_logit", "raydrop_mask", "image_orig", "w"
 
 
 class Equalised(nn.Module):
-    """gain rate f(x / sqrt n) with weights of N(0, 1 / rate^2), zero biases and n = the elements of weight[0].
+    """gain rate f(x / sqrt n) with weights of N(0, 1 / rate^2), zero biases and n = weight[0].numel().
 
-    Adam then learns all layers at one speed, `rate` times that of others (Karras et al. 2018, section 4.1). n is the
-    fan-in but for a transposed convolution, where the published weights were trained with out_channels k k. `exact`
-    computes in float32 whatever autocast does.
+    Adam then learns all layers at equal speed, times `rate` (Karras et al. 2018, section 4.1). n is the fan-in, except
+    for transposed convolutions, as in the published weights. `exact` computes in float32 also under autocast.
     """
 
     def __init__(self, module: nn.Module, gain: float = 1.0, rate: float = 1.0, exact: bool = False) -> None:
@@ -43,7 +42,7 @@ class Equalised(nn.Module):
 
 
 class BiasedLeakyReLU(nn.Module):
-    """sqrt(2) max(x + b, 0.2 (x + b)) with a bias for each channel."""
+    """sqrt(2) max(x + b, 0.2 (x + b)) with a bias b per channel."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -55,7 +54,7 @@ class BiasedLeakyReLU(nn.Module):
 
 
 class Pad(nn.Module):
-    """One pixel more at each edge: circular in azimuth where the image is a ring, else as `edge` says."""
+    """Padding by one pixel: circular in azimuth for `ring`, else by the mode `edge`."""
 
     def __init__(self, ring: bool, edge: str) -> None:
         super().__init__()
@@ -67,10 +66,10 @@ class Pad(nn.Module):
 
 
 class Filter(ExactBuffers):
-    """An image of the same size by a separable filter, circular in azimuth, the edge rows repeated.
+    """A separable filter with circular padding in azimuth and replicated edge rows; it keeps the size.
 
     Args:
-        window: Filter taps, normalised to sum 1; of an even number, one more reaches to the left and up.
+        window: Filter taps, normalised to sum 1; an even number reaches one pixel further left and up.
         axes: "h" (elevation), "w" (azimuth) or "hw".
     """
 
@@ -94,7 +93,7 @@ class Filter(ExactBuffers):
 
 
 class BlurBoth(nn.Module):
-    """The image blurred in elevation and, as further channels, blurred in azimuth (Kaneko and Harada 2020, NR-GAN)."""
+    """Concatenation of the image blurred in elevation and in azimuth (Kaneko and Harada 2020, NR-GAN)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -105,7 +104,7 @@ class BlurBoth(nn.Module):
 
 
 def logistic(uniform: Tensor) -> Tensor:
-    """log u - log(1 - u): standard logistic noise of u in [0, 1), clamped to [eps, 1 - eps] of float32."""
+    """Standard logistic noise log u - log(1 - u) for u in [0, 1), clamped to [eps, 1 - eps] of float32."""
     u = uniform.clamp(EPS, 1 - EPS)
     return u.log() - torch.log1p(-u)
 
@@ -121,7 +120,7 @@ def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0
 
 
 class RayDrop(nn.Module):
-    """The image where a drawn mask keeps a ray, -1 elsewhere (Nakashima and Kurazume 2021, section III-B)."""
+    """Set rays dropped by a random mask to -1 (Nakashima and Kurazume 2021, section III-B)."""
 
     raydrop_const: Tensor
 
@@ -135,26 +134,26 @@ class RayDrop(nn.Module):
 
 
 class LatentGenerator(nn.Module):
-    """z to an image: a mapping to a code w, a synthesis and, where rays are dropped, a measurement.
+    """Generate images from z: a mapping to a code w, a synthesis and optionally a ray-drop mask.
 
-    Parameters carry the published weights' names.
+    Parameter names are those of the published weights.
 
     Args:
         latent: Width of z.
         code: Width of w.
-        mapping: z (B, latent) to w (B, code).
-        synthesis: w, and angles with their turn if there are any, to `image` and, where rays are dropped,
-            `raydrop_logit`, (B, ., H, W) float32.
-        measurement: What draws the mask; None where no ray is dropped.
-        tanh: Whether the image ends in tanh.
-        num_styles: Layers that take w.
+        mapping: Maps z (B, latent) to w (B, code).
+        synthesis: Maps w, optionally with angles and their rotation, to `image` and optionally `raydrop_logit`,
+            (B, ., H, W) float32.
+        measurement: Samples the mask; None: no mask.
+        tanh: Whether tanh is applied to the image.
+        num_styles: Number of layers that take w.
 
     Attributes:
-        temperature: Of the relaxed mask.
+        temperature: Temperature of the relaxed mask.
     """
 
     w_avg: Tensor
-    decay = 0.995  # of the mean code
+    decay = 0.995  # of the average w_avg
     temperature = 1.0
 
     def __init__(
@@ -181,20 +180,18 @@ class LatentGenerator(nn.Module):
         uniform: Tensor | None = None,
         shift: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """The image and what it was made of.
-
-        In training mode the mean code follows w; else w is moved towards it.
+        """Generate images; in training mode, also update the average code w_avg.
 
         Args:
             z: (B, latent), standard normal.
-            angle: Elevation and azimuth of every pixel, (1 or B, 2, H, W), for a synthesis that asks for them.
+            angle: Elevation and azimuth of every pixel, (1 or B, 2, H, W), for a synthesis that uses them.
             truncation: psi of w <- w_avg + psi (w - w_avg), outside training (Karras et al. 2019, section B).
-            uniform: u in [0, 1) of the mask's noise, (B, 1, H, W).
-            shift: Random turn of each scan's azimuth, as a share of a full one, (B,), for a synthesis with angles.
+            uniform: u in [0, 1) for the noise of the mask, (B, 1, H, W).
+            shift: Azimuth rotation of each scan in full turns, (B,), for a synthesis with angles.
 
         Returns:
-            `image` (B, C, H, W) and `w` (B, layers, code); where rays are dropped also `image_orig`, `raydrop_logit`
-            and `raydrop_mask`.
+            `image` (B, C, H, W) and `w` (B, layers, code); with a mask also `image_orig`, `raydrop_logit` and
+            `raydrop_mask`.
         """
         w: Tensor = self.mapping_network(z)
         if self.training:
@@ -213,7 +210,7 @@ class LatentGenerator(nn.Module):
 
 
 def halved(what: str, shape: tuple[int, int], times: int, least: int = 1) -> tuple[int, int]:
-    """Rows and columns of an image after so many halvings, at least so many; refuses an image that has no such."""
+    """Rows and columns of an image after `times` halvings; refuses indivisible sizes and results below `least`."""
     rows, columns = shape[0] >> times, shape[1] >> times
     if (rows << times, columns << times) != tuple(shape) or min(rows, columns) < least:
         raise InputError(

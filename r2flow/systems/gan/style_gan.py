@@ -1,5 +1,5 @@
 """A style-based GAN on rays (DUSty v2: Nakashima, Iwashita and Kurazume 2023, "Generative range imaging for learning
-scene priors of 3D LiDAR data"): every pixel is made from its own angles, by a code that modulates 1 x 1 convolutions.
+scene priors of 3D LiDAR data"): 1 x 1 convolutions, modulated by a code, map the angles of each pixel to its value.
 """
 
 import math
@@ -31,10 +31,10 @@ FREQUENCIES = 256
 
 
 class RandomFrequencies(ExactBuffers):
-    """sin and cos of f_e e + f_a a + phase for 256 fixed random frequencies: 512 features of each ray.
+    """sin and cos of f_e e + f_a a + phase for 256 fixed random frequencies: 512 features per ray.
 
-    f_e is uniform within 2^(ceil(log2 H) + 2); f_a is 0 or +-2^k for k < ceil(log2 W) - 1, so that the features close
-    around the turn of a level of H rows and W columns.
+    f_e is uniform within +-2^(ceil(log2 H) + 2); f_a is 0 or +-2^k for k < ceil(log2 W) - 1, so that features are
+    periodic in azimuth. The level has H rows and W columns.
     """
 
     freqs: Tensor
@@ -45,28 +45,27 @@ class RandomFrequencies(ExactBuffers):
         octaves_e, octaves_a = (math.ceil(math.log2(size)) for size in shape)
         elevation = (2 * torch.rand(FREQUENCIES) - 1) * 2.0 ** (octaves_e + 2)
         harmonics = 2.0 ** torch.arange(max(octaves_a - 1, 0))
-        ladder = torch.cat([-harmonics, torch.zeros(1), harmonics])
-        azimuth = ladder[torch.randint(len(ladder), (FREQUENCIES,))]
+        choices = torch.cat([-harmonics, torch.zeros(1), harmonics])
+        azimuth = choices[torch.randint(len(choices), (FREQUENCIES,))]
         self.register_buffer("freqs", torch.stack([elevation, azimuth], 1)[:, :, None, None])
         self.register_buffer("phase", 2 * math.pi * torch.rand(FREQUENCIES))
 
     def forward(self, angle: Tensor) -> Tensor:
-        e, a = angle[:, :1], angle[:, 1:]  # elementwise: a matrix product would be rounded by autocast
+        e, a = angle[:, :1], angle[:, 1:]  # elementwise, since autocast would round a matrix product
         theta = self.freqs[:, 0] * e + self.freqs[:, 1] * a + self.phase[:, None, None]
         return torch.cat([theta.sin(), theta.cos()], dim=1)
 
 
 class ModulatedConv(nn.Module):
-    """A 1 x 1 convolution whose weights a code scales (Karras et al. 2020, StyleGAN2, section 2.2).
+    """A 1 x 1 convolution with weights modulated by a code (Karras et al. 2020, StyleGAN2, section 2.2).
 
-    With s = A w + b over its largest magnitude and W over its own, W'_oi = W_oi (s_i + 1), each output's weights then
-    at norm 1; and all of it over the root of a running mean of the input's square (Karras et al. 2021, StyleGAN3,
-    appendix C). Weights are float32 whatever autocast does. The last layers' weights are not normed, but over
-    sqrt(in_channels).
+    W'_oi = W_oi (s_i + 1) with s = A w + b, where W and s are divided by their largest magnitudes and W'_o is scaled to
+    norm 1, then divided by the root of a running mean of the input's square (Karras et al. 2021, StyleGAN3, appendix
+    C). Weights are float32 also under autocast. Without `norm`, W is divided by sqrt(in_channels) instead.
     """
 
     ema_var: Tensor
-    decay = 0.9989  # of the mean square, for each batch: half of it from the last 20,000 images, 32 at a time
+    decay = 0.9989  # of the mean square, per batch: a half-life of 20,000 images at batch size 32
 
     def __init__(self, in_channels: int, out_channels: int, code: int, norm: bool = True) -> None:
         super().__init__()
@@ -88,8 +87,8 @@ class ModulatedConv(nn.Module):
             weight = weight * torch.rsqrt(weight.square().sum(2, keepdim=True) + 1e-8)
         mean_square = self.ema_var
         if self.training:
-            found = averaged(at_least_float32(x.detach()).square().mean())
-            mean_square = mean_square.lerp(found, 1 - self.decay)
+            batch_mean = averaged(at_least_float32(x.detach()).square().mean())
+            mean_square = mean_square.lerp(batch_mean, 1 - self.decay)
             self.ema_var.copy_(mean_square)
         weight = weight / (mean_square.sqrt() + 1e-8)
         made = torch.bmm(weight.to(x.dtype), x.flatten(2)).unflatten(2, x.shape[2:])
@@ -97,7 +96,7 @@ class ModulatedConv(nn.Module):
 
 
 class Heads(nn.Module):
-    """One modulated layer for each output."""
+    """A modulated layer per output."""
 
     def __init__(self, in_channels: int, made: dict[str, int], code: int) -> None:
         super().__init__()
@@ -108,7 +107,7 @@ class Heads(nn.Module):
 
 
 class Level(nn.Module):
-    """Features at twice the size of the last level's, beside those of the rays, and what they add to each output."""
+    """Upsampled features concatenated with ray features, and their contribution to each output."""
 
     def __init__(
         self, in_channels: int, channels: int, made: dict[str, int], code: int, shape: tuple[int, int], ring: bool
@@ -127,7 +126,7 @@ class Level(nn.Module):
         self.head = Heads(channels, made, code)
 
     def coarser(self, angle: Tensor) -> Tensor:
-        """The angles of the level before: of the filtered sines and cosines, for a mean angle would break at +-pi."""
+        """Angles of the previous level, from filtered sines and cosines to avoid the discontinuity at +-pi."""
         return torch.atan2(self.downsample(angle.sin()), self.downsample(angle.cos()))
 
     def forward(
@@ -143,7 +142,7 @@ class Level(nn.Module):
 
 
 class Synthesis(nn.Module):
-    """Levels from coarse to fine, each twice the size of the last; outputs are summed over them and divided by 4."""
+    """Levels from coarse to fine, each doubling the size; outputs are summed over levels and divided by 4."""
 
     def __init__(
         self,
@@ -169,15 +168,15 @@ class Synthesis(nn.Module):
             angles.insert(0, level.coarser(angles[0]))  # type: ignore[operator]
         x: Tensor | None = None
         made: dict[str, Tensor] = {}
-        for level, seen in zip(self.layers, angles, strict=True):
-            x, made = level(x, made, w, seen)
+        for level, level_angle in zip(self.layers, angles, strict=True):
+            x, made = level(x, made, w, level_angle)
         if shift is not None:
             made = {name: turned_back(o, shift) for name, o in made.items()}
         return {name: o / 4 for name, o in made.items()}
 
 
 def turned_back(x: Tensor, shift: Tensor) -> Tensor:
-    """x (B, C, H, W) read `shift` of a turn further to the right, (B,), linearly between two columns of the ring."""
+    """Rotate x (B, C, H, W) left by `shift` turns, (B,), with linear interpolation of columns."""
     width = x.shape[-1]
     place = torch.arange(width, device=x.device) + shift.double()[:, None] * width
     first = place.floor()
@@ -187,15 +186,15 @@ def turned_back(x: Tensor, shift: Tensor) -> Tensor:
 
 
 class Generator(LatentGenerator):
-    """z to a code w by two layers, and w with the rays' angles to an image and its mask.
+    """Map z to a code w, and w with the angles of rays to an image and its mask.
 
-    In training each scan is made as seen by a sensor turned at random and turned back, so that no azimuth is special.
+    Training rotates the angles at random and rotates the image back, so that all azimuths are alike.
 
     Args:
         shape: Rows and columns of the image.
-        channels: Of the image.
+        channels: Image channels.
 
-    See `r2flow.systems.gan.generator.DustyV2` for the others.
+    See `r2flow.systems.gan.generator.DustyV2` for other arguments.
     """
 
     def __init__(
@@ -226,9 +225,9 @@ class Generator(LatentGenerator):
 
 
 class ResidualBlock(nn.Module):
-    """(f(x) + g(x)) / sqrt 2 at half the size: f two 3 x 3 convolutions, g one of 1 x 1, both halving what is filtered.
+    """(f(x) + g(x)) / sqrt 2 at half the size: two 3 x 3 convolutions f, a 1 x 1 convolution g, strided after a filter.
 
-    The residual network of StyleGAN2's discriminator (Karras et al. 2020, figure 7c).
+    The residual block of StyleGAN2's discriminator (Karras et al. 2020, figure 7c).
     """
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
@@ -251,29 +250,29 @@ def _convolution(in_channels: int, out_channels: int, stride: int = 1) -> nn.Seq
 
 
 class MinibatchDeviation(nn.Module):
-    """How much images differ, as one channel more: the mean deviation of all features over groups of images.
+    """Append a channel with the standard deviation over a group of images, averaged over all features.
 
-    Of a batch of B in groups of G, images b, b + B / G, ... belong together (Karras et al. 2018, section 3). G is the
-    largest number up to 4 that divides B.
+    A group has G images b, b + B / G, ..., with the largest divisor G <= 4 of the batch size B (Karras et al. 2018,
+    section 3).
     """
 
     def forward(self, x: Tensor) -> Tensor:
         group = max(n for n in range(1, 5) if len(x) % n == 0)
         grouped = at_least_float32(x).unflatten(0, (group, -1))
         deviation = (grouped.var(0, unbiased=False) + 1e-8).sqrt().mean((1, 2, 3))[:, None]
-        said = deviation.repeat(group, 1)[:, :, None, None].expand(-1, -1, *x.shape[2:])
-        return torch.cat([x, said.to(x.dtype)], dim=1)
+        channel = deviation.repeat(group, 1)[:, :, None, None].expand(-1, -1, *x.shape[2:])
+        return torch.cat([x, channel.to(x.dtype)], dim=1)
 
 
 class Discriminator(nn.Module):
-    """x (B, C, H, W) to scores (B, 1): blurred, halved by residual blocks, compared with the others of its batch.
+    """Scores (B, 1) of images (B, C, H, W): blur, residual blocks, minibatch deviation and linear layers.
 
     Args:
         shape: Rows and columns of the image.
-        channels: Of the image.
-        base_channels: Width of the first map; it doubles inwards.
-        max_channels: Widest.
-        halvings: From the image to the last map; None for as many as leave 4 rows or columns.
+        channels: Image channels.
+        base_channels: Width of the first layer; each block doubles it.
+        max_channels: Maximum width.
+        halvings: Number of blocks; None: as many as leave at least 4 rows and columns.
     """
 
     def __init__(

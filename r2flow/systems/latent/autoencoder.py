@@ -1,7 +1,6 @@
-"""LiDM's autoencoder: range images to a small map of codes and back (Ran et al. 2024, "Towards realistic scene
-generation with LiDAR diffusion models").
+"""LiDM's autoencoder (Ran et al. 2024, "Towards realistic scene generation with LiDAR diffusion models").
 
-Circular in azimuth, zeros beyond the top and bottom. Parameters carry the published weights' names.
+Padding is circular in azimuth and zero in elevation. Parameter names are those of the published weights.
 """
 
 import math
@@ -24,7 +23,7 @@ GROUPS = 32
 Size = tuple[int, int]
 Margins = tuple[int, int, int, int]  # left, right, top, bottom
 
-# Of a stride (rows, columns): kernel and margins on the way down, of the blocks of the decoder, and on the way up.
+# Stride (rows, columns) -> kernel and margins of downsampling, decoder blocks and upsampling.
 DOWN: dict[Size, tuple[Size, Margins]] = {(1, 2): ((3, 3), (0, 1, 1, 1)), (2, 2): ((3, 3), (0, 1, 0, 1))}
 BLOCK: dict[Size, tuple[Size, Margins]] = {(1, 2): ((1, 4), (1, 2, 0, 0)), (2, 2): ((3, 3), (1, 1, 1, 1))}
 UP: dict[Size, tuple[Size, Margins]] = {(1, 2): ((1, 5), (2, 2, 0, 0)), (2, 2): ((3, 3), (1, 1, 1, 1))}
@@ -33,7 +32,7 @@ FLAT = BLOCK[1, 2]
 
 
 class CircularConv2d(nn.Conv2d):
-    """A convolution with margins of its own: circular on the left and right, zeros at the top and bottom."""
+    """A convolution with given margins: circular left and right, zeros at the top and bottom."""
 
     def __init__(
         self,
@@ -69,7 +68,7 @@ class ResidualBlock(nn.Module):
 
 
 class Attention(nn.Module):
-    """x + attention(norm x) among all pixels, with one head."""
+    """x + attention(norm x) over all pixels, with one head."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -78,35 +77,31 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         normed = self.norm(x)
-        # with a dimension of heads and contiguous, as the fast kernels want them
+        # Contiguous with a dimension of heads, as the fast kernels need.
         q, k, v = (layer(normed).flatten(2).mT[:, None].contiguous() for layer in (self.q, self.k, self.v))
         attended = F.scaled_dot_product_attention(q, k, v)[:, 0].mT.unflatten(2, x.shape[2:])
         return x + self.proj_out(attended)
 
 
 def _middle(channels: int) -> nn.Module:
-    """A residual block, attention and another one."""
+    """Residual block, attention, residual block."""
     blocks = ResidualBlock(channels, channels), ResidualBlock(channels, channels)
     return nn.Sequential(OrderedDict(block_1=blocks[0], attn_1=Attention(channels), block_2=blocks[1]))
 
 
 def _downsample(channels: int, stride: Size) -> nn.Module:
-    """A convolution that takes every stride-th row and column."""
+    """A strided convolution."""
     return nn.Sequential(OrderedDict(conv=CircularConv2d(channels, channels, *DOWN[stride], stride=stride)))
 
 
 def _upsample(channels: int, stride: Size) -> nn.Module:
-    """Bilinear between the outermost pixels, which stay where they are, then a convolution."""
+    """Bilinear interpolation with aligned corners, then a convolution."""
     enlarge = nn.Upsample(scale_factor=stride, mode="bilinear", align_corners=True)
     return nn.Sequential(OrderedDict(enlarge=enlarge, conv=CircularConv2d(channels, channels, *UP[stride])))
 
 
 class Level(nn.Module):
-    """Residual blocks of one resolution, each followed by attention where the level has it.
-
-    Attributes:
-        downsample, upsample: To the next level, where there is one.
-    """
+    """Residual blocks of one resolution, optionally with attention after each and a resampling to the next level."""
 
     def __init__(
         self,
@@ -135,7 +130,7 @@ class Level(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Images (B, channels, H, W) to (B, out_channels, H / rows, W / columns), of all strides together."""
+    """Images (B, channels, H, W) to (B, out_channels, H / rows, W / columns), with the product of all strides."""
 
     def __init__(
         self,
@@ -148,9 +143,9 @@ class Encoder(nn.Module):
     ) -> None:
         super().__init__()
         self.conv_in = CircularConv2d(channels, widths[0])
-        before = [widths[0], *widths]
+        in_widths = [widths[0], *widths]
         self.down = nn.ModuleList(
-            Level([before[i], *[width] * blocks], SQUARE, i in attends, down=stride)
+            Level([in_widths[i], *[width] * blocks], SQUARE, i in attends, down=stride)
             for i, (width, stride) in enumerate(zip(widths, [*strides, None], strict=True))
         )
         self.mid = _middle(widths[-1])
@@ -165,7 +160,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """The way back, with one more block a level; a level that widens columns alone looks along rows alone."""
+    """Latents to images, with one more block per level than the encoder; kernels follow the level's stride."""
 
     def __init__(
         self,
@@ -179,10 +174,10 @@ class Decoder(nn.Module):
         super().__init__()
         self.conv_in = CircularConv2d(channels, widths[-1])
         self.mid = _middle(widths[-1])
-        deeper = [*widths[1:], widths[-1]]
+        in_widths = [*widths[1:], widths[-1]]
         self.up = nn.ModuleList(
             Level(
-                [deeper[i], *[width] * (blocks + 1)],
+                [in_widths[i], *[width] * (blocks + 1)],
                 FLAT if stride is None else BLOCK[stride],
                 i in attends,
                 up=stride,
@@ -200,21 +195,20 @@ class Decoder(nn.Module):
 
 
 class Autoencoder(nn.Module):
-    """Images (B, C, H, W) to latents (B, code_channels, h, w), nearest codes, and back.
+    """Images (B, C, H, W) to latents (B, code_channels, h, w), quantisation, and back.
 
     Args:
-        channels: C of the images.
-        width: Of the first level, a multiple of 32.
-        multipliers: Width of each level over `width`.
-        strides: Rows and columns that become one between each level and the next: [1, 2] or [2, 2].
-        blocks: Residual blocks of each level; the decoder has one more.
-        attention: Numbers of the levels that attend, beside the middle, which always does.
-        latent_channels: Between the encoder and the codes' projections.
-        code_channels: Of a code.
-        codes: How many there are.
-        beta: See `Quantiser`.
-        legacy: See `Quantiser`.
-        mask: Whether the decoder says, in one channel more, which rays return; where it is negative there is none.
+        channels: Image channels C.
+        width: Width of the first level, a multiple of 32.
+        multipliers: Width of each level relative to `width`.
+        strides: Downsampling of rows and columns between levels: [1, 2] or [2, 2].
+        blocks: Residual blocks per level of the encoder; the decoder has one more.
+        attention: Indices of levels with attention; the middle always has it.
+        latent_channels: Channels between the encoder and the projection to codes.
+        code_channels: Channels of a code.
+        codes: Size of the codebook.
+        beta, legacy: See `Quantiser`.
+        mask: Whether the decoder's last channel is a mask, negative at dropped rays.
     """
 
     def __init__(
@@ -251,7 +245,7 @@ class Autoencoder(nn.Module):
         self.post_quant_conv = nn.Conv2d(code_channels, latent_channels, 1)
 
     def latent_shape(self, rows: int, columns: int) -> tuple[int, int, int]:
-        """(code_channels, h, w) of an image's latents."""
+        """Shape (code_channels, h, w) of the latents of an image."""
         high, wide = (math.prod(stride[axis] for stride in self.strides) for axis in (0, 1))
         if rows % high or columns % wide:
             raise InputError(
@@ -260,15 +254,15 @@ class Autoencoder(nn.Module):
         return self.code_channels, rows // high, columns // wide
 
     def encode(self, x: Tensor) -> Tensor:
-        """Latents, not yet codes."""
+        """Latents before quantisation."""
         return self.quant_conv(self.encoder(x))
 
     def decode(self, z: Tensor, quantise: bool = True) -> Tensor:
-        """The image of latents, which become codes first; a ray that the mask drops is -1."""
+        """Decode latents, by default after quantisation; rays dropped by the mask are -1."""
         image = self.decoder(self.post_quant_conv(self.quantize(z).codes if quantise else z))
         return torch.where(image[:, -1:] < 0, -1.0, image[:, :-1]) if self.mask else image
 
     def forward(self, x: Tensor) -> tuple[Tensor, Quantised]:
-        """The reconstruction, with its mask in the last channel where there is one, and what the quantiser found."""
+        """Reconstruction, including the mask channel, and output of the quantiser."""
         quantised = self.quantize(self.encode(x))
         return self.decoder(self.post_quant_conv(quantised.codes)), quantised

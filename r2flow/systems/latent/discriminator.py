@@ -9,30 +9,30 @@ from r2flow.registry import Count
 
 
 class PatchDiscriminator(nn.Module):
-    """Images (B, channels, H, W) to a map of scores: 4 x 4 convolutions, batch norm and leaky ReLU.
+    """Map of scores of images (B, channels, H, W): 4 x 4 convolutions, batch norm and leaky ReLU.
 
     Args:
-        channels: Of the images.
-        width: Of the first convolution; each further one doubles it, up to 8 times.
-        layers: Convolutions that halve the image.
+        channels: Image channels.
+        width: Width of the first convolution; each further one doubles it, up to a factor of 8.
+        layers: Number of strided convolutions.
 
     Attributes:
-        smallest: The fewest rows or columns of an image that leave a score.
+        smallest: Minimum rows and columns of an image.
     """
 
     def __init__(self, channels: Count = 1, width: Count = 64, layers: Count = 3) -> None:
         super().__init__()
         self.smallest = 3 * 2**layers  # after `layers` halvings, two 4 x 4 convolutions without stride
         parts: list[nn.Module] = [nn.Conv2d(channels, width, 4, 2, 1), nn.LeakyReLU(0.2)]
-        here = width
+        narrow = width
         for layer in range(1, layers + 1):
-            after = width * min(2**layer, 8)
+            wide = width * min(2**layer, 8)
             stride = 2 if layer < layers else 1
             parts += [
-                nn.Conv2d(here, after, 4, stride, 1, bias=False), nn.BatchNorm2d(after), nn.LeakyReLU(0.2),
+                nn.Conv2d(narrow, wide, 4, stride, 1, bias=False), nn.BatchNorm2d(wide), nn.LeakyReLU(0.2),
             ]  # fmt: skip
-            here = after
-        self.main = nn.Sequential(*parts, nn.Conv2d(here, 1, 4, 1, 1))
+            narrow = wide
+        self.main = nn.Sequential(*parts, nn.Conv2d(narrow, 1, 4, 1, 1))
         for module in self.main:
             if isinstance(module, nn.Conv2d):
                 nn.init.normal_(module.weight, 0, 0.02)
@@ -44,30 +44,30 @@ class PatchDiscriminator(nn.Module):
 
 
 def hinge_loss(real: Tensor, fake: Tensor) -> Tensor:
-    """(mean max(0, 1 - real) + mean max(0, 1 + fake)) / 2 of the discriminator's scores."""
+    """(mean max(0, 1 - real) + mean max(0, 1 + fake)) / 2 for scores of the discriminator."""
     return (F.relu(1 - real).mean() + F.relu(1 + fake).mean()) / 2
 
 
 def adaptive_weight(reconstruction: Tensor, adversarial: Tensor, last: Tensor, weight: float) -> Tensor:
-    """weight |grad R| / (|grad A| + 1e-4), at most 1e4 weight: the adversarial loss A then pulls as hard as the
-    reconstruction R does at the decoder's last weights (eq. 7).
+    """weight |grad R| / (|grad A| + 1e-4), at most 1e4 weight: balances the adversarial loss A with the reconstruction
+    loss R at the decoder's last weights (eq. 7).
 
     Args:
-        last: These weights, whose gradients are averaged over all processes.
+        last: The decoder's last weights; their gradients are averaged over all processes.
     """
-    toward, against = (
+    grad_r, grad_a = (
         averaged(torch.autograd.grad(loss, last, retain_graph=True)[0]).norm() for loss in (reconstruction, adversarial)
     )
-    return weight * (toward / (against + 1e-4)).clamp(0, 1e4).detach()
+    return weight * (grad_r / (grad_a + 1e-4)).clamp(0, 1e4).detach()
 
 
 def reconstruction_loss(x: Tensor, made: Tensor, mask: Tensor | None = None, mask_factor: float = 0.0) -> Tensor:
-    """mean |x - made|; with a mask, (mean |x - made| + mask_factor mean |mask - made's last channel|) / 2.
+    """mean |x - made|; with a mask, (mean |x - made| + mask_factor mean |mask - predicted mask|) / 2.
 
     Args:
         x: Images, (B, C, H, W).
-        made: (B, C, H, W), or with a channel more, the mask's.
-        mask: (B, 1, H, W), 1 where a ray returns and -1 where it does not.
+        made: Reconstructions, (B, C, H, W), optionally with the predicted mask as last channel.
+        mask: (B, 1, H, W), 1: return, -1: dropped ray.
     """
     error = (x - made[:, : x.shape[1]]).abs().mean()
     if mask is None or not mask_factor:
@@ -76,5 +76,5 @@ def reconstruction_loss(x: Tensor, made: Tensor, mask: Tensor | None = None, mas
 
 
 def adversarial_factor(step: int, start: int, inverted: bool = False) -> float:
-    """0 before the step `start` and 1 from it on; `inverted`, as LiDM's published code: 1 up to it and 0 after it."""
+    """0 before step `start`, then 1; `inverted`, as in LiDM's published code: 1 up to `start`, then 0."""
     return float(step <= start if inverted else step >= start)

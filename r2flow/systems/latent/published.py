@@ -1,8 +1,7 @@
-"""LiDM's published checkpoints: Lightning's dict, whose state_dict holds a latent diffusion with its autoencoder, or an
-autoencoder alone.
+"""LiDM's published checkpoints: Lightning files of a latent diffusion with its autoencoder, or of an autoencoder.
 
-The files say neither the size of the images nor the width of attention heads. Both are in the `config.yaml` that is
-published with them: where that lies next to a file it is read, else they are 64 x 1024 and 32, as in all of them.
+Image size and width of attention heads are read from the published `config.yaml` next to a file; without it they are
+64 x 1024 and 32, as in all published files.
 """
 
 import logging
@@ -42,7 +41,7 @@ def holds_autoencoder(content: Any) -> bool:
 
 
 def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
-    """A published latent diffusion, with its averaged weights, whose names have lost their dots."""
+    """Read a published latent diffusion; names of averaged weights have no dots."""
     state, notes = _state(content), _notes(path)
     raw = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
     undotted = {name: AVERAGE + name.removeprefix("model.").replace(".", "") for name in raw}
@@ -60,7 +59,7 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
 
 
 def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
-    """A published autoencoder; its discriminator is left out."""
+    """Read a published autoencoder, without its discriminator."""
     raw = {name: value for name, value in _state(content).items() if not name.startswith("loss.")}
     config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(raw)}, path, _notes(path))
     return Published(config, {AUTOENCODER + name: value for name, value in raw.items()}, _step(content))
@@ -75,7 +74,7 @@ def _step(content: Mapping[str, Any]) -> int:
 
 
 def _counted(names: Mapping[str, Tensor], form: str) -> int:
-    """How many of form.format(0), form.format(1), ... there are."""
+    """Count the consecutive names form.format(0), form.format(1), ..."""
     count = 0
     while form.format(count) in names:
         count += 1
@@ -120,17 +119,17 @@ def _unet(state: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def _notes(path: Path) -> Mapping[str, Any]:
-    """The published `config.yaml` next to a file; nothing where there is none."""
+    """Read the published `config.yaml` next to a file; empty if missing."""
     file = path.with_name("config.yaml")
     try:
-        found = yaml.safe_load(file.read_text()) if file.is_file() else {}
+        content = yaml.safe_load(file.read_text()) if file.is_file() else {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{file}, next to {path.name}, cannot be read: {' '.join(str(error).split())}.") from None
-    return found if isinstance(found, Mapping) else {}
+    return content if isinstance(content, Mapping) else {}
 
 
 def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> dict[str, Any]:
-    """The config of a file, with what its `config.yaml` says of the data."""
+    """Build the config of a file, with the data settings of its `config.yaml`."""
     if not notes:
         heads = f", attention heads of {HEAD} channels" if generator["name"] == "latent_diffusion" else ""
         log.warning(
@@ -141,13 +140,15 @@ def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> 
     rows, columns = (int(size) for size in images.get("size", SIZE))
     nearest, farthest = (float(limit) for limit in images.get("depth_range", RANGES))
     if tuple(images.get("fov", VIEW)) != VIEW:
-        raise InputError(f"{path}: LiDM's images see from 3 to -25 degrees, its config.yaml says {images['fov']}.")
+        raise InputError(f"{path}: LiDM's images see from 3 to -25 degrees, its config.yaml has {images['fov']}.")
     logarithmic = bool(images.get("log_scale", True))
     sensor = {"name": "hdl64e", "rows": rows, "columns": columns, "min_range": nearest, "max_range": farthest}
-    own = ShiftedLog(build_sensor(**sensor)).scale if logarithmic else farthest  # type: ignore[arg-type]
-    scale = float(images.get("depth_scale", own))
-    if abs(scale - own) > 1e-6:
-        raise InputError(f"{path}: ranges up to {farthest:g} m have the scale {own:g}, its config.yaml says {scale:g}.")
+    expected = ShiftedLog(build_sensor(**sensor)).scale if logarithmic else farthest  # type: ignore[arg-type]
+    scale = float(images.get("depth_scale", expected))
+    if abs(scale - expected) > 1e-6:
+        raise InputError(
+            f"{path}: ranges up to {farthest:g} m have the scale {expected:g}, its config.yaml has {scale:g}."
+        )
     return {
         "sensor": sensor,
         "encoding": {"format": "shifted_log" if logarithmic else "metric", "reflectance": False, "limits": "open"},

@@ -1,5 +1,4 @@
-"""Vector quantisation by a learned codebook (van den Oord et al. 2017, "Neural discrete
-representation learning")."""
+"""Vector quantisation by a learned codebook (van den Oord et al. 2017, "Neural discrete representation learning")."""
 
 from typing import NamedTuple
 
@@ -12,24 +11,23 @@ AT_ONCE = 4096  # vectors per block of distances to all codes
 class Quantised(NamedTuple):
     """Output of a quantiser for z, (B, C, H, W)."""
 
-    codes: Tensor  # the nearest codes, (B, C, H, W), with the gradient of z (straight through)
+    codes: Tensor  # nearest codes, (B, C, H, W), with straight-through gradient
     loss: Tensor  # codebook and commitment loss, ()
     indices: Tensor  # of the codes, (B H W,) int64
 
 
 class Quantiser(nn.Module):
-    """q(z), the code e_k nearest to each vector z, and the loss
+    """q(z), the code e_k nearest to each vector z, and the mean over all elements of the loss
 
         |q - sg z|^2 + beta |sg q - z|^2
 
-    in the mean over all numbers, with sg the value without its gradient (2017, eq. 3). The first term moves the codes,
-    the second, the commitment, the vectors.
+    with sg the stop-gradient (2017, eq. 3). The first term moves codes, the second (commitment) vectors.
 
     Args:
-        codes: How many there are.
-        channels: Of each.
+        codes: Size of the codebook.
+        channels: Channels of a code.
         beta: Weight of the commitment.
-        legacy: Put beta on the first term instead, as the published code that LiDM's weights were trained with does.
+        legacy: Apply beta to the first term instead, as in the published code of LiDM.
     """
 
     def __init__(self, codes: int, channels: int, beta: float = 0.25, legacy: bool = False) -> None:
@@ -49,7 +47,7 @@ class Quantiser(nn.Module):
 
     @torch.no_grad()
     def nearest(self, vectors: Tensor) -> Tensor:
-        """The index of the code nearest to each vector, (N, C) to (N,)."""
+        """Index of the code nearest to each vector, (N, C) to (N,)."""
         codes = self.embedding.weight.float()
         lengths = codes.square().sum(1)
         with torch.autocast(vectors.device.type, enabled=False):  # full precision, for differences of large numbers

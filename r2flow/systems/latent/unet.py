@@ -1,7 +1,6 @@
-"""LiDM's U-Net on latents: the guided-diffusion network (Dhariwal and Nichol 2021) with convolutions that are circular
-in azimuth.
+"""LiDM's U-Net on latents: the guided-diffusion network (Dhariwal and Nichol 2021), circular in azimuth.
 
-Parameters carry the published weights' names.
+Parameter names are those of the published weights.
 """
 
 import math
@@ -28,7 +27,7 @@ def norm(channels: int) -> GroupNorm:
 
 
 def cosines_and_sines(t: Tensor, channels: int) -> Tensor:
-    """cos(f_i t), then sin(f_i t), with f_i = 10^(-4 i / (C / 2)); t as it is, the number of a step, (B,)."""
+    """Concatenated cos(f_i t) and sin(f_i t), with f_i = 10^(-4 i / (C / 2)) and step numbers t, (B,)."""
     half = channels // 2
     frequencies = torch.exp(-math.log(1e4) / half * torch.arange(half, device=t.device, dtype=torch.float32))
     phase = at_least_float32(t.to(torch.promote_types(t.dtype, torch.float32)))[:, None] * frequencies
@@ -36,7 +35,7 @@ def cosines_and_sines(t: Tensor, channels: int) -> Tensor:
 
 
 class ResidualBlock(nn.Module):
-    """skip(x) + conv silu norm (conv silu norm (x) + W silu(c)), its last convolution zero at the start."""
+    """skip(x) + conv silu norm (conv silu norm (x) + W silu(c)), with a zero-initialised last convolution."""
 
     def __init__(self, channels: int, out_channels: int, condition_channels: int) -> None:
         super().__init__()
@@ -53,7 +52,7 @@ class ResidualBlock(nn.Module):
 
 
 class Attention(nn.Module):
-    """x + attention(norm x) among all pixels; of each head the q, k and v lie side by side."""
+    """x + attention(norm x) over all pixels; the q, k and v of a head are adjacent in `qkv`."""
 
     def __init__(self, channels: int, head_channels: int) -> None:
         super().__init__()
@@ -68,7 +67,7 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         flat = self.norm(x).flatten(2)
-        # contiguous: the fast kernels want the channels of a head side by side
+        # Contiguous, since the fast kernels need adjacent channels of a head.
         q, k, v = (part.contiguous() for part in self.qkv(flat).unflatten(1, (self.heads, 3, -1)).mT.unbind(2))
         attended = F.scaled_dot_product_attention(q, k, v).mT.flatten(1, 2)
         return x + self.proj_out(attended).view(x.shape)
@@ -83,7 +82,7 @@ def _double(channels: int) -> nn.Module:
 
 
 class Step(nn.Sequential):
-    """Layers one after the other, of which residual blocks are told the time."""
+    """Sequential layers; residual blocks are conditioned on time."""
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:  # type: ignore[override]
         for layer in self:
@@ -96,13 +95,13 @@ class LatentUNet(nn.Module):
 
     Args:
         shape: Channels, rows and columns of the latents.
-        width: Of the first level.
-        multipliers: Width of each level over `width`.
-        blocks: Residual blocks of each level on the way down; one more on the way up.
-        attention: By how much the levels are reduced that attend; the middle always does.
-        head_channels: Of an attention head.
-        position: "learnable" adds a learned bias for each place after the first convolution, (width, rows, columns),
-            zero at the start: the paper's LiDM + APE. "none": LiDM.
+        width: Width of the first level.
+        multipliers: Width of each level relative to `width`.
+        blocks: Residual blocks per level of the encoder; the decoder has one more.
+        attention: Downsampling factors of levels with attention; the middle always has it.
+        head_channels: Channels per attention head.
+        position: "learnable" adds a zero-initialised bias, (width, rows, columns), after the first convolution: the
+            paper's LiDM + APE. "none": LiDM.
     """
 
     def __init__(
@@ -130,30 +129,30 @@ class LatentUNet(nn.Module):
         def block(before: int, after: int) -> ResidualBlock:
             return ResidualBlock(before, after, condition)
 
-        here, skips = width, [width]
+        current, skips = width, [width]
         self.input_blocks = nn.ModuleList([Step(CircularConv2d(channels, width))])
         for level, after in enumerate(widths):
             for _ in range(blocks):
                 attends = [Attention(after, head_channels)] if 2**level in attention else []
-                self.input_blocks.append(Step(block(here, after), *attends))
-                here = after
-                skips.append(here)
+                self.input_blocks.append(Step(block(current, after), *attends))
+                current = after
+                skips.append(current)
             if level < len(widths) - 1:
-                self.input_blocks.append(Step(_halve(here)))
-                skips.append(here)
-        self.middle_block = Step(block(here, here), Attention(here, head_channels), block(here, here))
+                self.input_blocks.append(Step(_halve(current)))
+                skips.append(current)
+        self.middle_block = Step(block(current, current), Attention(current, head_channels), block(current, current))
         self.output_blocks = nn.ModuleList()
         for level in reversed(range(len(widths))):
             for index in range(blocks + 1):
-                layers: list[nn.Module] = [block(here + skips.pop(), widths[level])]
-                here = widths[level]
-                layers += [Attention(here, head_channels)] if 2**level in attention else []
-                layers += [_double(here)] if level and index == blocks else []
+                layers: list[nn.Module] = [block(current + skips.pop(), widths[level])]
+                current = widths[level]
+                layers += [Attention(current, head_channels)] if 2**level in attention else []
+                layers += [_double(current)] if level and index == blocks else []
                 self.output_blocks.append(Step(*layers))
-        self.out = nn.Sequential(norm(here), nn.SiLU(), zero_initialised(CircularConv2d(here, channels)))
+        self.out = nn.Sequential(norm(current), nn.SiLU(), zero_initialised(CircularConv2d(current, channels)))
 
     def forward(self, z: Tensor, t: Tensor) -> Tensor:
-        """eps, of z's shape (B, channels, rows, columns), at the steps t, (B,)."""
+        """eps for z, (B, channels, rows, columns), at steps t, (B,)."""
         condition = self.time_embed(cosines_and_sines(t, self.width))
         h, skips = z, []
         for index, step in enumerate(self.input_blocks):

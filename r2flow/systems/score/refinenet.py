@@ -1,7 +1,6 @@
-"""RefineNet of NCSNv2 as LiDARGen has it: the score of noised range images (Song and Ermon 2020; Zyrianov et al. 2022).
+"""NCSNv2's RefineNet as in LiDARGen: the score of noised range images (Song and Ermon 2020; Zyrianov et al. 2022).
 
-Most convolutions are circular in azimuth and in elevation too, where an image is no ring: the published weights were
-trained so. Parameters carry their names.
+Most convolutions are circular in azimuth and elevation, as in the published weights, whose parameter names are kept.
 """
 
 from collections import OrderedDict
@@ -17,17 +16,16 @@ from r2flow.registry import Count
 
 
 def torus_convolution(channels: int, out_channels: int, dilation: int = 1, bias: bool = True) -> nn.Conv2d:
-    """3 x 3, circular in both directions."""
+    """A 3 x 3 convolution with circular padding in both directions."""
     return nn.Conv2d(
         channels, out_channels, 3, padding=dilation, dilation=dilation, bias=bias, padding_mode="circular"
     )  # fmt: skip
 
 
 class InstanceNormPlus(nn.Module):
-    """gamma (norm(x) + alpha m) + beta, with norm each channel's own and m the channels' means, standardised.
+    """gamma (instance_norm(x) + alpha m) + beta, with m the channels' means, standardised over the channels.
 
-    m has lost its own mean and is divided by its standard deviation over the channels (the unbiased one): what norm
-    takes away of the channels' means comes back (Song and Ermon 2019, appendix A).
+    m, with the unbiased standard deviation, restores the means that the norm removes (Song and Ermon 2019, appendix A).
     """
 
     def __init__(self, channels: int) -> None:
@@ -46,7 +44,7 @@ class InstanceNormPlus(nn.Module):
 
 
 def pooled_convolution(channels: int, out_channels: int, size: int) -> nn.Module:
-    """A convolution, zeros beyond the edges, then the mean of every 2 x 2 pixels."""
+    """A convolution with zero padding, then 2 x 2 average pooling."""
     convolution = nn.Conv2d(channels, out_channels, size, padding=size // 2)
     return nn.Sequential(OrderedDict(conv=convolution, pool=nn.AvgPool2d(2)))
 
@@ -54,7 +52,7 @@ def pooled_convolution(channels: int, out_channels: int, size: int) -> nn.Module
 class ScoreBlock(nn.Module):
     """shortcut(x) + conv elu norm conv elu norm (x).
 
-    A block that `changes` learns its shortcut; it halves the image if its convolutions are not dilated.
+    With `changes`, the shortcut is learned, and without dilation the image is halved.
     """
 
     def __init__(self, channels: int, out_channels: int, changes: bool = False, dilation: int = 1) -> None:
@@ -78,7 +76,7 @@ class ScoreBlock(nn.Module):
 
 
 class ResidualUnits(nn.Module):
-    """x <- x + conv elu conv elu (x), several times."""
+    """x <- x + conv elu conv elu (x), repeated."""
 
     def __init__(self, channels: int, count: int) -> None:
         super().__init__()
@@ -93,7 +91,7 @@ class ResidualUnits(nn.Module):
 
 
 class Fusion(nn.Module):
-    """The sum of several maps, each by a convolution and then enlarged to one size."""
+    """Sum of several maps after a convolution and upsampling of each."""
 
     def __init__(self, channels: Sequence[int], out_channels: int) -> None:
         super().__init__()
@@ -101,12 +99,12 @@ class Fusion(nn.Module):
 
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
         size = maps[0].shape[2:]
-        every = [conv(x) for conv, x in zip(self.convs, maps, strict=True)]
-        return sum((F.interpolate(x, size, mode="bilinear", align_corners=True) for x in every[1:]), every[0])
+        outputs = [conv(x) for conv, x in zip(self.convs, maps, strict=True)]
+        return sum((F.interpolate(x, size, mode="bilinear", align_corners=True) for x in outputs[1:]), outputs[0])
 
 
 class PoolChain(nn.Module):
-    """x + p_1 + p_2 with p_i = conv maxpool p_{i-1}, p_0 = x = elu of the input."""
+    """x + p_1 + p_2 with p_i = conv maxpool p_{i-1} and p_0 = x = elu(input)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -121,7 +119,7 @@ class PoolChain(nn.Module):
 
 
 class RefineBlock(nn.Module):
-    """Maps of several sizes become one of the first one's size (Lin et al. 2017, "RefineNet")."""
+    """Fusion of maps of several sizes at the size of the first (Lin et al. 2017, "RefineNet")."""
 
     def __init__(self, channels: Sequence[int], out_channels: int, last: bool = False) -> None:
         super().__init__()
@@ -139,12 +137,12 @@ class RefineBlock(nn.Module):
 class RefineNet(nn.Module):
     """s(x, i) = F(2 x - 1, column, row) / sigma_i for images x of [0, 1].
 
-    Four levels, of which the second alone halves the image; the third and the fourth see further by dilation.
+    Of four levels, the second halves the image, and the third and fourth use dilation.
 
     Args:
         sigmas: Noise levels, (L,).
-        channels: Of the image.
-        width: Of the first level; the others are twice as wide.
+        channels: Image channels.
+        width: Width of the first level; the others are twice as wide.
     """
 
     sigmas: Tensor
@@ -168,7 +166,7 @@ class RefineNet(nn.Module):
         self.refine4 = RefineBlock([width, width], width, last=True)
 
     def forward(self, x: Tensor, labels: Tensor) -> Tensor:
-        """The score of images (B, C, H, W) at the noise levels (B,) int64, of their shape; H and W are even."""
+        """Score of images (B, C, H, W) at noise levels `labels`, (B,) int64; H and W must be even."""
         rows, columns = x.shape[2:]
         column = torch.linspace(0, 1, columns, device=x.device, dtype=x.dtype).expand(len(x), 1, rows, -1)
         row = torch.linspace(0, 1, rows, device=x.device, dtype=x.dtype)[:, None].expand(len(x), 1, -1, columns)
