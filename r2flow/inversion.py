@@ -1,4 +1,4 @@
-"""From scans back to their noise, and from one scan to another: what only a flow can do."""
+"""Inversion of scans to noise, and interpolation between scans, by the ODE of a flow."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ TIGHT = Adaptive(tolerance=1e-5)
 
 
 class Real(NamedTuple):
-    """A real scan as a flow sees it: its name, and its range in metres and reflectance, (2 or 1, H, W)."""
+    """A real scan, projected for a flow: its name, and range in metres and reflectance, (2 or 1, H, W)."""
 
     name: str
     image: Tensor
@@ -29,16 +29,16 @@ class Real(NamedTuple):
 def real_scans(
     checkpoint: Checkpoint, specs: Sequence[str | Path], reflectance_scale: float | None = None, most: int = 16
 ) -> list[Real]:
-    """Scans projected as the checkpoint's training scans were.
+    """Read scans with the projection of the checkpoint's training scans.
 
     Args:
         specs: As for `r2flow.data.opening.open_scans`.
-        reflectance_scale: The value in the files that means full reflectance; None for the training's.
-        most: Scans to take of a set, evenly spread over it.
+        reflectance_scale: Value of full reflectance in the files; None: as in training.
+        most: Maximum number of scans per set, evenly spread.
     """
-    own = reading_for([], checkpoint)
-    scale = own.reflectance_scale if reflectance_scale is None else reflectance_scale
-    reading = replace(own, reflectance=checkpoint.encoding.reflectance, reflectance_scale=scale,
+    trained = reading_for([], checkpoint)
+    scale = trained.reflectance_scale if reflectance_scale is None else reflectance_scale
+    reading = replace(trained, reflectance=checkpoint.encoding.reflectance, reflectance_scale=scale,
                       on_bad_scan="error", within_limits=True)  # fmt: skip
     sets = [open_scans(spec, reading).spread(most) for spec in specs]
     stems = [Path(name).name.split(".")[0].replace(" ", "_") for scans in sets for name in scans.source.names]
@@ -48,47 +48,47 @@ def real_scans(
 
 
 class Inversion(NamedTuple):
-    """Scans, their noise, and what becomes of it on the way forward again; all on the CPU."""
+    """Scans, their noise, and the scans generated from this noise; all on the CPU."""
 
-    x_1: Tensor  # the scans in model space, (B, C, H, W)
-    x_0: Tensor  # their noise
-    again: Tensor  # x_1 once more, from x_0
-    evaluations: Tensor  # of the network, of both ways, (B,)
-    converged: Tensor  # whether both ways are solved to the tolerance and finite, (B,) bool
+    x_1: Tensor  # scans in model space, (B, C, H, W)
+    x_0: Tensor  # noise
+    again: Tensor  # scans generated from x_0
+    evaluations: Tensor  # network evaluations of both directions, (B,)
+    converged: Tensor  # whether both directions are solved to the tolerance and finite, (B,) bool
 
 
 def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, progress: Progress = None) -> Inversion:
-    """x_1 -> x_0 by the flow's ODE backward in time, and forward again.
+    """Solve the flow's ODE backward from x_1 to x_0, and forward again.
 
-    A scan that holds a NaN is not converged, its noise is NaN, and its neighbours are what they are without it.
+    A scan with NaN is not converged and has NaN as noise; other scans of the batch are unaffected.
 
     Args:
-        images: Range in metres and reflectance, (B, 2 or 1, H, W), 0 where a ray was dropped.
-        sampler: The solver of both ways.
+        images: Range in metres and reflectance, (B, 2 or 1, H, W), 0 for dropped rays.
+        sampler: Solver of both directions.
         progress: Called after every network evaluation.
     """
     flow = as_flow(checkpoint.generator, "inversion")
     assert images.shape[2:] == checkpoint.sensor.shape
     x_1 = checkpoint.encoding.encode(images[:, : 1 + checkpoint.encoding.reflectance])
-    there = flow.solve(x_1, 1.0, 0.0, sampler=sampler, progress=progress)
-    # where a solver gives up, its last state is not yet noise
-    x_0 = there.x.cpu().masked_fill(~there.converged.view(-1, 1, 1, 1), math.nan)
+    backward = flow.solve(x_1, 1.0, 0.0, sampler=sampler, progress=progress)
+    # The last state of an unconverged solution is not noise.
+    x_0 = backward.x.cpu().masked_fill(~backward.converged.view(-1, 1, 1, 1), math.nan)
     again = flow.solve(x_0, sampler=sampler, progress=progress)
-    evaluations, converged = there.evaluations + again.evaluations, there.converged & again.converged
+    evaluations, converged = backward.evaluations + again.evaluations, backward.converged & again.converged
     return Inversion(x_1, x_0, again.x.cpu(), evaluations, converged)
 
 
 def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> dict[str, Tensor]:
-    """How far scans are from themselves after inversion and generation, each (B,).
+    """Errors of scans after inversion and generation, each (B,).
 
     Returns:
         `rms` in model space, [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`; `noise_std`, the standard
-        deviation of x_0, far from 1 for a scan unlike the training's. NaN for a scan that is not finite.
+        deviation of x_0, far from 1 for scans unlike the training set. NaN for scans that are not finite.
     """
-    apart = rms(inversion.again - inversion.x_1)
+    error = rms(inversion.again - inversion.x_1)
     median_m, rms_m, dropped = metres_apart(*(checkpoint.encoding.decode(x) for x in (inversion.x_1, inversion.again)))
     return {
-        "rms": apart, "median_m": median_m, "rms_m": rms_m, "dropped": dropped.masked_fill(apart.isnan(), math.nan),
+        "rms": error, "median_m": median_m, "rms_m": rms_m, "dropped": dropped.masked_fill(error.isnan(), math.nan),
         "noise_std": inversion.x_0.double().flatten(1).std(1),
     }  # fmt: skip
 
@@ -99,11 +99,11 @@ def rms(x: Tensor) -> Tensor:
 
 
 def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """How far decoded images, (B, 2 or 1, H, W), are from others, scan by scan, each (B,) float64.
+    """Errors between decoded images, (B, 2 or 1, H, W), per scan, each (B,) float64.
 
     Returns:
-        Lower median and root mean square of |r' - r| in metres over the rays that return in both, NaN where none does;
-        the share of all rays that return in one alone.
+        Lower median and root mean square of |r' - r| in metres over the rays that return in both, NaN without any;
+        share of all rays that return in only one.
     """
     before, after = image[:, 0].double(), other[:, 0].double()
     apart = (after - before).abs().masked_fill((before <= 0) | (after <= 0), math.nan).flatten(1)
@@ -112,13 +112,13 @@ def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
-    """Spherical linear interpolation, (sin((1 - w) a) x + sin(w a) y) / sin a, a the angle of x and y.
+    """Spherical linear interpolation, (sin((1 - w) a) x + sin(w a) y) / sin a, with a the angle between x and y.
 
-    Shoemake 1985, "Animating rotation with quaternion curves". Unlike the straight mean it keeps the length of noise:
-    two independent draws are nearly orthogonal. Where the angle vanishes it is the straight mean.
+    Unlike linear interpolation, it keeps the norm of noise, since independent samples are nearly orthogonal (Shoemake
+    1985, "Animating rotation with quaternion curves"). For a vanishing angle it is linear.
 
     Args:
-        x, y: The ends, (...).
+        x, y: Ends, (...).
         weights: w of each point, (N,); 0 gives x and 1 gives y.
 
     Returns:
@@ -129,7 +129,7 @@ def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     if min(lengths) == 0:
         raise InputError("slerp needs two directions, and one of its ends is zero.")
     u, v = u / lengths[0], v / lengths[1]
-    # arccos of the inner product loses half the digits of a small angle; this keeps them
+    # arccos of the inner product would lose half the digits of a small angle.
     angle = 2 * torch.atan2(torch.linalg.vector_norm(u - v), torch.linalg.vector_norm(u + v))
     if math.pi - angle < 1e-6:
         raise InputError("slerp has no shortest way between opposite ends.")
@@ -142,13 +142,13 @@ def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
 
 
 class Interpolation(NamedTuple):
-    """Scans on the way from one to another."""
+    """Interpolated scans."""
 
-    ends: Inversion  # the two inverted
-    weights: Tensor  # where each frame lies, (N,), from 0 to 1
-    images: Tensor  # range in metres and reflectance, (N, 2 or 1, H, W); the outer two are the ends' round trips
-    evaluations: Tensor  # of the network for each frame, (N,); the ends' are those of both ways
-    converged: Tensor  # whether each is solved, (N,) bool; what is not is no scan of the flow
+    ends: Inversion  # inversion of the two given scans
+    weights: Tensor  # interpolation weight of each frame, (N,), from 0 to 1
+    images: Tensor  # range in metres and reflectance, (N, 2 or 1, H, W); first and last are round trips of the ends
+    evaluations: Tensor  # network evaluations of each frame, (N,); of both directions for the ends
+    converged: Tensor  # whether each frame is solved, (N,) bool; others are not samples of the flow
 
 
 def interpolate_scans(
@@ -159,13 +159,13 @@ def interpolate_scans(
     progress: Progress = None,
     arrived: Callable[[int], None] = lambda done: None,
 ) -> Interpolation:
-    """Invert two scans, `slerp` between their noises, generate the scans of it: the paper's figure 3.
+    """Invert two scans, `slerp` between their noise, and generate scans: the paper's figure 3.
 
     Args:
-        pair: The two in metres and reflectance, (2, 2 or 1, H, W).
-        frames: Scans in all, the two ends included, at least 2.
+        pair: Two scans in metres and reflectance, (2, 2 or 1, H, W).
+        frames: Number of scans, including both ends; at least 2.
         progress: Called after every network evaluation.
-        arrived: Called with the number of frames that are done, the ends first.
+        arrived: Called with the number of finished frames, the ends first.
     """
     flow = as_flow(checkpoint.generator, "interpolation")
     ends = invert(checkpoint, pair, sampler, progress)
@@ -182,8 +182,8 @@ def interpolate_scans(
         parts.append(flow.solve(noise[None], sampler=sampler, progress=progress))
         arrived(2 + len(parts))
 
-    def framed(of_ends: Tensor, name: str) -> Tensor:
-        return torch.cat([of_ends[:1], *(getattr(part, name).cpu() for part in parts), of_ends[1:]])
+    def framed(outer: Tensor, name: str) -> Tensor:
+        return torch.cat([outer[:1], *(getattr(part, name).cpu() for part in parts), outer[1:]])
 
     images = checkpoint.encoding.decode(framed(ends.again, "x"))
     evaluations = framed(ends.evaluations, "evaluations")

@@ -1,11 +1,10 @@
-"""Modules of somebody else that enter their classes into our registries.
+"""Plug-ins: external modules that register classes.
 
     r2flow train --plugin my.module stage=my_stage
     r2flow sample --plugin ./my_stage.py runs/NAME
 
-A package can say so itself, in the entry-point group `r2flow.plugins`: it is imported when a name is asked for that no
-registry knows. A config or a checkpoint names the plug-ins that it was made with, which is information: nothing that a
-file names is imported.
+Installed packages in the entry-point group `r2flow.plugins` are imported when a registry lacks a name. Configs and
+checkpoints list their plug-ins for information only: r2flow never imports a module because a file names it.
 """
 
 import importlib
@@ -23,11 +22,11 @@ from r2flow.signals import Stopped
 
 GROUP = "r2flow.plugins"
 
-_loaded: set[str] = set()  # names and files, as sys.modules, in which a path has no name
+_loaded: set[str] = set()  # names and files of loaded modules
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """(the other arguments, the plug-ins) of a command line with `--plugin NAME`, anywhere and any number of times."""
+    """Split a command line into (other arguments, names of plug-ins), for any number of `--plugin NAME`."""
     others: list[str] = []
     names: list[str] = []
     rest = iter(arguments)
@@ -44,41 +43,41 @@ def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def load_plugins(names: Sequence[str]) -> None:
-    """Import modules, named as in an import or by a path ending in `.py`, each once."""
+    """Import modules once, by name or by a path ending in `.py`."""
     for name in names:
-        if _known(name) in _loaded:
+        if _identity(name) in _loaded:
             continue
         try:
             file = _import(name)
         except (KeyboardInterrupt, Stopped):
             raise
-        except BaseException as error:  # whatever somebody's module raises, SystemExit too
-            said = " ".join(str(error).split()) or "no more is known"
-            raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {said}") from None
-        _loaded.update({_known(name), file})
+        except BaseException as error:  # modules may raise any exception, also SystemExit
+            message = " ".join(str(error).split()) or "no message"
+            raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {message}") from None
+        _loaded.update({_identity(name), file})
 
 
-def _known(name: str) -> str:
-    """One name for one file, however its path is written."""
+def _identity(name: str) -> str:
+    """The module name, or the absolute path of a file."""
     return str(Path(name).expanduser().resolve()) if name.endswith(".py") else name
 
 
 def _import(name: str) -> str:
-    """Import a module, unless its file has been imported; its file."""
+    """Import a module, unless its file has been imported; return its file."""
     if not name.endswith(".py"):
-        here = str(Path.cwd())
-        if here not in sys.path and "" not in sys.path:
-            sys.path.append(here)  # as `python -m` does, but last
+        folder = str(Path.cwd())
+        if folder not in sys.path and "" not in sys.path:
+            sys.path.append(folder)  # as `python -m` does, but last
         spec = importlib.util.find_spec(name)
-        if spec is not None and spec.origin is not None and _known(spec.origin) in _loaded:
-            return _known(spec.origin)
+        if spec is not None and spec.origin is not None and _identity(spec.origin) in _loaded:
+            return _identity(spec.origin)
         file = importlib.import_module(name).__file__
         if file is None:
             raise ImportError("it is a folder without an __init__.py; to name a file, end it in .py")
-        return _known(file)
-    path = _known(name)
+        return _identity(file)
+    path = _identity(name)
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{path} is no file")
+        raise FileNotFoundError(f"{path} is not a file")
     module_name = f"r2flow_plugin_{Path(path).stem}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None and spec.loader is not None  # noqa: PT018
@@ -92,7 +91,7 @@ def _import(name: str) -> str:
 
 
 def load_installed() -> None:
-    """Import what installed packages name in the entry-point group."""
+    """Import the modules of installed packages in the entry-point group."""
     load_plugins([entry.value.partition(":")[0] for entry in entry_points(group=GROUP)])
 
 
@@ -101,17 +100,17 @@ Registry.on_missing.append(load_installed)
 
 @contextmanager
 def made_with(config: Mapping[str, Any], what: str) -> Iterator[None]:
-    """Say of an unknown name in a config from a file which plug-in it may come from.
+    """Add the plug-ins that may define an unknown name of a stored config to the error message.
 
     Args:
-        what: What the config belongs to, as "the checkpoint".
+        what: Owner of the config for the message, such as "the checkpoint".
     """
     try:
         yield
     except UnknownName as error:
-        missing = [name for name in config.get("plugins") or () if _known(name) not in _loaded]
+        missing = [name for name in config.get("plugins") or () if _identity(name) not in _loaded]
         if not missing:
             raise
         give = " ".join(f"--plugin {name}" for name in missing)
-        known = str(error).rstrip(".")
-        raise UnknownName(f"{known}; {what} was made with the plug-in {', '.join(missing)}: give {give}.") from None
+        message = str(error).rstrip(".")
+        raise UnknownName(f"{message}; {what} was made with the plug-in {', '.join(missing)}: give {give}.") from None

@@ -62,21 +62,21 @@ def measure_paths(
 ) -> Paths:
     """s(t) over `steps` Euler steps of scans 0 to num - 1 of a seed, and the most curved paths.
 
-    Takes 2 x steps evaluations a batch, `progress` after each; the memory does not grow with `num`.
+    Each batch takes 2 x steps evaluations, with a call of `progress` after each; memory does not grow with `num`.
     """
     flow = as_flow(checkpoint.generator, "curvature")
-    batches = []
+    parts = []
     for first in range(0, num, batch_size):
         x_0 = Draws(seed, range(first, min(first + batch_size, num))).start(flow.noise_shape).to(flow.device)
         with torch.inference_mode():
-            found = straightness(flow.velocity, x_0, steps, most_curved, progress)
-        most = found.curvature.per_pixel.flatten()[found.pixels]
-        batches.append((found.s, found.curvature.squared_length, most, found.trajectories))
-    s, squared_length, bends, trajectories = (torch.cat(one).cpu().numpy() for one in zip(*batches, strict=True))
+            batch = straightness(flow.velocity, x_0, steps, most_curved, progress)
+        bends = batch.curvature.per_pixel.flatten()[batch.pixels]
+        parts.append((batch.s, batch.curvature.squared_length, bends, batch.trajectories))
+    s, squared_length, curvature, trajectories = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
     if not np.isfinite(s).all():
         log.warning("%s: s(t) is not finite for %d of %d scans.", label, (~np.isfinite(s).all(1)).sum(), len(s))
-    order = np.argsort(-bends, kind="stable")[:most_curved]
-    return Paths(label, found.t.numpy(), s, squared_length, trajectories[order])
+    order = np.argsort(-curvature, kind="stable")[:most_curved]
+    return Paths(label, batch.t.numpy(), s, squared_length, trajectories[order])
 
 
 def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
@@ -91,21 +91,21 @@ def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
 def summary(flow: Paths) -> dict[str, Any]:
     """One row per checkpoint."""
     mean = flow.s.mean(0)
-    whole = mean.sum() or math.nan
+    total = mean.sum() or math.nan
     return {
         "checkpoint": flow.label,
         "scans": len(flow.s),
         "integral": float(mean.mean()),
         "integral_normalised": float(flow.s_normalised.mean()),
         "t_of_most": float(flow.t[mean.argmax()]),
-        "first_tenth": float(mean[flow.t < 0.1].sum() / whole),
-        "last_tenth": float(mean[flow.t >= 0.9].sum() / whole),
+        "first_tenth": float(mean[flow.t < 0.1].sum() / total),
+        "last_tenth": float(mean[flow.t >= 0.9].sum() / total),
     }
 
 
 COLUMNS = {
     "checkpoint": "checkpoint", "integral": "int s dt", "integral_normalised": "int s dt / length^2",
-    "t_of_most": "t of the most", "first_tenth": "share in t < 0.1", "last_tenth": "share in t >= 0.9",
+    "t_of_most": "t of the maximum", "first_tenth": "share in t < 0.1", "last_tenth": "share in t >= 0.9",
 }  # fmt: skip
 
 
@@ -114,8 +114,8 @@ def curvature_text(flows: Sequence[Paths]) -> list[str]:
     about = (
         "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 5), the mean over "
         f"{len(flows[0].s)} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight "
-        "path, which one step follows exactly. A flow that goes nowhere is straight too: compare int s dt over the "
-        "squared length |x_1 - x_0|^2."
+        "path, which one step follows exactly. An untrained flow with v = 0 is straight too: compare int s dt over "
+        "the squared length |x_1 - x_0|^2."
     )
     return [about, table([summary(flow) for flow in flows], COLUMNS)]
 
@@ -126,8 +126,8 @@ def curvature_figure(flows: Sequence[Paths]) -> Figure:
     panels = {"s": "s(t) = |(x_1 - x_0) - v_t|²", "s_normalised": "s(t) / |x_1 - x_0|²"}
     for axes, (name, label) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         for flow, style in zip(flows, cycle(STYLES), strict=False):
-            values, every = getattr(flow, name), max(len(flow.t) // 8, 1)
-            axes.plot(flow.t, values.mean(0), **style, ms=5, lw=1.4, markevery=every, label=flow.label)
+            values, interval = getattr(flow, name), max(len(flow.t) // 8, 1)
+            axes.plot(flow.t, values.mean(0), **style, ms=5, lw=1.4, markevery=interval, label=flow.label)
             axes.fill_between(flow.t, values.min(0), values.max(0), color=style["color"], alpha=0.12, lw=0)
         axes.set(xlabel="t  (0 noise, 1 data)", ylabel=label, xlim=(0, 1))
         if any((getattr(flow, name) > 0).any() for flow in flows):
@@ -154,6 +154,6 @@ def curvature_page(flows: Sequence[Paths], seed: int, command: str, device: str 
     """Build the report on one or several checkpoints."""
     figures = {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)}
     return Page(
-        "curvature", "How straight the flows are", curvature_text(flows), curvature_rows(flows), figures, command,
+        "curvature", "Straightness of flows", curvature_text(flows), curvature_rows(flows), figures, command,
         {"scans": seed}, device, {"summary": [summary(flow) for flow in flows]},
     )  # fmt: skip

@@ -28,7 +28,7 @@ from r2flow.reports.view import most_images
 from r2flow.reports.view.panels import Panel, write_panels
 
 MOST = 8  # maximum number of frames in the figure, evenly spaced
-# Rows: the first two show points, the others images.
+# Rows: points, then images.
 PANELS = {
     "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
     "reflectance": draw_reflectance,
@@ -52,49 +52,49 @@ def interpolation(
     """Write `frames` interpolated scans as `out/frames/NNN.ply` and `.npy`.
 
     Returns:
-        The page with the figure, still to be written.
+        The page with the figure, to be written by the caller.
     """
     pair, names, rays = torch.stack([scan.image for scan in scans]), [s.name for s in scans], checkpoint.sensor.rays()
     with ScanBar("interpolating", frames, frames * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
-        found = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.set)
-    warn_unsolved(found.converged)
-    images, weights = found.images.nan_to_num(0.0).numpy(), found.weights.tolist()
+        result = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.set)
+    warn_unsolved(result.converged)
+    images, weights = result.images.nan_to_num(0.0).numpy(), result.weights.tolist()
     rows = []
     for number, (weight, image) in enumerate(zip(weights, images, strict=True)):
         write_scan(image, rays, Path(out, "frames"), f"{number:03d}", ("ply", "npy"))
         rows.append({
             "frame": number, "weight": weight, "returns": int((image[0] > 0).sum()),
-            "evaluations": int(found.evaluations[number]), "converged": bool(found.converged[number]),
+            "evaluations": int(result.evaluations[number]), "converged": bool(result.converged[number]),
         })  # fmt: skip
-    errors = round_trip(checkpoint, found.ends) | {"converged": found.ends.converged}
+    errors = round_trip(checkpoint, result.ends) | {"converged": result.ends.converged}
     ends_rows = [{"scan": name} | {key: errors[key][i].item() for key in errors} for i, name in enumerate(names)]
     text = (
-        f"Both scans were carried to their noise by the flow of {checkpoint.path.name}, step {checkpoint.step}; frames "
-        "come from the spherical interpolation (slerp) of the two. The first and the last frame are the scans' round "
-        "trips; their evaluations are those of both ways.",
+        f"The flow of {checkpoint.path.name}, step {checkpoint.step}, inverted both scans to noise and generated the "
+        "frames from spherical interpolations (slerp) of it. The first and last frames are round trips of the scans; "
+        "their evaluations include both directions.",
         table(ends_rows, ENDS),
         table(rows, BETWEEN),
     )
     first, last = (Panel(f"real: {name}", image[None], rays) for name, image in zip(names, pair.numpy(), strict=True))
     chosen = spread(len(images), most_images(images.shape) - 2)
-    said = [f"w = {weights[i]:.2f}" for i in chosen]
+    captions = [f"w = {weights[i]:.2f}" for i in chosen]
     panels = [first, Panel("between", images[chosen], rays), last]
-    write_panels(Path(out, "interpolation.html"), panels, said, "From scan to scan")
+    write_panels(Path(out, "interpolation.html"), panels, captions, "Interpolation")
     figures = {"interpolation": interpolation_figure(pair.numpy(), images, weights, rays, names)}
     device = str(checkpoint.generator.device)
-    return Page("interpolation", "From scan to scan", text, rows, figures, command, device=device)
+    return Page("interpolation", "Interpolation", text, rows, figures, command, device=device)
 
 
 def interpolation_figure(
     real: np.ndarray, frames: np.ndarray, weights: Sequence[float], rays: Tensor, names: Sequence[str]
 ) -> Figure:
-    """Columns from one real scan over the frames between to the other; perspective, bird's-eye view and images.
+    """Figure with the real scans as outer columns and frames in between; perspective, bird's-eye view and images.
 
-    The first and the last of the frames are the round trips of the real scans.
+    The first and last frames are round trips of the real scans.
     """
     last = len(frames) - 1
     chosen = sorted({round(i) for i in np.linspace(0, last, MOST)})
-    between = [("there and back" if i in (0, last) else f"w = {weights[i]:.2f}", frames[i]) for i in chosen]
+    between = [("round trip" if i in (0, last) else f"w = {weights[i]:.2f}", frames[i]) for i in chosen]
     columns = [(f"real: {names[0]}", real[0]), *between, (f"real: {names[1]}", real[1])]
     heights = [1.15, 1.6, *[0.5] * real.shape[1]]
     figure = dark_figure(2.45 * len(columns), 1.55 * sum(heights) + 0.45)

@@ -41,13 +41,13 @@ class Page:
     """Contents of a report.
 
     Attributes:
-        name: Of its files, as `solvers`.
+        name: Stem of the files, such as `solvers`.
         text: Paragraphs and tables of Markdown.
-        rows: One for each measurement: the CSV, and the `rows` of the JSON.
-        figures: By name; the PNG is `NAME.png`.
-        command: What makes the page again.
-        seeds: Every seed that a number depends on, by what it is for.
-        device: What the networks ran on.
+        rows: One row per measurement, for the CSV and the `rows` of the JSON.
+        figures: Figures by name, written as `NAME.png`.
+        command: Command that reproduces the page.
+        seeds: All seeds, by purpose.
+        device: Device of the networks.
         more: Further lists for the JSON, by name.
     """
 
@@ -63,7 +63,7 @@ class Page:
 
 
 def write_page(page: Page, out: str | Path) -> list[Path]:
-    """Write `out/NAME.png ...`, `NAME.csv`, `NAME.json` and `NAME.md`, each whole or not at all; the files in order."""
+    """Write `out/NAME.png ...`, `NAME.csv`, `NAME.json` and `NAME.md` atomically; returns the files."""
     out, origin = Path(out), provenance(page)
     # Figures carry their provenance; PNG notes only support Latin-1.
     note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
@@ -102,7 +102,7 @@ def prepare_folder(out: str | Path) -> Path:
 
 
 def provenance(page: Page) -> dict[str, Any]:
-    """Machine, versions, seeds, date and command of a page, without paths other than the command's."""
+    """Machine, versions, seeds, date and command of a page; only the command has paths."""
     machine = {
         "cpu": _cpu_name(), "cores": os.cpu_count() or 1, "threads": torch.get_num_threads(),
         "system": platform.platform(terse=True),

@@ -28,10 +28,10 @@ from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
 from r2flow.reports.tables import Row, table
 
-FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four between
-MANY = 16  # evaluations; the evaluated row with the most, at least this many, stands next to the paper's 256
+FRAMES = 6  # frames of figure 3, as in the paper: round trips of both ends, and four in between
+MANY = 16  # minimum evaluations of a row to compare with the paper's 256
 
-# The paper's names of other systems, by the name of the generator.
+# Generator -> the paper's name of the system.
 SYSTEMS = {
     "vanilla_gan": "Vanilla GAN", "dusty1": "DUSty v1", "dusty2": "DUSty v2", "score": "LiDARGen",
     "latent_diffusion": "LiDM", "diffusion": "R2DM",
@@ -40,7 +40,7 @@ SYSTEMS = {
 
 @dataclass(frozen=True)
 class PaperRun:
-    """A generator and its role: "1-RF", "2-RF", "2-TD"; for another system its method's name in table I."""
+    """A generator and its role: "1-RF", "2-RF", "2-TD", or the method's name in table I for other systems."""
 
     role: str
     label: str
@@ -48,7 +48,7 @@ class PaperRun:
 
 
 def role_of(checkpoint: Checkpoint, label: str) -> str:
-    """The row of table I that a checkpoint belongs to, from its config; its label where the config does not say it."""
+    """The row of table I for a checkpoint, from its config; `label` if the config does not determine it."""
     config = checkpoint.config
     options, stage = config.get("generator") or {}, config.get("stage") or {}
     if system := SYSTEMS.get(options.get("name", "")):
@@ -69,40 +69,40 @@ def paper_page(
     command: str = "",
     device: str = "cpu",
 ) -> Page:
-    """The page, still to be written.
+    """Build the page.
 
     Args:
-        rows: From `read_results`.
-        real: Scans for figures 3, 5 and 7; None leaves figure 3 out.
-        num: Scans of each generator in figures 5 and 7.
-        steps: Euler steps of the paths of four scans in figure 8.
+        rows: Rows of `read_results`.
+        real: Scans for figures 3, 5 and 7; None: no figure 3.
+        num: Scans per generator in figures 5 and 7.
+        steps: Euler steps of the four paths in figure 8.
     """
     roles = {weights_hash(run.checkpoint): run.role for run in runs}
     evaluated = [{**row, "role": roles[row["weights"]]} for row in rows if row["weights"] in roles]
     architectures = architecture_rows(runs, evaluated, device)
-    named = ", ".join(f"{run.label} ({run.role})" for run in runs)
-    text = [f"{len(runs)} generators: {named}.", "## Table I: methods and metrics", table_i(evaluated)]
+    names = ", ".join(f"{run.label} ({run.role})" for run in runs)
+    text = [f"{len(runs)} generators: {names}.", "## Table I: methods and metrics", table_i(evaluated)]
     if architectures:
         text += ["## Table II: velocity estimators", table(architectures, ARCHITECTURES)]
     figures: dict[str, Figure] = {}
     flows = [run for run in runs if isinstance(run.checkpoint.generator, Flow)]
     if real is not None and len(real) > 1 and flows and flows[0].role not in SYSTEMS.values():
         figures["figure_3"] = between_figure(flows[0].checkpoint, real)
-    drawn = {
-        run.label: np.concatenate([one.images.nan_to_num(0.0).numpy() for one in sample(run.checkpoint, num)])
+    samples = {
+        run.label: np.concatenate([batch.images.nan_to_num(0.0).numpy() for batch in sample(run.checkpoint, num)])
         for run in track(runs, "sampling", "generators")
     }
-    truth = None if real is None else np.stack([real.spread(num).source[i] for i in range(min(num, len(real)))])
+    scans = None if real is None else np.stack([real.spread(num).source[i] for i in range(min(num, len(real)))])
     figures["figure_5"] = birds_eye_figure(
-        {run.label: _from_above(drawn[run.label], run.checkpoint) for run in runs},
-        None if truth is None else _from_above(truth, runs[0].checkpoint),
+        {run.label: _birds_eye(samples[run.label], run.checkpoint) for run in runs},
+        None if scans is None else _birds_eye(scans, runs[0].checkpoint),
     )
-    if names := [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in evaluated)]:
-        figures["figure_6"] = speed_figure([{**row, "flow": row["role"]} for row in evaluated], names)
-    figures["figure_7"] = scans_figure(runs, drawn, truth)
-    curved = [run for run in flows if not run.checkpoint.generator.fixed]
-    if curved:
-        tracked = track(curved, "following paths")
+    if metrics := [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in evaluated)]:
+        figures["figure_6"] = speed_figure([{**row, "flow": row["role"]} for row in evaluated], metrics)
+    figures["figure_7"] = scans_figure(runs, samples, scans)
+    solvable = [run for run in flows if not run.checkpoint.generator.fixed]
+    if solvable:
+        tracked = track(solvable, "following paths")
         paths = [measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4) for run in tracked]
         figures |= {"figure_8a": curvature_figure(paths), "figure_8b": trajectories_figure(paths)}
         text += ["## Figure 8: straightness", *curvature_text(paths)]
@@ -113,7 +113,7 @@ def paper_page(
 
 
 def read_results(files: Sequence[Path]) -> list[dict[str, Any]]:
-    """A row for each sampled set of the JSON files of `r2flow evaluate`; see `r2flow.reports.evaluation.points`."""
+    """One row per sampled set in the JSON files of `r2flow evaluate`; see `r2flow.reports.evaluation.points`."""
     rows = []
     for file in files:
         try:
@@ -124,9 +124,9 @@ def read_results(files: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def table_i(rows: Sequence[Row]) -> str:
-    """Table I as printed, and below each printed row the evaluated ones: equal evaluations, or both at least `MANY`.
+    """Table I as printed, with evaluated rows below: those of equal evaluations, or the most if both are >= `MANY`.
 
-    Evaluated rows without a printed one come last.
+    Evaluated rows without a printed row come last.
     """
     lines: list[dict[str, Any]] = []
     placed: list[Row] = []
@@ -136,18 +136,18 @@ def table_i(rows: Sequence[Row]) -> str:
         lines.append(line | dict(zip(COLUMNS, printed.figures, strict=True)))
         same = [row for row in rows if row["role"] == role]
         most = max((row["evaluations"] for row in same), default=0)
-        near = [row for row in same if row["evaluations"] in ((count, most) if min(count, most) >= MANY else (count,))]
-        lines += map(_evaluated, near)
-        placed += near
+        like = [row for row in same if row["evaluations"] in ((count, most) if min(count, most) >= MANY else (count,))]
+        lines += map(_evaluated, like)
+        placed += like
     lines += [_evaluated(row) for row in rows if row not in placed]
     headings = {name: heading for name, (heading, _) in COLUMNS.items()}
     return table(lines, {"method": "method", "of": "figures of", "evaluations": "NFE", **headings})
 
 
 def _evaluated(row: Row) -> dict[str, Any]:
-    """The columns of table I that a row of an evaluation has, scaled as the paper prints them."""
-    found = {name: row.get(f"{name}/{name}") for name in COLUMNS}
-    scaled = {name: None if value is None else value * COLUMNS[name][1] for name, value in found.items()}
+    """Columns of table I of an evaluated row, scaled as printed."""
+    figures = {name: row.get(f"{name}/{name}") for name in COLUMNS}
+    scaled = {name: None if value is None else value * COLUMNS[name][1] for name, value in figures.items()}
     return {"method": row["role"], "of": row["flow"], "evaluations": row["evaluations"], **scaled}
 
 
@@ -158,34 +158,34 @@ ARCHITECTURES = {
 
 
 def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str) -> list[dict[str, Any]]:
-    """Table II: a row for each 1-RF, with the printed row of the network of as many parameters."""
-    found = []
+    """Table II: one row per 1-RF, with the printed row of equal parameters."""
+    lines = []
     for run in (run for run in runs if run.role == "1-RF"):
         config = run.checkpoint.config
         row = {"backbone": config["backbone"]["name"], **cost(config, 3, device)}
         if printed := same_architecture(row["parameters"]):
             row |= {"gmac_printed": printed.gmac, "latency_printed": printed.latency_ms, "frd_printed": printed.frd}
-        own = [one for one in rows if one["weights"] == weights_hash(run.checkpoint) and "frd/frd" in one]
-        best = max(own, key=lambda one: one["evaluations"], default={})
-        found.append(row | {"frd": best.get("frd/frd")})
-    return found
+        evaluated = [r for r in rows if r["weights"] == weights_hash(run.checkpoint) and "frd/frd" in r]
+        best = max(evaluated, key=lambda r: r["evaluations"], default={})
+        lines.append(row | {"frd": best.get("frd/frd")})
+    return lines
 
 
 def same_architecture(parameters: int) -> Architecture | None:
-    """The row of table II with this number of parameters, to the digits that are printed (its 125.5 M are 125.2 M)."""
-    return next((one for one in TABLE_II.values() if abs(parameters - one.parameters) < 4e-3 * one.parameters), None)
+    """The row of table II with this number of parameters, within 0.4 % (the printed 125.5 M are 125.2 M)."""
+    return next((row for row in TABLE_II.values() if abs(parameters - row.parameters) < 4e-3 * row.parameters), None)
 
 
 def between_figure(checkpoint: Checkpoint, real: ScanSet) -> Figure:
-    """Figure 3: from one real scan to another, far apart in the set, through the noise."""
+    """Figure 3: interpolation between two distant scans of the set."""
     ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])
-    found = interpolate_scans(checkpoint, torch.from_numpy(ends), FRAMES)
-    frames = found.images.nan_to_num(0.0).numpy()
-    return interpolation_figure(ends, frames, found.weights.tolist(), checkpoint.sensor.rays(), ("first", "last"))
+    result = interpolate_scans(checkpoint, torch.from_numpy(ends), FRAMES)
+    frames = result.images.nan_to_num(0.0).numpy()
+    return interpolation_figure(ends, frames, result.weights.tolist(), checkpoint.sensor.rays(), ("first", "last"))
 
 
-def _from_above(images: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
-    """The bird's-eye histogram of scans, (100, 100)."""
+def _birds_eye(images: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
+    """Bird's-eye histogram of scans, (100, 100)."""
     rays = checkpoint.sensor.rays()
     return np.sum([birds_eye_histogram(image_to_points(image, rays)[0]) for image in images], axis=0)
 
@@ -196,35 +196,35 @@ def marginals_apart(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) -> Figure:
-    """Figure 5: where points lie from above, (100, 100) each, and their marginals with the real scans' dotted."""
+    """Figure 5: bird's-eye histograms, (100, 100) each, with marginals; dotted: real scans."""
     shown = {**made, **({} if real is None else {"real scans": real})}
     figure = blank_figure(2.75 * len(shown) + 0.5, 3.6)
     panels = figure.subplots(2, 2 * len(shown), squeeze=False, width_ratios=(3.2, 1) * len(shown),
                              height_ratios=(1, 3.2))  # fmt: skip
     centres = (np.arange(100) + 0.5) / 100 * 2 * EXTENT - EXTENT
     for place, (name, counts) in enumerate(shown.items()):
-        (above, corner), (axes, beside) = panels[:, 2 * place : 2 * place + 2]
+        (top, corner), (axes, right) = panels[:, 2 * place : 2 * place + 2]
         share = counts / max(counts.sum(), 1)
-        # Ahead is up and left is left, as in every other picture from above.
+        # Forward is up and left is left, as in all bird's-eye views.
         axes.imshow(np.log10(share[::-1, ::-1] + 1e-7), extent=(EXTENT, -EXTENT, -EXTENT, EXTENT), cmap="magma",
                     vmin=-6, vmax=-2, aspect="auto")  # fmt: skip
         axes.set(xlabel="y, m", ylabel="x, m" if place == 0 else "")
         for histogram, style in ((counts, {"color": "#1f6fb4"}), (real, {"color": "0.2", "ls": ":"})):
             if histogram is not None:
                 part = histogram / max(histogram.sum(), 1)
-                above.plot(centres, part.sum(0), lw=0.9, **style)
-                beside.plot(part.sum(1), centres, lw=0.9, **style)
-        above.set(xlim=(EXTENT, -EXTENT))
-        beside.set(ylim=(-EXTENT, EXTENT))
-        for panel in (above, beside, corner):
+                top.plot(centres, part.sum(0), lw=0.9, **style)
+                right.plot(part.sum(1), centres, lw=0.9, **style)
+        top.set(xlim=(EXTENT, -EXTENT))
+        right.set(ylim=(-EXTENT, EXTENT))
+        for panel in (top, right, corner):
             panel.set_axis_off()
-        apart = "" if real is None or counts is real else f"marginals apart {marginals_apart(counts, real):.3f}"
-        above.set_title(f"{name}\n{apart}", fontsize=8)
+        distance = "" if real is None or counts is real else f"JSD of marginals {marginals_apart(counts, real):.3f}"
+        top.set_title(f"{name}\n{distance}", fontsize=8)
     return figure
 
 
 def scans_figure(runs: Sequence[PaperRun], drawn: Mapping[str, np.ndarray], real: np.ndarray | None) -> Figure:
-    """Figure 7: a real scan and the first scan of each generator."""
+    """Figure 7: a real scan, and the first sample of each generator."""
     images = {} if real is None else {"real": real[0]}
     for run in runs:
         generator = run.checkpoint.generator

@@ -6,7 +6,7 @@ against all real ones, Euler steps, NVIDIA RTX 6000 Ada.
 
 from typing import NamedTuple
 
-# Metric's name in `r2flow.metrics` -> (heading, the factor that the paper prints it with).
+# Name in `r2flow.metrics` -> (heading, factor of the printed values).
 COLUMNS = {
     "frd": ("FRD", 1.0),
     "frid": ("FRID", 1.0),
@@ -19,9 +19,9 @@ COLUMNS = {
 
 
 class Printed(NamedTuple):
-    """A row of table I: the role is "1-RF", ... for the paper's own flows, None for others, which their method names.
+    """A row of table I; `role` is "1-RF", ... for the paper's flows, None for other methods.
 
-    The figures stand in the order of `COLUMNS`, with its factors; None where the paper has none.
+    Figures are in the order of `COLUMNS`, with its factors; None: not printed.
     """
 
     method: str
@@ -55,7 +55,7 @@ TABLE_I = (
 
 
 class Architecture(NamedTuple):
-    """A row of table II; `gmac` is what the paper calls FLOPs (G), `frd` at 256 Euler steps."""
+    """A row of table II; `gmac`: the paper's FLOPs (G), `frd`: at 256 Euler steps."""
 
     gmac: float
     parameters: float

@@ -1,4 +1,4 @@
-"""Scans and range images prepared for drawing."""
+"""Scans and range images to draw."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from r2flow.lidar.scan_files import read_range_image
 
 
 class View(NamedTuple):
-    """One scan to draw: its path, and its index in an opened set."""
+    """A scan to draw: its path, and its index in an opened set."""
 
     path: Path
     scans: ScanSet
@@ -33,7 +33,7 @@ class View(NamedTuple):
         return self.scans.sensor.rays()
 
     def labelled(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """The image, and the semantic id of each pixel, (H, W), where a .label file or the simulator knows it."""
+        """The image, and semantic ids, (H, W), from a .label file or the simulator; else None."""
         source = self.scans.source
         if isinstance(source, SimulatedScans):
             from r2flow.simulator import simulate
@@ -42,10 +42,10 @@ class View(NamedTuple):
             return made.image[: 1 + source.reflectance], made.labels
         if not isinstance(source, ScanFiles):
             return self.image, None
-        path, how = Path(source.paths[self.number]), source.reading
+        path, reading = Path(source.paths[self.number]), source.reading
         if labels_beside(path) is None or read_range_image(path) is not None:
             return self.image, None
-        return read_labelled_scan(path, replace(how, on_bad_scan="error"))
+        return read_labelled_scan(path, replace(reading, on_bad_scan="error"))
 
 
 def scans_of(path: Path) -> list[Path]:
@@ -57,27 +57,26 @@ def scans_of(path: Path) -> list[Path]:
     return [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
 
 
-def _say_how_many(what: str | Path, count: int, most: int) -> None:
+def _print_choice(what: str | Path, count: int, most: int) -> None:
     if count > most:
         print(f"{what}: {most} of its {count:,} scans, evenly spread (--num)")
 
 
 def views_of(spec: str, reading: Reading, most: int) -> list[View]:
-    """At most `most` of the scans that a name stands for (`open_scans`), evenly spread.
+    """Up to `most` scans of a set (`open_scans`), evenly spread.
 
-    Files that r2flow did not write are opened one by one: each has its own reflectance or none, and a range image its
-    own size.
+    Files not written by r2flow are opened one by one, since sizes of range images and reflectance may differ.
     """
     reading = replace(reading, on_bad_scan="error")
     options, file = parse(spec)
     if own_reading(spec) is None and options.name == FOLDER:
-        every = scans_of(file or Path(options.folder))
-        _say_how_many(spec, len(every), most)
-        loose = [every[index] for index in spread(len(every), most)]
-        warn_of_other_sensor(loose, reading, spec)
-        return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]
+        paths = scans_of(file or Path(options.folder))
+        _print_choice(spec, len(paths), most)
+        chosen = [paths[index] for index in spread(len(paths), most)]
+        warn_of_other_sensor(chosen, reading, spec)
+        return [View(path, open_scans(path, reading, own_size=True), 0) for path in chosen]
     opened = open_scans(spec, reading)
     if options.name != SIMULATED:  # simulated sets have any size
-        _say_how_many(spec, len(opened), most)
+        _print_choice(spec, len(opened), most)
     scans = opened.spread(most)
     return [View(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]

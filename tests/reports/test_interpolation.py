@@ -28,7 +28,7 @@ def test_the_figure_has_a_column_for_each_frame_between_the_real_scans(count, ch
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert titles[0] == "real: a"
     assert titles[-1] == "real: b"
-    assert titles[1] == titles[-2] == "there and back"
+    assert titles[1] == titles[-2] == "round trip"
     assert len(titles) == min(count, 8) + 2
     assert len(figure.axes) == len(titles) * (2 + channels)
     between = [float(title.removeprefix("w = ")) for title in titles[2:-2]]
@@ -60,7 +60,7 @@ def test_a_page_says_what_was_measured(tmp_path, paths):
 
 
 class LostBetween(GaussianFlow):
-    """Lost after both ends have gone there and back in four steps of rk4."""
+    """NaN after the evaluations of both round trips, in four steps of rk4."""
 
     evaluations = 0
 

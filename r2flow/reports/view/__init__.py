@@ -1,10 +1,10 @@
-"""Scans in 3-D as one HTML page, which needs no network: `r2flow view`.
+"""Scans in 3-D as a self-contained HTML page: `r2flow view`.
 
     images = flow.sample(4)
     Path("scans.html").write_text(page(images, flow.sensor.rays()))
 
-The page holds what a scanner measures, not points: for each pixel two bytes of range and one of reflectance, packed by
-zlib, and the rays once. The browser multiplies the two. `view.js` draws, `view.css` says how it looks.
+The page stores two bytes of range and one of reflectance per pixel, compressed by zlib, and the rays once; the browser
+computes the points.
 """
 
 import base64
@@ -25,10 +25,10 @@ from r2flow.errors import InputError, printable
 from r2flow.files import atomic_write
 from r2flow.reports.pictures import HEIGHTS, RANGES, class_colours, colours
 
-MOST = 256 * 64 * 1024  # pixels of a page, all images together: about 33 MB
-STEP = 0.004  # metres of a range code: uint16 reaches 262 m, and a range is off by 2 mm at most
+MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB
+STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at most 2 mm
 CODES = 2**16
-SCALES = ("range", "height", "reflectance")  # as `view.js` numbers them
+SCALES = ("range", "height", "reflectance")  # in the order of `view.js`
 
 Images = np.ndarray | Tensor
 Rays = np.ndarray | Tensor
@@ -43,23 +43,23 @@ def page(
     labels: Sequence[np.ndarray | None] = (),
     title: str = "r2flow",
 ) -> str:
-    """One HTML page with a point cloud and a range image of each scan, under one camera.
+    """One HTML page with a point cloud and a range image per scan, under a shared camera.
 
     Args:
-        images: Range in metres and reflectance of each scan, (2 or 1, H, W), 0 where a ray was dropped; or of each
-            frame of it, (T, 2 or 1, H, W), which a slider goes through. Scans may differ in size and number of frames.
+        images: Range in metres and reflectance of each scan, (2 or 1, H, W), 0 for dropped rays; or frames
+            (T, 2 or 1, H, W) for a slider. Scans may differ in size and number of frames.
         rays: Elevation and azimuth in radians, (2, H, W), of all scans, or of each.
-        captions: Of each scan; its number if left out.
-        frames: What the slider says at each frame.
-        labels: Semantic id of each pixel of a scan, (H, W) or (T, H, W); None for a scan without.
+        captions: Caption of each scan; default: its number.
+        frames: Slider caption of each frame.
+        labels: Semantic ids of each scan, (H, W) or (T, H, W), or None.
 
     Returns:
-        The page, about 50 kB and 130 kB for each image of 64 x 1024. Texts in it are never read as HTML.
+        The page: about 50 kB, and 130 kB per image of 64 x 1024. Captions are escaped.
 
     Raises:
         InputError: no scan, or more than `MOST` pixels.
     """
-    stacks = [_frames_of(one) for one in images]
+    stacks = [_frames_of(scan) for scan in images]
     count, pixels = sum(map(len, stacks)), sum(stack[:, 0].size for stack in stacks)
     if not 0 < pixels <= MOST:
         raise InputError(
@@ -67,17 +67,17 @@ def page(
             f"{pixels:,}. Take fewer scans or frames (--num)."
         )
     shared = isinstance(rays, np.ndarray | Tensor)
-    each_rays = [np.asarray(one, dtype=np.float64) for one in ([rays] * len(stacks) if shared else rays)]
-    each_labels = [None if one is None else np.asarray(one) for one in labels or [None] * len(stacks)]
+    each_rays = [np.asarray(angles, dtype=np.float64) for angles in ([rays] * len(stacks) if shared else rays)]
+    each_labels = [None if ids is None else np.asarray(ids) for ids in labels or [None] * len(stacks)]
     each_caption = captions or range(len(stacks))
     sensors: dict[bytes, tuple[int, dict[str, Any]]] = {}
-    given = [ids[ids > 0] for ids in each_labels if ids is not None]
-    classes = class_colours(np.concatenate(given), most=255) if given else {}
+    labelled = [ids[ids > 0] for ids in each_labels if ids is not None]
+    classes = class_colours(np.concatenate(labelled), most=255) if labelled else {}
     step = max(STEP, max(float(stack[:, 0].max(initial=0)) for stack in stacks) / (CODES - 1))
     scans = []
-    for stack, seen, ids, caption in zip(stacks, each_rays, each_labels, each_caption, strict=True):
-        assert seen.shape == (2, *stack.shape[2:]), f"{caption}: images of {stack.shape[2:]}, rays of {seen.shape}"
-        number, _ = sensors.setdefault(seen.tobytes(), (len(sensors), _described(seen)))
+    for stack, angles, ids, caption in zip(stacks, each_rays, each_labels, each_caption, strict=True):
+        assert angles.shape == (2, *stack.shape[2:]), f"{caption}: images of {stack.shape[2:]}, rays of {angles.shape}"
+        number, _ = sensors.setdefault(angles.tobytes(), (len(sensors), _described(angles)))
         numbers = None if ids is None else _numbered(ids, stack, classes)
         packed = [packed_image(image, step, None if numbers is None else numbers[t]) for t, image in enumerate(stack)]
         scans.append({
@@ -100,12 +100,12 @@ def page(
 
 
 def most_images(shape: Sequence[int]) -> int:
-    """How many images of (..., H, W) a page holds."""
+    """Maximum number of images (..., H, W) on a page."""
     return MOST // int(np.prod(shape[-2:]))
 
 
 def write_page(path: str | Path, *args: Any, **options: Any) -> Path:
-    """Write the `page` of these arguments, whole or not at all."""
+    """Write the `page` of these arguments atomically."""
     content = page(*args, **options)
     with atomic_write(path, "w") as file:
         file.write(content)
@@ -113,14 +113,14 @@ def write_page(path: str | Path, *args: Any, **options: Any) -> Path:
 
 
 def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = None) -> str:
-    """An image as base64 of zlib of planes of bytes, H W each.
+    """Encode an image as byte planes of H W each, compressed by zlib, in base64.
 
-    High and low byte of the range codes, each row as differences from its left neighbour modulo 2^16; reflectance in
-    255 levels, where there is one; the number of the class, where there is one. Code c is c `step` metres, 0 no return.
+    Planes: high and low bytes of range codes, as differences along each row modulo 2^16; optionally reflectance in 255
+    levels; optionally class numbers. Code c means c `step` metres, 0 no return.
 
     Args:
         image: (2 or 1, H, W).
-        numbers: (H, W) uint8.
+        numbers: Class numbers, (H, W) uint8.
     """
     r = np.nan_to_num(image[0].astype(np.float64), posinf=0, neginf=0)
     codes = np.where(r > 0, np.clip(np.rint(r / step), 1, CODES - 1), 0).astype(np.int32)
@@ -134,14 +134,14 @@ def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = No
 
 
 def _frames_of(images: Images) -> np.ndarray:
-    """(T, 2 or 1, H, W) of one scan."""
+    """Frames of a scan, (T, 2 or 1, H, W)."""
     stack = np.asarray(images, dtype=np.float32)
     assert stack.shape[-3] in (1, 2), stack.shape
     return stack.reshape(-1, *stack.shape[-3:])
 
 
 def _described(rays: np.ndarray) -> dict[str, Any]:
-    """Rays as an elevation of each row and an azimuth of each column; pixel by pixel where that is not enough."""
+    """Rays as elevations of rows and azimuths of columns if they determine all pixels, else per pixel."""
     e, a = rays
     size = {"rows": e.shape[0], "columns": e.shape[1], "spacing": _spacing(rays)}
     if (e == e[:, :1]).all() and (a == a[:1]).all():
@@ -150,23 +150,23 @@ def _described(rays: np.ndarray) -> dict[str, Any]:
 
 
 def _spacing(rays: np.ndarray) -> float:
-    """Usual angle between neighbouring rays in radians: of rows and columns the geometric mean."""
+    """Geometric mean of the median angles between neighbouring rows and columns, in radians."""
     e, a = rays
-    gaps = [float(np.median(np.abs(np.diff(one, axis=axis)))) for axis, one in enumerate((e, a)) if one.shape[axis] > 1]
+    gaps = [float(np.median(np.abs(np.diff(x, axis=axis)))) for axis, x in enumerate((e, a)) if x.shape[axis] > 1]
     return float(np.prod(gaps) ** (1 / len(gaps))) if gaps else 0.01
 
 
 def _numbered(ids: np.ndarray, stack: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:
-    """The place of each id among the classes, from 1 on, (T, H, W); 0 for none."""
+    """Class number of each id, from 1, (T, H, W); 0 for ids without a class."""
     table = np.zeros(int(max(ids.max(initial=0), *classes, 0)) + 1, np.uint8)
     table[list(classes)] = np.arange(1, len(classes) + 1)
     return np.broadcast_to(table[ids], (len(stack), *stack.shape[2:]))
 
 
 def _filled(contents: dict[str, Any], title: str) -> str:
-    # The policy lets the one script and the one style run, by their hashes.
+    # The content security policy allows only this script and this style, by hash.
     part = {name: files(__package__).joinpath(f"view.{name}").read_text("utf-8") for name in ("html", "css", "js")}
-    # Within a script element only "<" could end it, or begin another one.
+    # Only "<" could end the script element.
     data = json.dumps(contents, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return Template(part["html"]).substitute(
         title=html.escape(printable(title)), data=data, style=part["css"], script=part["js"],

@@ -1,4 +1,4 @@
-"""What a page of `r2flow.reports.view` can show: scans of files and sets, samples of a generator, its way to them."""
+"""Panels of a page of `r2flow.reports.view`: scans of files and sets, samples of a generator and their states x_t."""
 
 import math
 from collections import Counter
@@ -25,7 +25,7 @@ from r2flow.samplers import OnGrid
 
 
 class Panel(NamedTuple):
-    """One scan of a page, or several in the slider's turn.
+    """One scan of a page, or a sequence of scans for the slider.
 
     Attributes:
         images: (T, 2 or 1, H, W).
@@ -40,24 +40,24 @@ class Panel(NamedTuple):
 
 
 def write_panels(path: str | Path, panels: Sequence[Panel], frames: Sequence[str] = (), title: str = "r2flow") -> Path:
-    """Write the page of some panels."""
+    """Write a page of panels."""
     captions, images, rays, labels = zip(*panels, strict=True) if panels else ((), (), (), ())
     return write_page(path, images, rays, captions, frames=frames, labels=labels, title=title)
 
 
 def scan_panels(views: Sequence[View]) -> list[Panel]:
-    """A panel for each scan, named by its file; by its folder too, where two files have one name."""
-    shared = Counter(view.path.name for view in views)
+    """One panel per scan, captioned by file name, with the folder where names are ambiguous."""
+    counts = Counter(view.path.name for view in views)
     panels = []
     for view in views:
         image, labels = view.labelled()
-        caption = view.path.name if shared[view.path.name] == 1 else f"{view.path.parent.name}/{view.path.name}"
+        caption = view.path.name if counts[view.path.name] == 1 else f"{view.path.parent.name}/{view.path.name}"
         panels.append(Panel(caption, image[None], view.rays, None if labels is None else labels[None]))
     return panels
 
 
 def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
-    """Panels as one, each a frame, and what the slider says."""
+    """Combine panels as frames of one; returns it and the slider captions."""
     captions, images, rays, labels = zip(*panels, strict=True)
     for name, image, ray, label in panels[1:]:
         alike = image.shape == images[0].shape and (label is None) == (labels[0] is None)
@@ -69,56 +69,55 @@ def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
 
 
 def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: Sequence[int] = ()) -> list[Panel]:
-    """Scans 0 to num - 1 of a seed, a panel each; with `steps`, a panel for each number of steps, a scan each frame."""
+    """Samples 0 to num - 1 of a seed, a panel each; with `steps`, a panel per number of steps, samples as frames."""
     samplers = [flow.generator.choose(steps=count) for count in steps] or [flow.generator.sampler]
-    evaluations = num * sum(one.evaluations(flow.generator) or 0 for one in samplers)
-    drawn = []
+    evaluations = num * sum(sampler.evaluations(flow.generator) or 0 for sampler in samplers)
+    sets = []
     with ScanBar("sampling", num * len(samplers), evaluations) as bar:
-        for one in samplers:
-            made = list(sample(flow, num, seed, sampler=one, progress=bar.evaluated))
-            for batch in made:
+        for sampler in samplers:
+            batches = list(sample(flow, num, seed, sampler=sampler, progress=bar.evaluated))
+            for batch in batches:
                 warn_unsolved(batch.converged, batch.first)
-            drawn.append(torch.cat([batch.images for batch in made]).nan_to_num(0.0).numpy())
-            bar.set(num * len(drawn))
+            sets.append(torch.cat([batch.images for batch in batches]).nan_to_num(0.0).numpy())
+            bar.set(num * len(sets))
     rays, label = flow.sensor.rays(), f"{label}, seed {seed}"
     if not steps:
-        return [Panel(f"{label}, sample {number}", image[None], rays) for number, image in enumerate(drawn[0])]
+        return [Panel(f"{label}, sample {number}", image[None], rays) for number, image in enumerate(sets[0])]
     captions = [f"{label}, {count} step{'s' * (count > 1)}" for count in steps]
-    return [Panel(caption, images, rays) for caption, images in zip(captions, drawn, strict=True)]
+    return [Panel(caption, images, rays) for caption, images in zip(captions, sets, strict=True)]
 
 
 def way_panels(
     flow: Checkpoint, label: str, num: int, seed: int = 0, steps: int | None = None, times: int = 9
 ) -> tuple[list[Panel], list[str]]:
-    """x_t of scans 0 to num - 1 of a seed at `times` times from t = 0 to 1, decoded, and what the slider says.
+    """Decoded x_t of scans 0 to num - 1 of a seed, at `times` times from t = 0 to 1, and the slider captions.
 
-    Between two times the flow's own solver takes its share of the steps, at least one, or the usual one where its own
-    draws noise.
+    The flow's ODE solver (the default one for a stochastic sampler) divides its steps evenly between the times.
     """
-    solved = as_flow(flow.generator, "x_t")
-    share = ode_sampler(solved).changed(steps=steps)
-    if isinstance(share, OnGrid):
-        share = share.changed(steps=math.ceil(share.steps / (times - 1)), grid="uniform")
-    x = Draws(seed, range(num)).start(solved.noise_shape)
-    at = [i / (times - 1) for i in range(times)]
+    generator = as_flow(flow.generator, "x_t")
+    solver = ode_sampler(generator).changed(steps=steps)
+    if isinstance(solver, OnGrid):
+        solver = solver.changed(steps=math.ceil(solver.steps / (times - 1)), grid="uniform")
+    x = Draws(seed, range(num)).start(generator.noise_shape)
+    grid = [i / (times - 1) for i in range(times)]
     decoded = [flow.encoding.decode(x)]
-    with ScanBar("solving", times - 1, (times - 1) * (share.evaluations(solved) or 0)) as bar:
-        for t_0, t_1 in pairwise(at):
-            x = solved.solve(x, t_0, t_1, sampler=share, progress=bar.evaluated).x
+    with ScanBar("solving", times - 1, (times - 1) * (solver.evaluations(generator) or 0)) as bar:
+        for t_0, t_1 in pairwise(grid):
+            x = generator.solve(x, t_0, t_1, sampler=solver, progress=bar.evaluated).x
             decoded.append(flow.encoding.decode(x.cpu()))
             bar.set(len(decoded) - 1)
     images = torch.stack(decoded, 1).nan_to_num(0.0).numpy()
     rays, label = flow.sensor.rays(), f"{label}, seed {seed}"
     panels = [Panel(f"{label}, sample {number}", image, rays) for number, image in enumerate(images)]
-    return panels, [f"t = {t:.3g}" for t in at]
+    return panels, [f"t = {t:.3g}" for t in grid]
 
 
 def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, title: str = "r2flow") -> Path:
-    """A panel for each set, a slider through `num` scans of each, evenly spread."""
+    """Write a page with one panel per set, with `num` evenly spread scans as frames."""
     panels = []
     for name, scans in sets.items():
-        some = scans.spread(num)
-        if len(some):
-            images = some.source.batch(range(len(some))).nan_to_num(0.0).numpy()
+        chosen = scans.spread(num)
+        if len(chosen):
+            images = chosen.source.batch(range(len(chosen))).nan_to_num(0.0).numpy()
             panels.append(Panel(f"{name}: {scans.label}", images, scans.sensor.rays()))
     return write_panels(path, panels, title=title)
