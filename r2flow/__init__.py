@@ -5,7 +5,7 @@ Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1
 
     flow = r2flow.load("street")              # a model by name, a run folder or a checkpoint
     scans = flow.sample(4)                    # range in metres and reflectance, (4, 2, H, W)
-    scan = r2flow.read("000000.bin", "vlp16")  # a file's scan as such an image, (2, H, W)
+    scan = r2flow.read("000000.bin", "vlp16")  # a scan file as such an image, (2, H, W)
 """
 
 import os
@@ -23,17 +23,17 @@ __version__ = "0.2.0"
 
 
 def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoint":
-    """A trained generator: a model by its name (`r2flow weights` lists them), a run folder or a checkpoint file.
+    """Load a trained generator: a model by name (see `r2flow weights`), a run folder or a checkpoint file.
 
     Args:
-        device: cpu, cuda, cuda:1, ..., or auto for a GPU where there is one.
+        device: cpu, cuda, cuda:1, ..., or auto: a GPU if available.
 
     Raises:
-        InputError: there is none, or no such device.
+        InputError: unknown model, unusable file or unavailable device.
     """
     from r2flow.devices import choose_device
     from r2flow.errors import InputError
-    from r2flow.model.checkpoint import load_checkpoint  # takes as long as torch
+    from r2flow.model.checkpoint import load_checkpoint  # slow, imports torch
 
     if not isinstance(name, str | os.PathLike):
         raise InputError(f"a model has a name, a run folder or a file; found {name!r}.")
@@ -41,15 +41,15 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
 
 
 def read(path: "str | Path", sensor: "Sensor | str | None" = None) -> "torch.Tensor":
-    """A scan from a file: range in metres and reflectance, (2, H, W) float32, 0 where there is no return.
+    """Read a scan from a file: range in metres and reflectance, (2, H, W) float32, 0 for rays without a return.
 
     Args:
         path: A scan file, or a range image (.npy).
-        sensor: Whose image the points become, or its name, or the YAML file of one. If left out, the sensor that the
-            file's folder names where r2flow wrote it, else hdl64e.
+        sensor: Sensor of the image, or its name or YAML file. Default: the sensor in the manifest of a folder that
+            r2flow wrote, else hdl64e.
 
     Raises:
-        InputError: the file cannot be read, or no point lies in the sensor's view.
+        InputError: the file cannot be read, or no point is in the sensor's field of view.
     """
     from r2flow.data.opening import read
 

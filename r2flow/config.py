@@ -1,8 +1,7 @@
-"""The rule of every config key: may it change on resume, does a child inherit it, which links does it concern.
+"""Rules of config keys: whether a key may change on resume, is inherited by a child, and applies to links of a chain.
 
-A key's type is that of the constructor that takes it, which explains it too, and its default stands in `conf/`. A key
-that is not in `RULES` follows the group that it is in; where no group around it is there either, a change makes another
-run, nothing is inherited, and every link is concerned.
+Constructors document and type the keys; defaults are in `conf/`. A key without an entry in `RULES` follows its
+innermost group with one, else the defaults of `Key`.
 """
 
 import json
@@ -16,14 +15,14 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Key:
-    """A config key's rule.
+    """Rule of a config key.
 
     Attributes:
-        resume: `free`: it may differ when a run resumes, for it says where and how is computed, not what.
-        inherited: A run with `stage.init` has its parent's value: `always`, or `unless_given` on the command line;
-            `with_pairs`, which are images of the parent, always, and else unless given.
-        links: Which links of a chain take it from the chain's command line: all, those that read `scans` (the others
-            inherit from them), those that learn from `pairs`, or none, for it says what the `chain` is.
+        resume: `free`: may differ when a run resumes, since it does not affect the result.
+        inherited: Whether a run with `stage.init` takes its parent's value: `always`, `unless_given` on the command
+            line, or `with_pairs`: always with pairs, which are images of the parent, else unless given.
+        links: Links of a chain that take the key from the chain's command line: `all`, those that read `scans` (others
+            inherit from them), those trained on `pairs`, or none, for keys of the `chain`.
     """
 
     resume: Literal["fixed", "free"] = "fixed"
@@ -55,7 +54,7 @@ RULES: dict[str, Key] = {
     "encoding.levels": replace(OF_THE_MODEL, inherited="unless_given"),
     "generator": Key(inherited="unless_given", links="scans"),  # see `lineage.generator_of`
     "backbone": OF_THE_MODEL,
-    "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # the weights fit all the same
+    "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # does not affect the weights' shapes
     "backbone.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
     "backbone.inner.attention": replace(OF_THE_MODEL, inherited="unless_given"),
     "backbone.inner.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
@@ -70,7 +69,7 @@ RULES: dict[str, Key] = {
     "data.workers": FREE,
     "data.memory_gib": FREE,
     "data.pairs": Key(links="pairs"),
-    "data.pairs.of": Key(links="pairs", resume="free"),  # data.pairs.parent says which
+    "data.pairs.of": Key(links="pairs", resume="free"),  # data.pairs.parent identifies them
     "data.scans": Key(links="pairs"),
     "data.scans.root": Key(links="pairs", resume="free"),
     "callbacks.reflow_pairs": FREE,
@@ -95,26 +94,26 @@ RULES: dict[str, Key] = {
 
 
 def rule(key: str) -> Key:
-    """The rule of a key, as `data.parts.0.root`: its own, else that of the nearest group around it."""
+    """Rule of a key, such as `data.parts.0.root`, or of its innermost group with a rule."""
     parts = re.sub(r"\.\d+(?=\.|$)", ".*", key).split(".")
-    around = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
-    return next((RULES[group] for group in around if group in RULES), Key())
+    groups = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
+    return next((RULES[group] for group in groups if group in RULES), Key())
 
 
 def groups_of(**wanted: str) -> list[str]:
-    """The top-level groups whose rule has these values, as `inherited="always"`."""
-    return [key for key, of in RULES.items() if "." not in key and all(getattr(of, k) == v for k, v in wanted.items())]
+    """Top-level groups with these values in their rule, such as `inherited="always"`."""
+    return [key for key, r in RULES.items() if "." not in key and all(getattr(r, k) == v for k, v in wanted.items())]
 
 
 def key_of(override: str) -> str:
-    """The key in a word of Hydra's command line, as `+data.root=x`; a group's package is left out."""
+    """Key of a Hydra override such as `+data.root=x`, without a group's package."""
     return override.lstrip("+~").partition("=")[0].partition("@")[0].replace("/", ".")
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """('a.b', value) for every leaf of a nested mapping; a list of groups counts them, 'a.0.b'."""
+    """('a.b', value) for every leaf of a nested mapping; groups in a list are numbered, 'a.0.b'."""
     for key, value in config.items():
-        if isinstance(value, Sequence) and value and all(isinstance(one, Mapping) for one in value):
+        if isinstance(value, Sequence) and value and all(isinstance(group, Mapping) for group in value):
             value = dict(enumerate(value))
         if isinstance(value, Mapping):
             yield from flatten(value, f"{prefix}{key}.")
@@ -123,10 +122,10 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def check_tree(config: Mapping[str, Any]) -> None:
-    """Refuse a config that contains itself, as an anchor of YAML or a pickle can have it.
+    """Refuse a config that contains itself, possible in YAML and pickles, or is nested too deeply.
 
     Raises:
-        ValueError: it does, or it is nested too deeply to be one.
+        ValueError: the config is refused.
     """
     try:
         json.dumps(config, skipkeys=True, default=str)
@@ -135,21 +134,21 @@ def check_tree(config: Mapping[str, Any]) -> None:
 
 
 def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A config without its free keys: what was learned, and neither where nor how it was computed."""
-    found: dict[str, Any] = {}
+    """A config without its free keys: the settings that affect the result."""
+    fixed: dict[str, Any] = {}
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
             inner = learned(value, f"{prefix}{key}.")
             if inner:
-                found[key] = inner
+                fixed[key] = inner
         elif rule(f"{prefix}{key}").resume == "fixed":
-            groups = isinstance(value, Sequence) and value and all(isinstance(one, Mapping) for one in value)
-            found[key] = [learned(one, f"{prefix}{key}.{n}.") for n, one in enumerate(value)] if groups else value
-    return found
+            groups = isinstance(value, Sequence) and value and all(isinstance(group, Mapping) for group in value)
+            fixed[key] = [learned(group, f"{prefix}{key}.{n}.") for n, group in enumerate(value)] if groups else value
+    return fixed
 
 
 def as_override(key: str, path: str | Path) -> str:
-    """KEY=PATH as a shell and then Hydra's grammar read it back; to the latter a space or a = needs quotes."""
+    """KEY=PATH quoted for a shell and for Hydra's grammar, in which a space or = needs quotes."""
     text = str(path)
     if not re.fullmatch(r"[\w./~-]+", text):
         text = '"' + re.sub(r'(\\*)"', r'\1\1\\"', text) + '"'

@@ -1,4 +1,4 @@
-"""The exception for mistakes of the user."""
+"""Errors of user input, their messages, and output streams."""
 
 import errno
 import io
@@ -18,21 +18,21 @@ log = logging.getLogger(__name__)
 
 
 class InputError(ValueError):
-    """Something that the user gave cannot be used.
+    """Unusable input of the user.
 
-    The message is one line: what was wrong, what was found, what to do. The command line prints it
-    without a traceback and exits with 2; any other exception is a defect of ours and keeps its traceback.
+    The message is one line: what was wrong, what was found, what to do. The command line prints it without a traceback
+    and exits with 2; any other exception is a bug and keeps its traceback.
     """
 
 
 def require(what: str, extra: str, *packages: str) -> None:
-    """Refuse what needs a package that is not installed, and say which extra of r2flow brings it."""
+    """Raise InputError with the extra to install if a package is missing."""
     for package in packages:
         if find_spec(package) is None:
             raise InputError(f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.")
 
 
-# System errors that a user can mend; others (a lost connection, a broken pipe) keep their traceback.
+# System errors that a user can fix; others (a lost connection, a broken pipe) keep their traceback.
 MENDABLE = {
     errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP,
@@ -41,28 +41,28 @@ MENDABLE = {
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """Puts a file's name before an InputError about it."""
+    """Prefix the message of an InputError with the name of a file."""
     try:
         yield
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
 
 
-# Oddities of scan files, logged once per folder: files by folder and kind, with how many values of each are odd.
+# Odd values of scan files, logged once per folder: (folder, kind) -> file -> number of odd values.
 _odd: defaultdict[tuple[Path, str], dict[Path, int]] = defaultdict(dict)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_odd.clear)
 
 
 def note_odd(path: Path, kind: str, count: int) -> None:
-    """Note that `count` values of a file are odd, for `tell_odd` or, at the latest, the end of the process."""
+    """Count odd values of a file, to be logged by `tell_odd`, at the latest at the end of the process."""
     if not _odd:
-        Finalize(None, tell_odd, exitpriority=0)  # in workers, too, where atexit is not enough
+        Finalize(None, tell_odd, exitpriority=0)  # unlike atexit, also in workers
     _odd[path.parent, kind][path] = count
 
 
 def tell_odd() -> None:
-    """Warn of what `note_odd` has collected, in one line for each folder and kind."""
+    """Log the counts of `note_odd` as warnings, one per folder and kind."""
     for (folder, kind), files in _odd.items():
         worst = max(files, key=files.__getitem__)
         number = f"{len(files)} file{'s' * (len(files) > 1)}"
@@ -71,43 +71,43 @@ def tell_odd() -> None:
 
 
 def explain_mistake(error: InputError | OSError) -> str:
-    """A mistake in one line: an InputError's own, or what the system refused (a read-only folder, a full disk)."""
+    """One line for an InputError or a system error that a user can fix; raises other system errors."""
     if isinstance(error, OSError):
         if error.errno not in MENDABLE:
             raise error
         if error.errno in (errno.ENOTDIR, errno.EEXIST) and error.filename:
-            named = Path(os.fsdecode(error.filename))
-            file = next((path for path in (named, *named.parents) if path.exists() and not path.is_dir()), None)
+            given = Path(os.fsdecode(error.filename))
+            file = next((path for path in (given, *given.parents) if path.exists() and not path.is_dir()), None)
             if file is not None:
                 return one_line(f"{file} is a file, not a folder; give another name.")
         where = f"{error.filename}: " if error.filename else ""
         return one_line(f"{where}{error.strerror or error}")
     text = str(error)
-    if "Traceback (most recent call last)" in text:  # of a loader's worker: the line is the last of it
+    if "Traceback (most recent call last)" in text:  # from a loader's worker, with the message at the end
         text = text.rpartition("InputError: ")[2]
     return one_line(text) or "unknown"
 
 
 def one_line(text: str) -> str:
-    """A text that may hold a file's name, as one line that every terminal takes."""
+    """Make a text with file names one printable line."""
     return printable("\\n".join(text.strip().splitlines()))
 
 
 def printable(text: str) -> str:
-    """A text that may hold a file's name, with control characters and bytes that are not UTF-8 escaped."""
+    """Escape control characters and bytes that are not UTF-8, as in file names."""
     safe = (c == "\n" or unicodedata.category(c)[0] != "C" for c in text)
     return "".join(c if plain else c.encode("unicode_escape").decode() for c, plain in zip(text, safe, strict=True))
 
 
 class PlainFormatter(logging.Formatter):
-    """Log lines without control characters of file names."""
+    """Escapes control characters in log lines."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
 
 
 class _Unbroken(io.FileIO):
-    """A descriptor that takes everything, also after its reader (`| head`) has ended."""
+    """A file descriptor that can be written to after its reader (`| head`) has ended."""
 
     def write(self, data: Any) -> int:
         try:
@@ -120,11 +120,11 @@ class _Unbroken(io.FileIO):
 
 
 def open_streams() -> None:
-    """Let standard output and error take any file name, outlive their reader, and exist in a daemon."""
+    """Make standard output and error accept any file name, outlive their reader, and exist in a daemon."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (to the end)
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (open until exit)
         elif stream is getattr(sys, f"__{name}__"):
             stream.flush()
             raw = io.BufferedWriter(_Unbroken(stream.fileno(), "w", closefd=False))

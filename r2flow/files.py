@@ -1,4 +1,4 @@
-"""Output files: a reader finds the old file or the whole new one, and devices, pipes and links stay what they are."""
+"""Atomic writing of files, and safe reading of JSON."""
 
 import errno
 import json
@@ -21,12 +21,12 @@ from r2flow.errors import InputError
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file that replaces `path` when the block ends without an error.
 
-    It is flushed to the disk before the rename and the folder after it: a reader, or a power cut, finds the old file or
-    the whole new one. A link stays, and its target is replaced. A device or a pipe is written into.
+    The file is synced before the rename and the folder after it, so that a reader finds the old or the complete new
+    file, even after a power cut. For a link, the target is replaced; devices and pipes are written to directly.
 
     Raises:
         IsADirectoryError: `path` is a folder.
-        InputError: it is a socket, a block device or a link to nothing.
+        InputError: `path` is a socket, a block device or a broken link.
     """
     path = Path(path)
     is_stream = _is_stream(path)
@@ -34,7 +34,7 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     target = Path(os.path.realpath(path))
     folder = Path(tempfile.gettempdir()) if is_stream else target.parent
     temporary = folder / f".{target.name}.{secrets.token_hex(4)}.part"
-    # A file's name may be part of a text, and need not be UTF-8.
+    # Texts may contain file names that are not UTF-8.
     encoding, errors = (None, None) if "b" in mode else ("utf-8", "backslashreplace")
     try:
         with open(temporary, mode.replace("w", "x"), encoding=encoding, errors=errors) as file:
@@ -48,10 +48,10 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
             os.replace(temporary, target)
             _sync_folder(folder)
     except OSError as error:
-        if error.errno is None:  # numpy's, of fewer bytes written than there are
+        if error.errno is None:  # numpy's error of an incomplete write
             error = OSError(errno.ENOSPC, f"cannot be written whole, is there room? ({error})")
-        named = str(error.filename or "")
-        if not named or named.endswith(".part"):  # a full disk names no file, a read-only folder the temporary one
+        name = str(error.filename or "")
+        if not name or name.endswith(".part"):  # errors of full disks have no name, of read-only folders the temporary
             error.filename = str(path)
         raise error
     finally:
@@ -60,13 +60,13 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
 
 
 def save_array(path: str | Path, array: np.ndarray) -> None:
-    """Write a .npy, whole or not at all."""
+    """Write a .npy file atomically."""
     with atomic_write(path) as file:
         np.save(file, array)
 
 
 def parse_json(text: str) -> Any:
-    """What a text of JSON says; a ValueError if it is not JSON or nested too deeply."""
+    """Parse JSON; raises ValueError if it is invalid or nested too deeply."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -74,19 +74,19 @@ def parse_json(text: str) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """What a file of JSON says; raises as `parse_json`."""
+    """Read a JSON file; raises the errors of `parse_json`."""
     return parse_json(path.read_text(encoding="utf-8"))
 
 
 def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:
-    """Refuse a path that is no regular file, or of 0 or more than `largest` bytes, before it is opened."""
+    """Refuse a path that is not a regular file, is empty or has more than `largest` bytes, before it is opened."""
     if path.is_symlink() and not path.exists():
         raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
     if not path.exists():
         raise InputError(f"{path} does not exist. Is the path right?")
     if path.is_dir():
         raise InputError(f"{path} is a folder, not a {what}; name a file in it.")
-    if not path.is_file():  # reading a pipe would wait for ever, a device never end
+    if not path.is_file():  # reading a pipe or a device may never end
         raise InputError(f"{path} is not a regular file.")
     size = path.stat().st_size
     if size == 0:
@@ -97,7 +97,7 @@ def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:
 
 
 def _is_stream(path: Path) -> bool:
-    """Whether a path is written into rather than replaced: a character device or a pipe."""
+    """Whether a path is a character device or a pipe, which is written to directly."""
     try:
         kind = path.stat().st_mode
     except FileNotFoundError:
@@ -125,7 +125,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def cache_folder(variable: str, name: str = "") -> Path:
-    """The folder that an environment variable names; else `name` in r2flow's folder of the user's cache."""
-    if named := os.environ.get(variable):
-        return Path(named).expanduser()
+    """Folder in an environment variable; default: `name` in r2flow's folder of the user's cache."""
+    if folder := os.environ.get(variable):
+        return Path(folder).expanduser()
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "r2flow", name).expanduser()

@@ -1,4 +1,4 @@
-"""What tensors hash to."""
+"""Hashes of tensors."""
 
 import hashlib
 from collections.abc import Mapping
@@ -8,11 +8,7 @@ from torch import Tensor
 
 
 def state_hash(state: Mapping[str, Tensor], prefix: bytes = b"") -> str:
-    """SHA-256 (64 hex digits) of tensors: their names, shapes, types and bytes, whatever file they came from.
-
-    Args:
-        prefix: What else the hash depends on.
-    """
+    """SHA-256 (64 hex digits) of names, shapes, types and bytes of tensors, after a prefix."""
     digest = hashlib.sha256(prefix)
     for name, value in sorted(state.items()):
         digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())

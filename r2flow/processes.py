@@ -1,4 +1,4 @@
-"""Work that several processes share: those of a run, or those of torchrun."""
+"""Communication between the processes of a run or of torchrun."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -10,14 +10,14 @@ from torch import Tensor, nn
 
 
 def place() -> tuple[int, int]:
-    """The number of this process among those of a run, and how many they are: (0, 1) for one alone."""
+    """Rank of this process and number of processes; (0, 1) for a single process."""
     if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
         return 0, 1
     return torch.distributed.get_rank(), torch.distributed.get_world_size()
 
 
 def summed(x: Tensor) -> Tensor:
-    """The sum over all processes of a run; x itself where there is one."""
+    """Sum over all processes; x itself for a single process."""
     if place()[1] == 1:
         return x
     x = x.clone()
@@ -26,27 +26,26 @@ def summed(x: Tensor) -> Tensor:
 
 
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """The mean of each gradient over all processes of a run, in one message; nothing where there is one process."""
-    taught = [p for p in parameters if p.grad is not None]
-    if not taught or place()[1] == 1:
+    """Average each gradient over all processes, in one message; no operation for a single process."""
+    trained = [p for p in parameters if p.grad is not None]
+    if not trained or place()[1] == 1:
         return
-    mean = averaged(torch.cat([p.grad.flatten() for p in taught if p.grad is not None]))
-    for parameter, gradient in zip(taught, mean.split([p.numel() for p in taught]), strict=True):
+    mean = averaged(torch.cat([p.grad.flatten() for p in trained if p.grad is not None]))
+    for parameter, gradient in zip(trained, mean.split([p.numel() for p in trained]), strict=True):
         parameter.grad = gradient.view_as(parameter)
 
 
 def averaged(x: Tensor) -> Tensor:
-    """The mean over all processes of a run, which share a batch equally; x itself where there is one."""
+    """Mean over all processes, which share a batch equally; x itself for a single process."""
     ranks = place()[1]
     return summed(x) / ranks if ranks > 1 else x
 
 
 @contextmanager
 def joined(device: str) -> Iterator[str]:
-    """Join the group of processes that torchrun has started, and leave it afterwards; alone without torchrun.
+    """Join torchrun's process group for a block; without torchrun, run as a single process.
 
-    The processes take batches by turns, statistics are added up when figures are computed, and every process has all
-    figures. Yields the device of this process.
+    Processes take batches in turn and sum statistics, so that each has all figures. Yields this process's device.
     """
     if os.environ.get("WORLD_SIZE", "1") == "1" or "RANK" not in os.environ:
         yield device
@@ -54,8 +53,8 @@ def joined(device: str) -> Iterator[str]:
     if device == "cuda":
         device = f"cuda:{int(os.environ.get('LOCAL_RANK', '0')) % torch.cuda.device_count()}"
         torch.cuda.set_device(device)
-    # Counts are exchanged on the CPU, statistics on the device that they are on. The first process alone searches for
-    # copies, which can take hours, and the others wait for it.
+    # Counts are exchanged on the CPU, statistics on their device. The timeout covers the search for copies by the first
+    # process, which can take hours.
     torch.distributed.init_process_group(
         "cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo", timeout=timedelta(days=7)
     )

@@ -1,4 +1,4 @@
-"""The progress bar of everything that takes a while."""
+"""Progress bars."""
 
 import sys
 import time
@@ -12,18 +12,18 @@ from rich.text import Text
 
 T = TypeVar("T")
 
-EVERY = 30  # seconds between two lines where there is no terminal, as in a cluster's log
+EVERY = 30  # seconds between lines without a terminal, as in a cluster's log
 
 
 class Bar:
-    """A progress bar with rate and time left, on standard error: results on standard output may be piped.
+    """A progress bar with rate and time left, on standard error.
 
     Args:
-        doing: What is being done, as "sampling".
+        doing: Activity, such as "sampling".
         total: Number of units.
-        unit: What is counted, as "scans".
-        shown: Whether it is drawn; if left out, on a terminal, and elsewhere as a line every `EVERY` seconds.
-        lines: Lines on a terminal too, where the bars of several processes would write over each other.
+        unit: Unit, such as "scans".
+        shown: Whether to draw it; default: on a terminal, elsewhere a line every `EVERY` seconds.
+        lines: Print lines also on a terminal, since bars of several processes would overwrite each other.
     """
 
     def __init__(self, doing: str, total: int, unit: str = "", shown: bool | None = None, lines: bool = False) -> None:
@@ -36,11 +36,11 @@ class Bar:
         self._task = self._progress.add_task(unit, total=total, note="")
         self._doing, self._unit = doing, unit
         self._lines = lines or (shown is None and not drawn)
-        self._told = time.monotonic()
-        self._first: tuple[float, float] | None = None  # what was done, and when: work that goes on begins with some
+        self._printed = time.monotonic()
+        self._first: tuple[float, float] | None = None  # units done at the first call, above 0 after resuming; its time
 
     def __enter__(self) -> Self:
-        self._told = time.monotonic()
+        self._printed = time.monotonic()
         self._progress.start()
         return self
 
@@ -48,24 +48,24 @@ class Bar:
         self._progress.stop()
 
     def __call__(self, units: float = 1) -> None:
-        """So many more units are done."""
+        """Advance by a number of units."""
         self._progress.advance(self._task, units)
-        self._tell()
+        self._print()
 
     def set(self, done: float | None = None, note: str | None = None) -> None:
-        """How many units are done by now, and what stands behind the bar."""
+        """Set the number of finished units, and the note after the bar."""
         if done is not None:
             self._progress.update(self._task, completed=done)
-            self._tell()
+            self._print()
         if note is not None:
             self._progress.update(self._task, note=note)
 
-    def _tell(self) -> None:
+    def _print(self) -> None:
         now, task = time.monotonic(), self._progress.tasks[0]
         before, began = self._first = self._first or (task.completed, now)
         done = task.completed - before
-        if self._lines and done > 0 and now - self._told >= EVERY:
-            self._told, rate = now, done / (now - began)
+        if self._lines and done > 0 and now - self._printed >= EVERY:
+            self._printed, rate = now, done / (now - began)
             left = duration(max((task.total or 0) - task.completed, 0) / rate)
             counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
             print(f"{counted}  {rate:.2f}/s  {left} left", file=sys.stderr, flush=True)
@@ -78,10 +78,10 @@ class _Rate(ProgressColumn):
 
 
 def track(items: Iterable[T], doing: str, unit: str = "", total: int | None = None, least: int = 0) -> Iterator[T]:
-    """The items one by one, with a bar where there are at least `least` of them.
+    """Iterate over items, with a bar if there are at least `least`.
 
     Args:
-        total: How many there are, for items that do not know their number.
+        total: Number of items, for iterables without a length.
     """
     count = length_hint(items) if total is None else total
     with Bar(doing, count, unit, shown=None if count >= least else False) as bar:

@@ -1,4 +1,4 @@
-"""Being told to stop: what a signal means to a run, and to a process that waits for one."""
+"""Handling of stop signals in runs, launchers and workers."""
 
 import atexit
 import multiprocessing
@@ -14,30 +14,30 @@ Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
 STOPPING = (signal.SIGTERM, signal.SIGINT)
 
-LATER = 75  # exit code, "try again later" among the system's: the run is not at its end, the same command resumes
+LATER = 75  # exit code EX_TEMPFAIL of an unfinished run: the same command resumes
 
 
 class Stopped(BaseException):
-    """The work was told to stop, and has.
+    """Work was stopped by a signal.
 
-    Not an `Exception`: what deals with errors on the way (a reader's, Hydra's) must not take it for one.
+    Not an `Exception`, so that handlers of errors (in readers, in Hydra) do not catch it.
 
     Attributes:
-        code: What the process is to exit with: 143 after SIGTERM, 130 after Ctrl-C.
+        code: Exit code of the process: 143 after SIGTERM, 130 after Ctrl-C.
     """
 
-    def __init__(self, code: int, said: str = "stopped") -> None:
-        super().__init__(said)
+    def __init__(self, code: int, message: str = "stopped") -> None:
+        super().__init__(message)
         self.code = code
 
 
 def code_of(number: int) -> int:
-    """The exit code by which a shell knows that a signal ended a process."""
+    """Exit code of a process that ended by a signal, as in shells."""
     return 128 + number
 
 
 def outlive_parent(seconds: float = 10.0) -> None:
-    """Wait for the launching process: Lightning kills it, unheard, once a child has ended with another code than 0."""
+    """Wait for the end of the launching process, which Lightning kills once a child ends with a nonzero code."""
     parent, begin = os.getppid(), time.monotonic()
     while os.getppid() == parent and time.monotonic() - begin < seconds:
         time.sleep(0.1)
@@ -45,29 +45,29 @@ def outlive_parent(seconds: float = 10.0) -> None:
 
 @contextmanager
 def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
-    """Have signals handled for the length of a block. Outside the main thread, which alone hears them, nothing changes.
+    """Handle signals within a block; without effect outside the main thread, which alone receives them.
 
-    Ctrl-C stays ignored where it is: a shell's background job is not meant.
+    Ctrl-C stays ignored if it was, as in background jobs of a shell.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {one: signal.getsignal(one) for one in signals}
-    heard = [one for one in signals if not (one == signal.SIGINT and before[one] is signal.SIG_IGN)]
-    for one in heard:
-        signal.signal(one, handler)
+    before = {number: signal.getsignal(number) for number in signals}
+    handled = [number for number in signals if not (number == signal.SIGINT and before[number] is signal.SIG_IGN)]
+    for number in handled:
+        signal.signal(number, handler)
     try:
         yield
     finally:
-        for one in heard:
-            signal.signal(one, before[one])
+        for number in handled:
+            signal.signal(number, before[number])
 
 
 def stop_at_once(number: int, frame: FrameType | None = None) -> None:
-    """A handler: nothing is under way that would have to be saved."""
-    if multiprocessing.parent_process() is not None:  # a worker, forked with the handler: who started it speaks
+    """Handler without anything to save."""
+    if multiprocessing.parent_process() is not None:  # a forked worker; its parent prints the message
         os._exit(code_of(number))
-    if _is_importing(frame):  # compiled modules swallow an exception, or make another one of it
+    if _is_importing(frame):  # compiled modules swallow or replace exceptions
         end_at_once(number)
     raise Stopped(code_of(number))
 
@@ -79,25 +79,25 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 def end_at_once(number: int, frame: FrameType | None = None) -> None:
-    """A handler for a program that is still being imported, or ends: there is nothing to clear away."""
+    """Handler during imports and at exit, without cleanup."""
     os.write(2, b"stopped\n")
     os._exit(code_of(number))
 
 
 @contextmanager
 def heard_from_the_first_import() -> Iterator[None]:
-    """Answer Ctrl-C and SIGTERM in one line around a whole program, whose imports take seconds, and at its exit."""
-    atexit.register(_end_in_peace)  # first, so that it is called last
+    """Answer Ctrl-C and SIGTERM by one line during a whole program, including slow imports and its exit."""
+    atexit.register(_end_in_peace)  # registered first, so that it is called last
     with listening(end_at_once):
         try:
             yield
         finally:
             atexit.unregister(_hear_at_exit)
-            atexit.register(_hear_at_exit)  # last, so that it is called first
+            atexit.register(_hear_at_exit)  # registered last, so that it is called first
 
 
 def _end_in_peace() -> None:
-    """Ignore signals while the interpreter takes itself apart, handlers too: the program has ended already."""
+    """Ignore signals while the interpreter shuts down."""
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
 
@@ -109,10 +109,7 @@ def _hear_at_exit() -> None:
 
 
 def end_with_parent(worker: int = 0) -> None:
-    """In a worker: end when the process that started it has ended, in whatever way.
-
-    A worker that waits for the reader of its results, which is gone, would wait for ever.
-    """
+    """End a worker when its parent process ends, since it would wait forever for a reader of its results."""
 
     def wait() -> None:
         parent = multiprocessing.parent_process()
@@ -125,11 +122,11 @@ def end_with_parent(worker: int = 0) -> None:
 
 @contextmanager
 def out_of_reach() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach, not even as they import; here it waits for the end of the block."""
+    """Start processes that ignore Ctrl-C also during imports; this process receives it after the block."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which they inherit
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the processes
     try:
         yield
     finally:
@@ -137,9 +134,9 @@ def out_of_reach() -> Iterator[None]:
 
 
 def outlive_the_signal(worker: int = 0) -> None:
-    """In a loader's worker: a signal is for the run, which may need the worker for the step that it is in.
+    """Keep a loader's worker alive after a signal for 30 s, since its run may need it to finish a step.
 
-    A worker that its run has forgotten goes by itself, and with its run.
+    The worker also ends with its run.
     """
     end_with_parent()
 

@@ -243,7 +243,7 @@ def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_b
     drawn = ("--num", 1, "--steps", 1, "--pictures", 0, "--out", out)
     code, _, error = r2flow("sample", published, *drawn, "--format", "npy,ply")
     assert code == 0
-    assert error.count("points are written along rays through their middles") == 1
+    assert error.count("points are written along rays through bin centres") == 1
     assert json.loads((out / "manifest.json").read_text())["recipe"]["rays"] == "centre"
     h, w, image = 16, 192, np.load(out / "000000.npy")
     xyz = read_points(out / "000000.ply").xyz
@@ -254,5 +254,5 @@ def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_b
         np.testing.assert_allclose(place, place.round(), atol=1e-3)
     found = image[0][row.round().astype(int), column.round().astype(int)]
     np.testing.assert_allclose(np.linalg.norm(xyz, axis=1), found, rtol=1e-5)
-    assert "middles" not in r2flow("sample", published, *drawn, "--format", "npy")[2]
-    assert "middles" not in r2flow("sample", saved[0], *drawn, "--format", "ply")[2]
+    assert "bin centres" not in r2flow("sample", published, *drawn, "--format", "npy")[2]
+    assert "bin centres" not in r2flow("sample", saved[0], *drawn, "--format", "ply")[2]

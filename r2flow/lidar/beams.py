@@ -236,7 +236,7 @@ def _beams(scans: Sequence[Points]) -> Beams:
 def _is_scattered(scan: Points) -> bool:
     """Whether elevations are spread evenly within sectors of one degree of azimuth.
 
-    The median gap between sorted elevations is 0.06 of the mean gap or less in real scans, whatever their order, ln 2
+    The median gap between sorted elevations is 0.06 of the mean gap or less in real scans of any order, ln 2
     for points drawn at random, and 0.4 or more for scanners without beams.
     """
     elevation = elevations_of(scan.xyz)

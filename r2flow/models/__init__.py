@@ -1,7 +1,7 @@
 """Trained generators by name: `r2flow.load("street")`, `r2flow sample street`, `stage.init=street`.
 
-The file of a model is `NAME.safetensors`, in this folder where it comes with the package, else in the folder of models,
-where `r2flow weights --add NAME FILE` puts it. Nothing is downloaded.
+`NAME.safetensors` is in this folder for models that come with the package, else in the folder of models, where
+`r2flow weights --add NAME FILE` copies it. r2flow does not download.
 """
 
 import hashlib
@@ -17,13 +17,13 @@ SHIPPED = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Model:
-    """A trained generator that has a name.
+    """A trained generator with a name.
 
     Attributes:
-        about: What it draws, and from what it has learned.
-        sha256: Of its file.
-        licence: Of its weights.
-        page: Where the file is to be got; None where it comes with the package.
+        about: Generated scans and training data.
+        sha256: SHA-256 of the file.
+        licence: Licence of the weights.
+        page: Source of the file; None: comes with the package.
     """
 
     about: str
@@ -53,20 +53,20 @@ DENSIFY = "densify"
 
 
 def models_folder() -> Path:
-    """The folder of models that do not come with the package: R2FLOW_MODELS, or ~/.cache/r2flow/models."""
+    """Folder of models that do not come with the package: R2FLOW_MODELS, or ~/.cache/r2flow/models."""
     return cache_folder("R2FLOW_MODELS", "models")
 
 
 def model_file(name: str) -> Path:
-    """Where the file of a model lies, or belongs."""
+    """Path of a model's file, which may be missing."""
     return (SHIPPED if MODELS[name].page is None else models_folder()) / f"{name}.safetensors"
 
 
 def find_model(name: str) -> Path:
-    """The file of a model.
+    """Find and verify the file of a model.
 
     Raises:
-        InputError: no model of that name, its file is not here, or is another.
+        InputError: unknown model, or missing or wrong file.
     """
     path, model = model_file(name), MODELS[name]
     if not path.is_file():
@@ -77,15 +77,15 @@ def find_model(name: str) -> Path:
 
 
 def add_model(name: str, file: Path) -> Path:
-    """Copy the file of a model to where it is looked for.
+    """Copy the file of a model into the folder of models.
 
     Raises:
-        InputError: no model of that name, one that comes with the package, or another file.
+        InputError: unknown model, one that comes with the package, or wrong file.
     """
     if MODELS[name].page is None:
         raise InputError(f"the model {name} comes with the package; there is nothing to add.")
     if not file.is_file():
-        raise InputError(f"{file} is no file. That of {name} is {MODELS[name].page}.")
+        raise InputError(f"{file} is not a file; the file of {name} is {MODELS[name].page}.")
     _check(name, file)
     path = model_file(name)
     with atomic_write(path) as out:
@@ -94,15 +94,15 @@ def add_model(name: str, file: Path) -> Path:
 
 
 def name_of(path: Path) -> str | None:
-    """The model whose file this is, if it is one."""
+    """Name of the model with this file, or None."""
     return next((name for name in MODELS if model_file(name) == path), None)
 
 
 def _check(name: str, path: Path) -> None:
     with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != MODELS[name].sha256:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest != MODELS[name].sha256:
         raise InputError(
-            f"{path} is not the model {name}, or damaged: its SHA-256 is {found[:16]}..., not "
+            f"{path} is not the model {name}, or damaged: its SHA-256 is {digest[:16]}..., not "
             f"{MODELS[name].sha256[:16]}.... Get it again."
         )

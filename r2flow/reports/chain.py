@@ -44,9 +44,9 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     bends = {name: bend(flow, num) for name, flow in flows.items()}
     cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     for name, steps in track(cells, "sampling"):
-        made = list(sample(flows[name], num, steps=steps))
-        images = np.concatenate([one.images.numpy() for one in made])
-        seconds = sum(one.seconds for one in made) / num
+        batches = list(sample(flows[name], num, steps=steps))
+        images = np.concatenate([batch.images.numpy() for batch in batches])
+        seconds = sum(batch.seconds for batch in batches) / num
         lines = distances(truth, panel(images, first.sensor))
         means = {"bend": bends[name], "mean": mean_distance(lines)}
         rows.append({"flow": name, "steps": steps, "seconds": seconds, **means, **lines})
@@ -58,8 +58,8 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     text = [
         f"{num} scans of each generator and number of steps, all from the same noise, against {len(real)} held-out "
         "scans. *Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 "
-        "is straight); an untrained flow is straight too, so read it beside the *distance*: the mean of the "
-        "panel's lines, 0 is equal.",
+        "is straight); an untrained flow is straight too, so read it together with the *distance*: the mean of "
+        "the panel's lines, 0 is equal.",
         table(rows, COLUMNS | {line: line for line in PANEL}),
     ]
     titles = [f"{name}, {steps} step{'s' * (steps > 1)}" for name, steps in cells]
@@ -89,7 +89,7 @@ Open {out / "chain.png"} first.""",
 
 
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
-    """Numbers of steps to sample: a distilled generator's own; for others 1, those of distilled ones and `MANY`."""
+    """Numbers of steps to sample: fixed for a distilled generator, else 1, those of distilled ones and `MANY`."""
     fixed = {other.generator.sampler.steps for other in flows if other.generator.fixed}  # type: ignore[attr-defined]
     return [flow.generator.sampler.steps] if flow.generator.fixed else sorted({1, *fixed, MANY})  # type: ignore[attr-defined]
 
@@ -105,9 +105,9 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 def bend(flow: Checkpoint, num: int) -> float:
     """int s(t) dt over |x_1 - x_0|^2, median over scans: 0 is straight; NaN for generators without paths."""
-    followed = flow.generator
-    if not isinstance(followed, Flow):
+    generator = flow.generator
+    if not isinstance(generator, Flow):
         return math.nan
-    x_0 = Draws(0, range(num)).start(followed.noise_shape).to(followed.device)
+    x_0 = Draws(0, range(num)).start(generator.noise_shape).to(generator.device)
     with torch.inference_mode():
-        return float(curvature(followed.velocity, x_0, MANY).normalised.median())
+        return float(curvature(generator.velocity, x_0, MANY).normalised.median())

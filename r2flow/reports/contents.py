@@ -14,10 +14,10 @@ def describe(path: str | Path) -> dict[str, Any]:
     loaded = load_checkpoint(path)
     rows, columns = loaded.sensor.shape
     model = name_of(loaded.path)
-    known = {"model": model, "draws": MODELS[model].about, "licence": MODELS[model].licence} if model else {}
+    about = {"model": model, "draws": MODELS[model].about, "licence": MODELS[model].licence} if model else {}
     broken = [name for name, value in loaded.generator.state_dict().items() if not value.isfinite().all()]
     return {
-        **known,
+        **about,
         "path": str(loaded.path),
         "bytes": loaded.path.stat().st_size,
         "format": loaded.format,

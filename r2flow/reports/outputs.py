@@ -56,15 +56,15 @@ def write_samples(
 ) -> None:
     """Sample scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
 
-    Scan i of a seed is the same whatever `num` and `batch_size` are. A call that was stopped resumes.
+    Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes.
 
     Args:
-        sampler: How the generator is run; its own if left out.
-        formats: All that fit if left out. `ply` and `bin` are points in metres with reflectance, `npy` the range image,
-            float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
-        pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
-        region, channels: See `r2flow.model.sampling.sample`. Files are of the sensor's shape, 0 outside the region.
-        replace: Whether samples of other settings in the folder are removed first.
+        sampler: Sampler; default: the generator's.
+        formats: File formats; default: all of `formats_of`. `ply` and `bin`: points in metres with reflectance; `npy`:
+            range image, float32 (2 or 1, H, W); reflectance without range is `NNNNNN.reflectance.npy`.
+        pictures: Number of scans with pictures; the contact sheet shows at most 8.
+        region, channels: See `r2flow.model.sampling.sample`. Files have the sensor's shape, 0 outside the region.
+        replace: Whether to delete samples of other settings in the folder.
     """
     generator = checkpoint.generator
     sampler = sampler or generator.sampler
@@ -83,8 +83,8 @@ def write_samples(
     stale = _stale(store, replace)
     if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
         log.warning(
-            "the model was told rays through the corners of the bins (rays=reference); points are written along rays "
-            "through their middles, where returns lie nearer (docs/data.md, Projection)"
+            "the model uses rays through the corners of bins (rays=reference); points are written along rays through "
+            "bin centres, closer to the returns (docs/data.md, Projection)"
         )
     shown: list[np.ndarray] = []
     with ScanBar("sampling", num, batches(num, batch_size) * (sampler.evaluations(generator) or 0)) as bar:
@@ -151,8 +151,8 @@ class ScanBar(Bar):
     """Progress bar of scans that also advances with network evaluations.
 
     Args:
-        evaluations: Network evaluations in all, batches counted as one; 0 where an adaptive solver decides.
-        unit: What is counted in the place of scans.
+        evaluations: Total network evaluations, one per batch; 0: unknown, as for adaptive solvers.
+        unit: Unit instead of scans.
     """
 
     def __init__(self, doing: str, num: int, evaluations: int = 0, unit: str = "scans") -> None:
@@ -206,10 +206,7 @@ def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> None:
 
 
 def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
-    """The commands that come after scans of a run were written to `out`.
-
-    After simulated scans come real ones, then the links of the paper's chain, then how good it is.
-    """
+    """Suggested commands after sampling a run to `out`: training on real scans, the next link, or evaluation."""
     plugins = "".join(f" --plugin {shlex.quote(str(name))}" for name in config.get("plugins") or ())
     experiment = {"rectify": "reflow", "reflow": "distill"}.get(config["stage"]["name"])
     if config["data"]["name"] == "simulated":

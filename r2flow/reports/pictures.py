@@ -71,8 +71,8 @@ def completed_figure(
     """Draw the known rays of a scan, its answers and their spread.
 
     Args:
-        rows: Name and image, (2 or 1, H, W), of each; the first one is what is known.
-        unknown: Rays of it that were not measured, (H, W) bool; drawn in grey.
+        rows: Name and image, (2 or 1, H, W), of each; the known rays first.
+        unknown: Rays that were not measured, (H, W) bool; drawn in grey.
         spread: Standard deviation of the range in metres and share of answers with a return, (2, H, W).
     """
     figure, grid = _sheet([2.4] * len(rows) + [1.3] * (spread is not None), space=0.16, top=0.5)
@@ -94,7 +94,7 @@ def completed_figure(
 
 
 def _sheet(heights: Sequence[float], space: float, top: float) -> tuple[Figure, Any]:
-    """A dark figure with a row of inches for each scan and its columns: images, bird's-eye view, perspective."""
+    """Dark figure with a row per scan, heights in inches, and columns of images, bird's-eye view and perspective."""
     figure = dark_figure(15, sum(heights))
     grid = figure.add_gridspec(
         len(heights), 3, width_ratios=[2.6, 0.9, 1.3], height_ratios=heights, hspace=space, wspace=0.03,
@@ -116,12 +116,12 @@ def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tens
 
 
 def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
-    """Range on a logarithmic colour scale, dropped rays black."""
+    """Draw range on a logarithmic colour scale, dropped rays black."""
     _draw_channel(axes, image, "range", np.log(np.maximum(image[0], 1e-3)), np.log(RANGES), label)
 
 
 def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
-    """Reflectance of [0, 1] from blue to yellow, its square root shown, dropped rays black."""
+    """Draw the square root of reflectance in [0, 1] from blue to yellow, dropped rays black."""
     _draw_channel(axes, image, "reflectance", np.sqrt(np.clip(image[1], 0, 1)), (0, 0.9), label)
 
 
@@ -132,12 +132,12 @@ def _draw_channel(axes: Any, image: np.ndarray, what: str, shown: np.ndarray, li
 
 
 def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
-    """Semantic ids, (H, W), named where SemanticKITTI knows all of them, else by number; dropped rays black."""
+    """Draw semantic ids, (H, W), named as in `class_colours`; dropped rays black."""
     returned = image[0] > 0
     shown = np.zeros((*labels.shape, 3))
     entries: dict[str, Any] = {}
-    for one, (name, colour) in class_colours(labels[returned]).items():
-        shown[returned & (labels == one)] = to_rgb(colour)
+    for label, (name, colour) in class_colours(labels[returned]).items():
+        shown[returned & (labels == label)] = to_rgb(colour)
         entries.setdefault(name, colour)
     axes.imshow(shown, aspect="auto", interpolation="nearest")
     _strip(axes, "labels")
@@ -148,14 +148,14 @@ def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
 
 
 def class_colours(labels: np.ndarray, most: int | None = None) -> dict[int, tuple[str, str]]:
-    """Name and colour of each semantic id in (N,) labels, at most so many, the commonest first.
+    """Name and colour of the `most` most frequent semantic ids in labels, (N,), in order of frequency.
 
-    Where SemanticKITTI does not know all of them, they are named by number.
+    Names are SemanticKITTI's if it defines all ids, else numbers.
     """
-    found, counts = np.unique(labels, return_counts=True)
-    named = all(int(one) in CLASSES for one in found)
-    ordered = [int(one) for one in found[np.argsort(-counts)][:most]]
-    return {one: CLASSES[one] if named else (f"class {one}", _numbered_colour(one)) for one in ordered}
+    ids, counts = np.unique(labels, return_counts=True)
+    named = all(int(label) in CLASSES for label in ids)
+    ordered = [int(label) for label in ids[np.argsort(-counts)][:most]]
+    return {label: CLASSES[label] if named else (f"class {label}", _numbered_colour(label)) for label in ordered}
 
 
 def _numbered_colour(number: int) -> str:
@@ -165,7 +165,7 @@ def _numbered_colour(number: int) -> str:
 
 
 def draw_birds_eye(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
-    """Points from above, driving direction upwards, coloured by height."""
+    """Draw points from above, driving direction upwards, coloured by height."""
     x, y, z = xyz[(np.abs(xyz[:, :2]) < VIEW).all(axis=1)].T
     dot = float(np.clip(20_000 / max(len(x), 1), 0.25, 3.0))
     axes.scatter(-y, x, c=z, s=dot, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
@@ -175,7 +175,7 @@ def draw_birds_eye(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
 
 
 def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
-    """Points from behind and above the sensor, looking ahead, coloured by height."""
+    """Draw points from behind and above the sensor, coloured by height."""
     # A pinhole camera 16 m behind and 9 m above the sensor, pitched down: x' right, y' up, depth ahead.
     eye, pitch = np.array([-16.0, 0.0, 9.0]), np.deg2rad(18)
     ahead = np.array([np.cos(pitch), 0, -np.sin(pitch)])
@@ -226,7 +226,7 @@ def dark_figure(width: float, height: float) -> Figure:
 
 @cache
 def colours(what: str) -> Any:
-    """Of range, height or reflectance from their low to their high end; black where there is none."""
+    """Colour map of range, height or reflectance from low to high values; black for missing ones."""
     scale = colormaps[{"range": "turbo_r", "height": "turbo", "reflectance": "cividis"}[what]]
     if what == "range":  # warm (near) to cold (far), without the dark ends, which would look like dropped rays
         scale = ListedColormap(scale(np.linspace(0.1, 0.93, 256)))

@@ -50,7 +50,7 @@ def configurations(
     for method in methods:
         how = method_of(method)
         if how.adapts:
-            chosen += [Configuration(method, f"{method}, {one:.0e}", {"tolerance": one}) for one in tolerances]
+            chosen += [Configuration(method, f"{method}, {tol:.0e}", {"tolerance": tol}) for tol in tolerances]
             continue
         start, per_step = getattr(how, "start", 0), getattr(how, "evaluations", 1)
         for count in sorted({(budget - start) // per_step for budget in budgets if budget >= start + per_step}):
@@ -65,9 +65,9 @@ class Subject:
 
     Attributes:
         x_0: Starts of the scans, (N, ...), on the velocity's device.
-        x_1: Their ends, (N, ...), float64.
-        floor: The least root mean square error that can be measured against `x_1`.
-        encoding: None for a problem without metres.
+        x_1: Ends of the scans, (N, ...), float64.
+        floor: Smallest RMS error that can be measured against `x_1`.
+        encoding: Encoding of a trained flow; None for exact problems.
     """
 
     name: str
@@ -98,7 +98,7 @@ def checkpoint_subject(
 ) -> Subject:
     """A trained flow and its reference solution: rk4 in many steps with a float64 state.
 
-    `floor` is three times the largest distance from dopri5 at a tight tolerance, inf where either did not converge.
+    `floor` is three times the largest distance to dopri5 at a tight tolerance, inf if either did not converge.
     """
     flow = as_flow(checkpoint.generator, "this report")
     x_0 = Draws(seed, range(num)).start(flow.noise_shape).to(flow.device)
@@ -118,8 +118,8 @@ def measure(
 ) -> list[dict[str, Any]]:
     """Measure error, evaluations and seconds of each configuration on each subject, one row each.
 
-    The configurations take turns, so that whatever else the machine does slows all of them alike; the error is that of
-    the first turn.
+    Repetitions are interleaved, so that other load on the machine affects all configurations alike; errors are those of
+    the first repetition.
     """
     rows = []
     for subject in subjects:
@@ -127,27 +127,29 @@ def measure(
         solutions: list[list[Solution]] = [[] for _ in chosen]
         with torch.inference_mode():
             subject.velocity(torch.zeros((), device=subject.x_0.device), subject.x_0[:1])  # warm up
-            for repeat, (i, one) in product(range(REPEATS), enumerate(chosen)):
+            for repeat, (i, configuration) in product(range(REPEATS), enumerate(chosen)):
                 if repeat > 0 and sum(seconds[i]) >= PATIENCE:
                     continue
-                how = {"method": one.method, "max_evaluations": MOST_EVALUATIONS, **one.fields}
+                how = {"method": configuration.method, "max_evaluations": MOST_EVALUATIONS, **configuration.fields}
                 for x_0 in subject.x_0.split(subject.batch_size):
                     solution, taken = timed(partial(solve, subject.velocity, x_0, **how), x_0.device)
                     seconds[i].append(taken / len(x_0))
                     solutions[i] += [] if repeat else [solution]
                 if progress is not None and repeat == 0:
                     progress()
-        rows += [_row(subject, *one) for one in zip(chosen, seconds, solutions, strict=True)]
+        rows += [_row(subject, *results) for results in zip(chosen, seconds, solutions, strict=True)]
     return rows
 
 
-def _row(subject: Subject, one: Configuration, seconds: list[float], solutions: Sequence[Solution]) -> dict[str, Any]:
+def _row(
+    subject: Subject, chosen: Configuration, seconds: list[float], solutions: Sequence[Solution]
+) -> dict[str, Any]:
     x_1 = torch.cat([solution.x for solution in solutions])
     errors = rms(x_1 - subject.x_1)
-    sampler = one.method.replace(TORCHDIFFEQ, f"{TORCHDIFFEQ}method=")
-    fields = [f"--{key} {value:g}" if key == "tolerance" else f"--{key} {value}" for key, value in one.fields.items()]
+    sampler = chosen.method.replace(TORCHDIFFEQ, f"{TORCHDIFFEQ}method=")
+    fields = [f"--{key} {v:g}" if key == "tolerance" else f"--{key} {v}" for key, v in chosen.fields.items()]
     row = {
-        "problem": subject.name, "method": one.method, "label": one.label,
+        "problem": subject.name, "method": chosen.method, "label": chosen.label,
         "options": " ".join([f"--sampler {sampler}", *fields]), "scans": len(errors),
         "evaluations": float(torch.cat([solution.evaluations for solution in solutions]).double().mean()),
         "seconds": float(np.median(seconds)), "error": float(errors.median()), "error_worst": float(errors.max()),
@@ -162,10 +164,7 @@ def _row(subject: Subject, one: Configuration, seconds: list[float], solutions: 
 
 
 def reached(row: Row) -> float:
-    """The error of a row: not below what can be measured.
-
-    Infinite where a scan was not solved, and where x_0 itself is no farther from the end.
-    """
+    """Error of a row, at least `floor`; infinite if a scan was not solved or x_0 has a smaller error."""
     if row["converged"] < row["scans"] or not row["error"] < row["length"]:
         return math.inf
     return float(max(row["error"], row["floor"]))
@@ -179,8 +178,8 @@ def best_within(rows: Sequence[Row], budget: float) -> Row | None:
 
 def cheapest(rows: Sequence[Row], metres: float) -> Row | None:
     """Row of fewest evaluations with a range error within a limit in metres (RMS, median over scans)."""
-    near = [row for row in rows if math.isfinite(reached(row)) and row["range_rms_m"] <= metres]
-    return min(near, key=lambda row: (row["evaluations"], reached(row)), default=None)
+    within = [row for row in rows if math.isfinite(reached(row)) and row["range_rms_m"] <= metres]
+    return min(within, key=lambda row: (row["evaluations"], reached(row)), default=None)
 
 
 COLUMNS = {
@@ -198,7 +197,7 @@ def solvers_page(
     command: str,
     device: str = "cpu",
 ) -> Page:
-    """The report on the rows of `measure`; `subject` is the trained flow among the subjects."""
+    """Build the report on the rows of `measure`; `subject` is the trained flow, if any."""
     text: list[str] = []
     figures: dict[str, Figure] = {}
     groups = _by(rows, "problem")
@@ -211,10 +210,10 @@ def solvers_page(
         text += [
             "## Exact problems",
             f"{rows[0]['scans']} scans each, in float64: the most accurate solver within a number of evaluations and "
-            "its median RMS error; none where x_0 is as near.",
+            "its median RMS error; none if x_0 has a smaller error.",
             problems_table(groups, budgets),
         ]
-        panels = [(name, own, "evaluations", "error") for name, own in groups.items()]
+        panels = [(name, group, "evaluations", "error") for name, group in groups.items()]
         figures["solvers_problems"] = _figure(panels, 4)
     text += ["## All configurations", table(rows, COLUMNS)]
     return Page("solvers", "Solvers: error against run time", text, rows, figures, command, seeds, device)
@@ -230,11 +229,11 @@ def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> 
         by_error.append({**row, "how": how, "wanted": f"{metres:g} m"})
     errors = {"error": "RMS error", "range_rms_m": "range, RMS m"}
     return [
-        f"**{subject.name}**, {len(subject.x_0)} scans, against its own tight solution. Errors above "
+        f"**{subject.name}**, {len(subject.x_0)} scans, against its reference solution. Errors above "
         f"{shown(subject.floor)} can be measured.",
-        "The sampler of fewest evaluations that reaches an RMS error of the range:",
+        "Sampler with the fewest evaluations for an RMS error of the range:",
         table(by_error, {"wanted": "error", "how": "sampler", "evaluations": "evaluations", "seconds": "s a scan"}),
-        "The most accurate solver within a number of evaluations:",
+        "Most accurate solver within a number of evaluations:",
         table(by_budget, {"budget": "evaluations", "label": "solver", **errors}),
     ]
 
@@ -242,9 +241,9 @@ def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> 
 def problems_table(groups: Mapping[str, Sequence[Row]], budgets: Sequence[int]) -> str:
     """Table of the most accurate solver per exact problem and budget."""
     lines = []
-    for name, own in groups.items():
-        best = [best_within(own, budget) for budget in sorted(budgets)]
-        lines.append([name, *("none" if one is None else f"{one['method']} {shown(reached(one))}" for one in best)])
+    for name, rows in groups.items():
+        best = [best_within(rows, budget) for budget in sorted(budgets)]
+        lines.append([name, *("none" if row is None else f"{row['method']} {shown(reached(row))}" for row in best)])
     return table(lines, ["problem", *(f"within {budget}" for budget in sorted(budgets))])
 
 
@@ -255,16 +254,16 @@ LABELS = {
 
 
 def _figure(panels: Sequence[tuple[str, Sequence[Row], str, str]], columns: int) -> Figure:
-    """A panel for each (title, rows, x, y), a line for each method through the rows that solve the problem."""
+    """Plot a panel per (title, rows, x, y), with a line per method through the rows that solve the problem."""
     columns = min(columns, len(panels))
     lines = math.ceil(len(panels) / columns)
     figure = blank_figure(3.6 * columns + 0.4, 3.0 * lines + 0.9)
     methods: dict[str, dict[str, Any]] = {}
     for place, (title, rows, x, y) in enumerate(panels, 1):
         axes = figure.add_subplot(lines, columns, place)
-        for method, own in _by(rows, "method").items():
+        for method, group in _by(rows, "method").items():
             methods[method] = STYLES[METHODS.index(method) % len(STYLES)] if method in METHODS else STYLES[-1]
-            solved = [row for row in own if math.isfinite(reached(row)) and math.isfinite(row[y])]
+            solved = [row for row in group if math.isfinite(reached(row)) and math.isfinite(row[y])]
             points = sorted((row[x], max(row[y], ROUNDING / 10)) for row in solved)
             if points:
                 axes.plot(*np.array(points).T, **methods[method], ms=4.5, lw=1.1)

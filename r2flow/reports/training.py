@@ -27,7 +27,7 @@ CURVES = {
 def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/loss")) -> dict[str, Curve]:
     """Logged values against optimiser steps, (steps, values) by name.
 
-    Every resumption logs into a folder of its own; of two values of one step, the later counts.
+    Each resumption logs into a new folder; of several values of a step, the last counts.
     """
     values: dict[str, dict[int, float]] = {name: {} for name in names}
     folders = Path(run, "metrics").glob("version_*/metrics.csv")
@@ -43,7 +43,7 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
                     except (TypeError, ValueError):  # a damaged line
                         damaged += 1
         if damaged:
-            log.warning("%s: left out %d values that are no numbers", path, damaged)
+            log.warning("%s: ignored %d values that are not numbers", path, damaged)
     return {
         name: (np.array(sorted(points)), np.array([points[step] for step in sorted(points)]))
         for name, points in values.items()
@@ -114,7 +114,7 @@ def finish(
     print(
         f"""
 checkpoint    {path}
-pictures      {out / "samples.png"} and one page a scan beside it; during training: {run / "pictures"}
+pictures      {out / "samples.png"} and one page per scan next to it; during training: {run / "pictures"}
 in 3-D        {out / "samples.html"}, in a browser
 point clouds  {out / "000000.ply"} ...
 loss curve    {f"{run / 'loss.png'}; " if curves else ""}tensorboard --logdir {run / "tensorboard"}

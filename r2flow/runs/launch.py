@@ -212,7 +212,7 @@ def _job(
         settings = plain(config)
         check_keys(settings)
         code = _chain(settings, given, command) if settings["chain"] else _fit(settings, given)
-    except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would add lines of its own
+    except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print more lines
         message = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -289,7 +289,7 @@ def _preview(model: str, out: Path) -> None:
 
     if not (out / "samples.png").is_file():
         write_samples(load_checkpoint(find_model(model)), out, num=4, seed=0)
-    print(f"preview: scans of the model {model} in {out / 'samples.png'}, point clouds beside it", flush=True)
+    print(f"preview: scans of the model {model} in {out / 'samples.png'}, point clouds next to it", flush=True)
 
 
 def _check_links(links: Sequence[Any]) -> None:

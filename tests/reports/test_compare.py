@@ -195,7 +195,7 @@ def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path, 
     steps, values = read_curves(run)["train/loss"]
     assert list(values[:3]) == [2.0, 1.0, 0.5]
     assert list(steps[:3]) == [1, 2, 3]
-    assert f"{log}: left out 1 values" in caplog.text
+    assert f"{log}: ignored 1 values" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):  # no
     assert code == 0
     figures = {"solvers.png", "solvers_problems.png"}
     assert {path.name for path in out.iterdir()} == figures | {f"solvers.{end}" for end in ("csv", "json", "md")}
-    assert f"**{saved[0]}**, 2 scans, against its own tight solution" in said
+    assert f"**{saved[0]}**, 2 scans, against its reference solution" in said
     with (out / "solvers.csv").open() as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     assert len(rows) == 3 * 8  # two problems and the checkpoint; two steps of two methods and four tolerances

@@ -82,7 +82,7 @@ class VanillaGan(Gan):
 
     Args:
         space: The images it makes.
-        backbone: Not used; the network is of its own kind.
+        backbone: Not used.
         latent: Width of z.
         base_channels: Width of the outermost map; it doubles inwards.
         max_channels: Widest.

@@ -120,7 +120,7 @@ class LearnLatentDiffusion(SingleLoss):
     """Mean squared error of the noise in a trained autoencoder's latents, at steps drawn uniformly.
 
     Args:
-        generator: A `LatentDiffusion`, whose autoencoder stays as it is.
+        generator: A `LatentDiffusion`, whose autoencoder is frozen.
         options: Those of `Stage`. The learning rate does not fall.
     """
 

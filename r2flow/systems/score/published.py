@@ -1,6 +1,6 @@
 """LiDARGen's published checkpoints: a list of weights, optimizer, epoch, step and averaged weights.
 
-The file says neither the size of its images nor their ranges: they are the published ones, 64 x 1024 and 0.5 to 63 m.
+The file stores neither image size nor ranges; they are the published ones, 64 x 1024 and 0.5 to 63 m.
 """
 
 from collections.abc import Mapping
