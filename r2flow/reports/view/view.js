@@ -1,5 +1,5 @@
-// The scans of one page as point clouds under one camera, each with its range image below it. Every scan is a texture
-// of whole numbers, every sensor a texture of directions: the vertex shader multiplies the two.
+// Draws scans as point clouds under a shared camera, each above its range image. A scan is a texture of integers, a
+// sensor a texture of directions; the vertex shader multiplies them.
 
 const page = JSON.parse(document.getElementById("data").textContent);
 const element = (id) => document.getElementById(id);
@@ -7,9 +7,9 @@ const tiles = element("tiles");
 const MODES = ["range", "height", "reflectance", "label"].filter(
   (mode) => !(mode in page.shown) || page.shown[mode],
 );
-const MOST_TILES = 16; // at once
-const SLOW = 90; // milliseconds a frame: a moving picture that takes longer is drawn with fewer points
-const COARSE = 5; // it takes every so many-th; no divisor of usual numbers of columns, which would leave stripes
+const MOST_TILES = 16; // on screen
+const SLOW = 90; // milliseconds per frame above which a moving camera draws fewer points
+const COARSE = 5; // draw every n-th point; not a divisor of usual numbers of columns, to avoid stripes
 
 const state = { mode: MODES[0], size: 0, frame: 0, first: 0, alone: null, picked: null, playing: false };
 const camera = { target: [0, 0, 0], yaw: Math.PI, pitch: 0.42, distance: 30 };
@@ -24,7 +24,7 @@ async function inflate(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Directions of the rays of a sensor, (H W, 4), from an elevation of each row and an azimuth of each column or pixel. */
+/** Directions of a sensor's rays, (H W, 4), from elevations of rows and azimuths of columns, or from both per pixel. */
 function directionsOf(rays) {
   const { rows, columns } = rays;
   const found = new Float32Array(4 * rows * columns);
@@ -39,7 +39,7 @@ function directionsOf(rays) {
   return found;
 }
 
-/** Range code, reflectance, class and nothing of each pixel, (H W, 4); the layout of `packed` in Python. */
+/** Range code, reflectance, class and padding of each pixel, (H W, 4); layout as in Python's `packed_image`. */
 function texelsOf(bytes, scan, rays) {
   const { rows, columns } = rays;
   const pixels = rows * columns;
@@ -59,7 +59,7 @@ function texelsOf(bytes, scan, rays) {
 
 const loading = new Map();
 
-/** The texels of a scan's frame, unpacked and uploaded once. */
+/** Texels of a scan's frame, unpacked and uploaded once. */
 function load(scan, frame) {
   const packed = scan.frames[frame];
   if (!loading.has(packed)) {
@@ -84,9 +84,9 @@ const COMMON = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
 uniform usampler2D scan;      // range code, reflectance, class
 uniform sampler2D directions;
-uniform sampler2D colours;    // a row for each mode
-uniform float metres;         // of one range code
-uniform vec2 ranges, heights; // what the colours span
+uniform sampler2D colours;    // one row per mode
+uniform float metres;         // per range code
+uniform vec2 ranges, heights; // limits of the colour scales
 uniform int mode;
 vec3 colour_of(uvec4 texel, float height) {
   float r = float(texel.r) * metres;
@@ -100,7 +100,7 @@ vec3 colour_of(uvec4 texel, float height) {
 
 const POINTS = [COMMON + `
 uniform mat4 camera;
-uniform float scale;          // pixels that a metre at a metre's distance covers
+uniform float scale;          // pixels per metre at a distance of one metre
 uniform float spacing;        // radians between neighbouring rays
 uniform float factor, least;
 uniform int stride;
@@ -125,7 +125,7 @@ void main() {
   shown = vec4(colour, 1.0);
 }`];
 
-// Eye-dome lighting (Boucheny 2009): a pixel is darker the farther it lies behind its neighbours.
+// Eye-dome lighting (Boucheny 2009): pixels are darkened by their distance behind their neighbours.
 const WHOLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 const LIGHT = [WHOLE, `#version 300 es
@@ -159,7 +159,7 @@ void main() {
   vec2 at = (gl_FragCoord.xy - corner) / size;
   int row = clamp(int((1.0 - at.y) * float(full.y)), 0, full.y - 1);
   int first = int(at.x * float(full.x));
-  int last = max(first + 1, int((at.x + 1.0 / size.x) * float(full.x))); // all that fall onto this pixel
+  int last = max(first + 1, int((at.x + 1.0 / size.x) * float(full.x))); // all columns on this pixel
   vec3 sum = vec3(0.0);
   for (int column = first; column < last && column < full.x; column++) {
     uvec4 texel = texelFetch(scan, ivec2(column, row), 0);
@@ -203,7 +203,7 @@ function texture(format, width, height, channels, type, values) {
   return made;
 }
 
-/** What the points are drawn into: colours and depths, as large as the canvas. */
+/** Framebuffer of the points: colours and depths, in the size of the canvas. */
 function buffer(width, height) {
   const drawn = texture(gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE, null);
   const depths = texture(gl.DEPTH_COMPONENT24, width, height, gl.DEPTH_COMPONENT, gl.UNSIGNED_INT, null);
@@ -215,9 +215,9 @@ function buffer(width, height) {
 }
 
 
-// Camera: it looks at a target from a yaw and a pitch; z is up, and all scans have it.
+// Camera, shared by all scans: orbits a target by yaw and pitch; z is up.
 
-const OPENING = Math.tan((25 * Math.PI) / 180); // of half the view, upwards, where it is not narrow
+const OPENING = Math.tan((25 * Math.PI) / 180); // half the vertical field of view, except in narrow views
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -230,7 +230,7 @@ function axes() {
   return { back, right, up: cross(back, right), eye: target.map((value, i) => value + distance * back[i]) };
 }
 
-/** The camera in a rectangle of the screen: a matrix by columns, metres to clip space, and what depends on it. */
+/** Camera of a rectangle of the screen: column-major matrix from metres to clip space, and derived values. */
 function lens(width, height) {
   const { back, right, up, eye } = axes();
   const half = OPENING * Math.max(1, (1.2 * height) / width);
@@ -244,7 +244,7 @@ function lens(width, height) {
   return { matrix, half, limits: [near, far] };
 }
 
-/** Where a point is in a rectangle of the screen, in its pixels from the upper left, and its depth in metres. */
+/** Position of a point in a rectangle of the screen, in pixels from the upper left, and its depth in metres. */
 function project(point, width, height, { matrix } = lens(width, height)) {
   const [x, y, , w] = [0, 1, 2, 3].map((i) => dot([matrix[i], matrix[4 + i], matrix[8 + i]], point) + matrix[12 + i]);
   return { x: ((1 + x / w) * width) / 2, y: ((1 - y / w) * height) / 2, depth: w };
@@ -256,7 +256,7 @@ function orbit(yaw, pitch) {
   moved();
 }
 
-/** Move by pixels of a rectangle that is so high. */
+/** Move by pixels of a rectangle of this height. */
 function pan(x, y, height) {
   const { right, up } = axes();
   const metres = (2 * OPENING * camera.distance) / height;
@@ -271,7 +271,7 @@ function zoom(factor) {
 
 function reset() {
   const { clientWidth: width, clientHeight: height } = shownScans()[0].points;
-  const pitch = width < height ? 0.75 : 0.42; // a tall view is filled from higher up
+  const pitch = width < height ? 0.75 : 0.42; // a steeper view fills tall rectangles
   Object.assign(camera, { target: [0.28 * home, 0, -0.04 * home], yaw: Math.PI, pitch, distance: home });
   moved();
 }
@@ -281,9 +281,9 @@ function top() {
   moved();
 }
 
-let home = 30; // metres from which a usual scan is seen well
+let home = 30; // default distance of the camera in metres
 
-/** Far scans are looked at from farther away: by the median range of the first one. */
+/** Set the default distance by the median range of the first scan. */
 function findHome() {
   const { texels } = current(page.scans[0]);
   const codes = texels.filter((_, i) => i % 4 === 0 && texels[i] > 0).sort();
@@ -296,7 +296,7 @@ function findHome() {
 let points, light, image, colours, into;
 let asked = false;
 let moving = false;
-let late = 0; // frames in a row that took long while the picture moved
+let late = 0; // consecutive slow frames while the camera moved
 let last = 0;
 let resting;
 
@@ -305,14 +305,14 @@ function redraw() {
   asked = true;
 }
 
-/** After a movement of the camera. */
+/** Redraw after a movement of the camera. */
 function moved() {
   moving = true;
   clearTimeout(resting);
   redraw();
 }
 
-/** The camera rests: the picture is drawn once more, whole. */
+/** Redraw with all points when the camera rests. */
 function rest() {
   moving = false;
   redraw();
@@ -391,7 +391,7 @@ function draw(now) {
   place();
 }
 
-/** Draw into a rectangle alone, and clear it. */
+/** Restrict drawing to a rectangle, and clear it. */
 function begin(box) {
   if (box[2] < 1 || box[3] < 1) return false;
   gl.viewport(...box);
@@ -418,7 +418,7 @@ function bind({ places }, scan) {
 }
 
 
-// Picking: the pixel that the cursor is on, in the image or among the points; every scan of these rays shows it.
+// Picking of the pixel under the cursor, in the image or among the points; shown in all scans of the same rays.
 
 function pointOf(scan, pixel) {
   const { texels } = current(scan);
@@ -428,7 +428,7 @@ function pointOf(scan, pixel) {
   return [0, 1, 2].map((i) => r * directions[4 * pixel + i]);
 }
 
-/** The pixel whose point lies under a place of the screen: of those within some pixels the foremost. */
+/** The pixel whose point is foremost within some pixels of a position on the screen. */
 function pickPoint(scan, x, y) {
   const { texels } = current(scan);
   if (!texels) return null;
@@ -446,7 +446,7 @@ function pickPoint(scan, x, y) {
     const dy = ((1 - (m[1] * px + m[5] * py + m[9] * pz + m[13]) / w) * height) / 2 - y;
     const off = dx * dx + dy * dy;
     if (off > 64) continue;
-    const found = w * (1 + off / 20); // nearer to the camera, nearer to the cursor
+    const found = w * (1 + off / 20); // prefers points close to camera and cursor
     if (found < score) [best, score] = [i / 4, found];
   }
   return best;
@@ -464,7 +464,7 @@ function pick(scan, pixel) {
   place();
 }
 
-/** Put the marks where the picked pixel is in every scan, and say what it is. */
+/** Mark the picked pixel in every scan, and show its values. */
 function place() {
   const picked = state.picked;
   for (const scan of shownScans()) {
@@ -530,7 +530,7 @@ function showAlone(scan) {
   arrange();
 }
 
-/** Columns, rows and number of tiles at once that make the tiles large and about 1.7 times as wide as high. */
+/** Columns, rows and number of tiles for large tiles with an aspect ratio of about 1.7. */
 function gridOf(count, width, height) {
   const most = Math.min(count, MOST_TILES, Math.max(1, Math.floor(width / 150) * Math.floor(height / 118)));
   let best = { score: -1 };
@@ -573,7 +573,7 @@ function turn(by) {
   arrange();
 }
 
-/** Draw as soon as all that is to be seen is unpacked. */
+/** Draw as soon as all visible frames are unpacked. */
 async function show() {
   await Promise.all(shownScans().map((scan) => current(scan).ready));
   redraw();
@@ -632,7 +632,7 @@ function followImage(scan) {
   });
 }
 
-/** Turn about a pixel's point from now on. */
+/** Orbit a pixel's point. */
 function lookAt(scan, pixel) {
   const point = pixel === null ? null : pointOf(scan, pixel);
   if (!point) return;
@@ -769,7 +769,7 @@ function buildControls() {
   light.onchange = () => setTheme(light.matches ? "light" : "dark");
 }
 
-const table = new Uint8Array(4 * 256 * 4); // colours: a row of 256 for each mode
+const table = new Uint8Array(4 * 256 * 4); // one row of 256 colours per mode
 
 function prepare() {
   table.set(bytesOf(page.colours));
