@@ -292,7 +292,7 @@ def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F
     for wrong in (("--size", "16x64"), ("--sensor", "vlp16", "--size", "8x64")):
         code, _, said = r2flow("evaluate", real, run / "samples", *quick, *wrong)
         assert code == 2
-        assert "holds images of hdl64e 8x64 (its manifest.json says so)" in said
+        assert "holds images of hdl64e 8x64 (in its manifest.json)" in said
         assert len(said.splitlines()) == 1
     assert r2flow("show", run, "--out", tmp_path / "views")[0] == 0
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["000000.png", "000001.png"]

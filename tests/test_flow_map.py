@@ -337,7 +337,7 @@ def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
         stage({**DATA, "scans": scans})
     with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
         build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent())
-    with pytest.raises(InputError, match=r"data\.scans stand beside pairs, found data=simulated"):
+    with pytest.raises(InputError, match=r"data\.scans needs data=pairs, found data=simulated"):
         DataOptions(scans=scans)
     with pytest.raises(InputError, match=r"data\.scans needs the name of a data set"):
         resolve({"name": "pairs", "scans": {"scenes": 4}})

@@ -287,7 +287,7 @@ def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
         return
     theirs, ours = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (stored.sensor, sensor))
     raise InputError(
-        f"{folder} holds images of {theirs} (its {MANIFEST} says so), not of {ours}: give no other --sensor or --size, "
+        f"{folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: give no other --sensor or --size, "
         "no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, .bin)."
     )
 

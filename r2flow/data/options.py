@@ -129,7 +129,7 @@ class DataOptions(SourceOptions):
             raise InputError(f"data.parts are those of data=mixed, found data={self.name}; leave them out, or give it.")
         if self.scans is not None and self.name != PAIRS:
             raise InputError(
-                f"data.scans stand beside pairs, found data={self.name}; leave them out, or give data=pairs."
+                f"data.scans needs data=pairs, found data={self.name}; leave data.scans out, or give data=pairs."
             )
 
     @property

@@ -114,7 +114,7 @@ class TestSamples:
 
     def test_another_size_is_one_line(self, tmp_path: Path):
         self.samples(tmp_path)
-        said = r"holds images of hdl64e 8x32 \(its manifest.json says so\), not of hdl64e 16x64: give no other"
+        said = r"holds images of hdl64e 8x32 \(in its manifest.json\), not of hdl64e 16x64: give no other"
         for name in (tmp_path, tmp_path / "000000.npy"):
             with pytest.raises(InputError, match=said):
                 open_scans(name, Reading(SENSORS["hdl64e"].resized(16, 64)))

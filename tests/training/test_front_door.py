@@ -37,7 +37,7 @@ REFUSED = {
     "data.split=train": "simulated scans are not files (data=folder for yours): leave data.split out",
     "data.scans={name: simulated, split: train}": "data.scans",
     "trainer.precision=bf16-true": "rounds the times of a flow to three digits; use bf16-mixed",
-    "data.scans={name: simulated}": "data.scans stand beside pairs, found data=simulated",
+    "data.scans={name: simulated}": "data.scans needs data=pairs, found data=simulated",
     "data.drives=[1]": "leave data.drives out",
     "data.reading.projection=unfolding": "leave data.reading out",
     "trainer.val_check_interval=0": "val_check_interval must be a finite number above 0",
