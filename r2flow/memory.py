@@ -1,4 +1,4 @@
-"""Settings of the C libraries for a program of our own; `import r2flow` changes nothing."""
+"""Settings of the C libraries for the command line; `import r2flow` changes nothing."""
 
 import ctypes
 import os
@@ -9,11 +9,11 @@ LARGEST, KEPT = 1 << 30, 2**31 - 1  # bytes
 
 
 def prepare_process() -> None:
-    """Read arguments as UTF-8, keep freed memory, let waiting threads sleep earlier; call it before torch is imported.
+    """Read arguments as UTF-8, keep freed memory, let waiting threads sleep earlier; call before importing torch.
 
-    glibc gives each freed block of 32 MiB or more back, and the kernel clears new pages for the next one. With this,
-    blocks of up to 1 GiB come from the heap, of which up to 2 GiB stay. Settings of the user (MALLOC_MMAP_...,
-    MALLOC_TRIM_..., GOMP_SPINCOUNT) are kept.
+    By default glibc returns each freed block of 32 MiB or more, and the kernel clears new pages for the next one. Here
+    blocks of up to 1 GiB come from the heap, which keeps up to 2 GiB. Settings of the user (MALLOC_MMAP_...,
+    MALLOC_TRIM_..., GOMP_SPINCOUNT) take precedence.
     """
     if sys.getfilesystemencoding() != "utf-8":  # as under LC_ALL=C with PYTHONUTF8=0: arguments and names are garbled
         os.environ["PYTHONUTF8"] = "1"

@@ -121,10 +121,10 @@ class SphericalHarmonics(RayEncoding):
         """P_l^m(sin e) for 0 <= m <= l, by recursion in l."""
         z, table = e.sin(), {}
         for m in range(self.degrees):
-            below, here = torch.zeros_like(z), math.prod(range(1, 2 * m, 2)) * e.cos() ** m
+            previous, current = torch.zeros_like(z), math.prod(range(1, 2 * m, 2)) * e.cos() ** m
             for l in range(m, self.degrees):  # noqa: E741
-                table[l, m] = here
-                below, here = here, ((2 * l + 1) * z * here - (l + m) * below) / (l - m + 1)
+                table[l, m] = current
+                previous, current = current, ((2 * l + 1) * z * current - (l + m) * previous) / (l - m + 1)
         return table
 
 

@@ -51,23 +51,23 @@ Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ only 
 def find_runs(paths: Sequence[Path]) -> list[Path]:
     """Given run folders, and the runs in folders of runs (a chain, a sweep, a sweep of chains).
 
-    Paths that are neither are skipped with a warning where there are others, as in `runs/sweep/*`.
+    Other paths, as in `runs/sweep/*`, are skipped with a warning if there is any run.
     """
-    found: list[Path] = []
+    runs: list[Path] = []
     others: list[Path] = []
     for path in paths:
         if not path.exists():
             raise InputError(f"{path} does not exist.")
         inside = [run.parent for level in ("", "*/", "*/*/") for run in sorted(path.glob(f"{level}{CONFIG}"))]
         inside = [run for run in inside if not run.name.startswith(".")]
-        found += inside[:1] if path in inside else inside
+        runs += inside[:1] if path in inside else inside
         others += [] if inside else [path]
-    if others and not found:
+    if others and not runs:
         raise InputError(f"{others[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
     for path in others:
         if path.suffix not in (".yaml", ".log"):  # files of a sweep's folder
             log.warning("%s holds no run and is skipped.", path)
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(runs))
 
 
 def labels(folders: Sequence[Path]) -> list[str]:

@@ -82,10 +82,10 @@ def completion_rows(
             answers[name] = [fill(image, mask)[None] for image, mask in zip(given, masks, strict=True)]
         for way in ways:
             how: Any = {"sampler": way.sampler, "batch_size": batch_size, "progress": progress}
-            made = list(complete(way.checkpoint, images, state, num, seed, **how))
-            answers[way.name] = [one.images.numpy() for one in made]
-            evaluations = float(torch.cat([one.evaluations for one in made]).float().mean())
-            cost[way.name] = evaluations, sum(one.seconds for one in made) / num / len(made)
+            results = list(complete(way.checkpoint, images, state, num, seed, **how))
+            answers[way.name] = [result.images.numpy() for result in results]
+            evaluations = float(torch.cat([result.evaluations for result in results]).float().mean())
+            cost[way.name] = evaluations, sum(result.seconds for result in results) / num / len(results)
         firsts = [[of_method[i][0] for of_method in answers.values()] for i in range(len(truths))]
         cases = zip(truths, firsts, masks, strict=True)
         common = means([dict(zip(answers, common_mae(x, y, ~mask), strict=True)) for x, y, mask in cases])

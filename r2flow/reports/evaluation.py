@@ -51,9 +51,9 @@ def heading(metric: str, figure: str) -> tuple[str, float]:
 def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     """One row per value."""
     return [
-        {"comparison": one.name, "kind": one.kind, **row}
-        for one in comparisons
-        for result in one.measured
+        {"comparison": c.name, "kind": c.kind, **row}
+        for c in comparisons
+        for result in c.measured
         for row in _rows_of(result)
     ]
 
@@ -102,9 +102,9 @@ def evaluation_page(
     columns, lines = _table(comparisons)
     remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
     sets = [
-        (one.name, side, s.label, len(s), _words(s.about))
-        for one in comparisons
-        for side, s in (("real", one.real), ("generated", one.generated))
+        (c.name, side, s.label, len(s), _words(s.about))
+        for c in comparisons
+        for side, s in (("real", c.real), ("generated", c.generated))
     ]
     protocols = [result.protocol for result in comparisons[0].measured]
     used = [
@@ -124,7 +124,7 @@ def evaluation_page(
         table(used, ("metric", "compares", "mask, m", "network", "weights", "features", "settings", "real scans",
                      "generated scans")),
     ]  # fmt: skip
-    more = {"comparisons": [_plain_comparison(one) for one in comparisons]}
+    more = {"comparisons": [_plain_comparison(c) for c in comparisons]}
     figures = {"evaluation": _figure(comparisons)}
     sampled = points(more["comparisons"])
     if len(sampled) > len({row["flow"] for row in sampled}):
@@ -155,32 +155,32 @@ def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]
         if row["low"] is not None and text != "none":
             text += f" [{row['low'] * factor:#.3g}, {row['high'] * factor:#.3g}]"
         cells.setdefault(row["printed_as"], {})[row["kind"], row["comparison"]] = text
-    sizes = [f"({len(one.generated)} : {len(one.real)})" for one in comparisons]
+    sizes = [f"({len(c.generated)} : {len(c.real)})" for c in comparisons]
     if len(comparisons) >= len(cells):
         lines = [
-            [one.title, size, *(values.get((one.kind, one.name), "") for values in cells.values())]
-            for size, one in zip(sizes, comparisons, strict=True)
+            [c.title, size, *(values.get((c.kind, c.name), "") for values in cells.values())]
+            for size, c in zip(sizes, comparisons, strict=True)
         ]
         return ["set", "its scans : real", *cells], lines
-    columns = ["", *(f"{one.title} {size}" for one, size in zip(comparisons, sizes, strict=True))]
-    lines = [[title, *(v.get((one.kind, one.name), "") for one in comparisons)] for title, v in cells.items()]
+    columns = ["", *(f"{c.title} {size}" for c, size in zip(comparisons, sizes, strict=True))]
+    lines = [[title, *(v.get((c.kind, c.name), "") for c in comparisons)] for title, v in cells.items()]
     return columns, lines
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     """Distinct remarks, with their metrics and comparisons."""
     lines = []
-    drawn = [m.protocol["interval"] for one in comparisons for m in one.measured if m.intervals]
+    drawn = [m.protocol["interval"] for c in comparisons for m in c.measured if m.intervals]
     if drawn:
         draws = drawn[0]["bootstrap draws"]
         lines.append(f"In brackets: intervals of {drawn[0]['level']:.0%}, from {draws} bootstrap draws.")
-    if len({(len(one.real), len(one.generated)) for one in comparisons}) > 1:
+    if len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:
         lines.append("Distances of fewer scans are larger: compare only sets of equal sizes.")
     remarks: dict[str, dict[str, list[str]]] = {}  # remark -> comparison -> metrics
-    for one in comparisons:
-        for result in one.measured:
+    for comparison in comparisons:
+        for result in comparison.measured:
             for remark in result.remarks:
-                remarks.setdefault(remark, {}).setdefault(one.title, []).append(result.metric)
+                remarks.setdefault(remark, {}).setdefault(comparison.title, []).append(result.metric)
     for remark, where in remarks.items():
         metrics = list(dict.fromkeys(name for names in where.values() for name in names))
         about = [] if len(where) == len(comparisons) else [", ".join(where)]
@@ -194,23 +194,23 @@ def _words(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{key} {shown(value)}" for key, value in values.items())
 
 
-def _plain_comparison(one: Comparison) -> dict[str, Any]:
-    sets = {"real": one.real, "generated": one.generated}
+def _plain_comparison(comparison: Comparison) -> dict[str, Any]:
+    sets = {"real": comparison.real, "generated": comparison.generated}
     return {
-        "comparison": one.name,
-        "kind": one.kind,
+        "comparison": comparison.name,
+        "kind": comparison.kind,
         **{side: {"set": s.label, "scans": len(s), **s.about} for side, s in sets.items()},
-        "seconds": round(one.seconds, 2),
+        "seconds": round(comparison.seconds, 2),
         "metrics": [
             asdict(result) | {"printed": {row["printed_as"]: row["printed"] for row in _rows_of(result)}}
-            for result in one.measured
+            for result in comparison.measured
         ],
     }
 
 
 def _figure(comparisons: Sequence[Comparison]) -> Figure:
     """Plot each metric's first value, one mark per comparison."""
-    measured = [m for one in comparisons for m in one.measured if m.figures and m.metric != "speed"]
+    measured = [m for c in comparisons for m in c.measured if m.figures and m.metric != "speed"]
     first = {m.metric: next(iter(m.figures)) for m in measured}
     columns = max(min(len(first), 4), 1)
     lines = max(math.ceil(len(first) / columns), 1)
@@ -219,8 +219,8 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
     for place, (metric, name) in enumerate(first.items()):
         axes = figure.add_subplot(lines, columns, place + 1)
         label, factor = heading(metric, name)
-        for row, one in enumerate(comparisons):
-            result = next((m for m in one.measured if m.metric == metric), None)
+        for row, comparison in enumerate(comparisons):
+            result = next((m for m in comparison.measured if m.metric == metric), None)
             value = math.nan if result is None else result.figures.get(name, math.nan) * factor
             style = STYLES[row % len(STYLES)]
             if result is not None and name in result.intervals:
@@ -229,7 +229,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
             axes.plot([value], [row], marker=style["marker"], color=style["color"], ms=7, ls="")
             if math.isnan(value):
                 axes.text(0.02, row, "none", transform=axes.get_yaxis_transform(), fontsize=8, va="center")
-        axes.set_yticks(range(len(comparisons)), [one.title for one in comparisons] if place % columns == 0 else [])
+        axes.set_yticks(range(len(comparisons)), [c.title for c in comparisons] if place % columns == 0 else [])
         axes.set(xlabel=label, ylim=(len(comparisons) - 0.5, -0.5))
         axes.set_xlim(min(0.0, axes.get_xlim()[0]), axes.get_xlim()[1] * 1.05)
         axes.locator_params(axis="x", nbins=4)
@@ -241,11 +241,11 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
 def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """One row per sampled set of a JSON's `comparisons`: flow, weights, speed, METRIC/FIGURE and interval."""
     rows = []
-    for one in comparisons:
-        if one["kind"] != "judged" or one["generated"].get("kind") != "sampled":
+    for comparison in comparisons:
+        if comparison["kind"] != "judged" or comparison["generated"].get("kind") != "sampled":
             continue
-        row = {"flow": one["generated"]["set"], "weights": one["generated"]["weights"]}
-        for metric in one["metrics"]:
+        row = {"flow": comparison["generated"]["set"], "weights": comparison["generated"]["weights"]}
+        for metric in comparison["metrics"]:
             short = "" if metric["metric"] == "speed" else f"{metric['metric']}/"
             row |= {f"{short}{name}": math.nan if value is None else value for name, value in metric["figures"].items()}
             for name, ends in metric["intervals"].items():
@@ -283,14 +283,14 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
 
 def copies_figure(nearest: Mapping[str, Nearest], training: ScanSet, pairs: int = 4) -> Figure:
     """Draw the scans of each set nearest to training scans, next to the aligned training scan."""
-    chosen = [(name, one, int(i)) for name, one in nearest.items() for i in np.argsort(one.distances)[:pairs]]
+    chosen = [(name, copies, int(i)) for name, copies in nearest.items() for i in np.argsort(copies.distances)[:pairs]]
     figure = blank_figure(14, 0.9 * len(chosen) + 0.2)
     figure.set_facecolor(BACKGROUND)
     panels = figure.subplots(len(chosen), 2, squeeze=False)
-    for (left, right), (name, one, place) in zip(panels, chosen, strict=True):
-        number = int(one.numbers[place])
-        draw_range(left, one.scans.source[number], label=False)
-        draw_range(right, one.match(place, training), label=False)
-        title = f"{name} {number}: {shown(float(one.distances[place]))} away"
+    for (left, right), (name, copies, place) in zip(panels, chosen, strict=True):
+        number = int(copies.numbers[place])
+        draw_range(left, copies.scans.source[number], label=False)
+        draw_range(right, copies.match(place, training), label=False)
+        title = f"{name} {number}: {shown(float(copies.distances[place]))} away"
         left.set_title(title, color=FOREGROUND, fontsize=8, pad=2)
     return figure

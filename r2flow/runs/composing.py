@@ -210,7 +210,7 @@ def explain(error: Exception) -> str:
     if unknown:
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)
-        others = [known for known in known_keys() if not key.startswith(f"{known}.")]  # not its own group
+        others = [other for other in known_keys() if not key.startswith(f"{other}.")]  # without the key's group
         return f"the config has no key '{key}'.{did_you_mean(key, others)} See --cfg job for all of them."
     missing = re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL)
     if missing:

@@ -56,8 +56,8 @@ def walk(
         times: Time argument of `denoise` per step, (N,); None: the log-SNR.
     """
     times = log_snrs if times is None else times
-    for j, (t, (here, there)) in enumerate(zip(times, pairwise(log_snrs), strict=False), start=1):
-        z = step(z, denoise(z, t), here, there, eta, noise(j) if eta and noise else None)
+    for j, (t, (start, end)) in enumerate(zip(times, pairwise(log_snrs), strict=False), start=1):
+        z = step(z, denoise(z, t), start, end, eta, noise(j) if eta and noise else None)
         yield z
 
 
@@ -94,9 +94,9 @@ def repaint(
         last = first + jump == len(log_snrs) - 1
         for repeat in range(1 if last else repeats):
             if repeat:
-                for here, there in pairwise(levels.flip(0)):
-                    z = forward_step(z, here, there, noise(next(j)))
-            for here, there in pairwise(levels):
-                measured = noised(image, there, noise(next(j)))
-                z = torch.where(known > 0, measured, step(z, denoise(z, here), here, there, 1.0, noise(next(j))))
+                for start, end in pairwise(levels.flip(0)):
+                    z = forward_step(z, start, end, noise(next(j)))
+            for start, end in pairwise(levels):
+                measured = noised(image, end, noise(next(j)))
+                z = torch.where(known > 0, measured, step(z, denoise(z, start), start, end, 1.0, noise(next(j))))
             yield z

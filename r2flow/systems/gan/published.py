@@ -1,4 +1,4 @@
-"""The published files of DUSty v2's authors, of the vanilla GAN, DUSty v1 and v2: cfg, step, angle, G, G_ema, D, ..."""
+"""Published files of the vanilla GAN, DUSty v1 and v2 by the authors of DUSty v2: cfg, step, angle, G, G_ema, D, ..."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,7 +12,7 @@ from r2flow.model.published import Format, Published, sensor_of
 from r2flow.systems.gan.layers import DROPPED
 
 GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
-NETWORK = "network."  # of the network in our generator
+NETWORK = "network."  # prefix of the network's parameters
 
 
 def holds(content: Any) -> bool:
@@ -20,10 +20,10 @@ def holds(content: Any) -> bool:
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
-    """A published GAN: its generator, by the averaged weights or the raw ones."""
+    """Read the generator of a published GAN, with averaged or raw weights."""
     cfg, angle = content["cfg"], content["angle"]
     model, dataset = cfg["model"]["generator"], cfg["dataset"]
-    out = {str(one["name"]): one for one in model["synthesis_kwargs"]["out_ch"]}
+    out = {str(output["name"]): output for output in model["synthesis_kwargs"]["out_ch"]}
     generator = _generator(model, out)
     rows, columns = (int(n) for n in model["synthesis_kwargs"]["resolution"])
     if tuple(angle.shape) != (1, 2, rows, columns):
