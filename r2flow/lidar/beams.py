@@ -150,10 +150,8 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
 
 
 def _height(xyz: np.ndarray) -> float:
-    """Height above the ground: the lowest frequent height of returns 3 to 20 m away, or the default.
-
-    If the beams are close to the horizon, the most frequent height may be that of hedges and cars.
-    """
+    """Height above the ground: the lowest frequent height of returns 3 to 20 m away, or the default. The most frequent
+    one may be that of hedges and cars."""
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
     z = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2), 2]
     counts, edges = np.histogram(z, np.arange(-6, -0.1, 0.1))
@@ -234,11 +232,9 @@ def _beams(scans: Sequence[Points]) -> Beams:
 
 
 def _is_scattered(scan: Points) -> bool:
-    """Whether elevations are spread evenly within sectors of one degree of azimuth.
-
-    The median gap between sorted elevations is 0.06 of the mean gap or less in real scans of any order, ln 2
-    for points drawn at random, and 0.4 or more for scanners without beams.
-    """
+    """Whether elevations are spread evenly within sectors of one degree of azimuth."""
+    # The median gap between sorted elevations is 0.06 of the mean gap or less in real scans of any order, ln 2 for
+    # points drawn at random, and 0.4 or more for scanners without beams.
     elevation = elevations_of(scan.xyz)
     seen = np.isfinite(elevation)
     elevation, sector = elevation[seen], np.degrees(np.arctan2(scan.xyz[seen, 1], scan.xyz[seen, 0])).astype(np.int64)

@@ -51,10 +51,8 @@ def _rows_beyond(image: np.ndarray, done: np.ndarray) -> np.ndarray:
 
 
 def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate between the known positions of each line, (C, lines, positions); returns values and known mask.
-
-    With `extend`, values are also extended beyond the known positions.
-    """
+    """Interpolate between the known positions of each line, (C, lines, positions), with `extend` also beyond them;
+    returns values and known mask."""
     count = known.shape[1]
     at, lines = np.arange(count), np.arange(len(known))[:, None]
     left, right = _neighbours(known, at)

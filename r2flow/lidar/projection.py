@@ -142,11 +142,9 @@ def _nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray,
 
 
 def _nearest_by_sorting(pixel: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `_nearest`, but like the reference: points are written from far to near, so that the nearest is written last.
-
-    KITTI stores coordinates in millimetres, and under 1 % of the pixels hold two points of equal range. Which one the
-    reference keeps depends on NumPy's unstable sort, so the same sort is used.
-    """
+    """As `_nearest`, but like the reference: points are written from far to near, the nearest last."""
+    # Under 1 % of KITTI's pixels have two points of equal range, in millimetres. The reference's choice depends on
+    # NumPy's unstable sort, so the same sort is used.
     order = np.argsort(-r)
     owner = np.full(int(pixel.max(initial=0)) + 1, -1, dtype=np.int64)
     owner[pixel[order]] = order

@@ -134,11 +134,7 @@ def _forgotten_plugins(arguments: Sequence[str]) -> str:
 
 
 def _checked_arguments(arguments: list[str]) -> list[str]:
-    """Order the command line: Hydra's flags, then its overrides.
-
-    Raises:
-        InputError: an unknown flag, or one folder for all runs of a sweep.
-    """
+    """Order the command line: Hydra's flags, then its overrides. Refuses a single folder for all runs of a sweep."""
     parser = get_args_parser()
 
     def refuse(message: str) -> NoReturn:
@@ -192,12 +188,8 @@ def job_folder(arguments: Sequence[str], overrides: str) -> str:
 def _job(
     arguments: Sequence[str], command: Sequence[str], ended: list[tuple[int, str]], launcher: int, config: DictConfig
 ) -> None:
-    """The task that Hydra runs. Hydra catches only `Exception`: SystemExit carries the exit code.
-
-    Args:
-        ended: Collects the unfinished jobs of a sweep.
-        launcher: Process that reads `ended`.
-    """
+    """The task that Hydra runs; SystemExit carries the exit code, since Hydra catches only `Exception`. `ended`
+    collects the unfinished jobs of a sweep for the process `launcher`."""
     try:
         given = list(HydraConfig.get().overrides.task)
         # Check the command line, not the overrides: a config file can make a sweeper add overrides.
@@ -293,11 +285,7 @@ def _preview(model: str, out: Path) -> None:
 
 
 def _check_links(links: Sequence[Any]) -> None:
-    """Compose and build every link before the first one runs, so that errors are reported early.
-
-    Raises:
-        InputError: a link that cannot be composed or built.
-    """
+    """Compose and build every link before the first one runs, so that errors are reported early."""
     folders = _config_folders()
     configs = {}
     for link in links:

@@ -87,7 +87,7 @@ class _Scene:
     @torch.no_grad()
     def solve(self) -> bool:
         """Solve to t_end; whether it was reached."""
-        with self._of_steps:  # full precision for the solver, whatever the network's precision is
+        with self._of_steps:  # full precision for the solver, independent of the network's
             return self._solve()
 
     def _solve(self) -> bool:

@@ -187,10 +187,8 @@ class StepController:
         return factors.astype(np.float32).astype(np.float64)
 
     def _look_for_stiffness(self, good: np.ndarray, dk: np.ndarray, dy: np.ndarray) -> None:
-        """Hairer, Wanner, Solving Ordinary Differential Equations II, IV.2: h |dk| / |dy| estimates |h lambda|.
-
-        If it stays at the boundary of the stability region, stability limits the steps, not accuracy.
-        """
+        """Detect steps limited by stability: h |dk| / |dy|, an estimate of |h lambda|, stays at the boundary of the
+        stability region (Hairer, Wanner, Solving Ordinary Differential Equations II, IV.2)."""
         with np.errstate(invalid="ignore", over="ignore"):
             touching = good & (self.h * dk > self.method.stability * dy)
             oscillating = good & (self.h * dk > OSCILLATING * dy)

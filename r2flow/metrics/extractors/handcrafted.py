@@ -235,14 +235,8 @@ class HandcraftedRange(Handcrafted):
 
 
 def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> tuple[Tensor, Tensor]:
-    """Means over equal parts of rows or columns, (B, cells), and the share of counted rays.
-
-    Args:
-        total: Sum per row or column, (B, n).
-        count: Number of summands, (B, n).
-        cells: Number of parts; they overlap unless n is a multiple.
-        rays: Maximum count of a row or column.
-    """
+    """Means over equal parts of n rows or columns, (B, cells), from their sums `total` and numbers of summands `count`,
+    (B, n) each; and the share of counted rays, with `rays` the maximum count of a row or column."""
     n = F.adaptive_avg_pool1d(count, cells)
     return F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays
 
