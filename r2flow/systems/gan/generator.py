@@ -81,7 +81,7 @@ class VanillaGan(Gan):
     """A convolutional GAN whose image encodes dropped rays: `r2flow.systems.gan.dcgan`.
 
     Args:
-        space: The images it makes.
+        space: Space of the images.
         backbone: Not used.
         latent: Width of z.
         base_channels: Width of the outermost map; it doubles inwards.
@@ -113,7 +113,7 @@ class DustyV1(VanillaGan):
     """`VanillaGan` with a second output, the logits of a mask of returns (Nakashima and Kurazume 2021).
 
     Args:
-        temperature: Of the relaxed mask.
+        temperature: Temperature of the relaxed mask.
         options: Those of `VanillaGan`.
     """
 
@@ -136,7 +136,7 @@ class DustyV2(Gan):
     Args:
         code: Width of w; null for `latent`.
         depth: Layers from z to w.
-        temperature: Of the relaxed mask.
+        temperature: Temperature of the relaxed mask.
 
     See `VanillaGan` for the others.
     """

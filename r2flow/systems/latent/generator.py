@@ -58,7 +58,7 @@ class LatentDiffusion(Generator):
         backbone: Not used.
         autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
         unet: Options of `r2flow.systems.latent.unet.LatentUNet`; `position: learnable` is LiDM + APE.
-        beta_first, beta_last: Of `r2flow.systems.diffusion.log_snr.square_root_linear`.
+        beta_first, beta_last: Arguments of `r2flow.systems.diffusion.log_snr.square_root_linear`.
         diffusion_steps: N.
     """
 

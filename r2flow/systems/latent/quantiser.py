@@ -13,7 +13,7 @@ class Quantised(NamedTuple):
 
     codes: Tensor  # nearest codes, (B, C, H, W), with straight-through gradient
     loss: Tensor  # codebook and commitment loss, ()
-    indices: Tensor  # of the codes, (B H W,) int64
+    indices: Tensor  # indices of the codes, (B H W,) int64
 
 
 class Quantiser(nn.Module):

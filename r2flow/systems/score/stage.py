@@ -17,7 +17,7 @@ class MatchScore(SingleLoss):
 
     Args:
         generator: A `ScoreModel`.
-        power: Of sigma in the weight of each level.
+        power: Exponent of sigma in the weight of each level.
         options: Those of `Stage`. The learning rate does not fall.
     """
 
