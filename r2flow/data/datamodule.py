@@ -24,7 +24,7 @@ from r2flow.data.resolving import resolve
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
 from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.progress import track
 from r2flow.registry import check_options
 from r2flow.signals import outlive_the_signal
@@ -55,6 +55,7 @@ class ScanDataModule(L.LightningDataModule):
         self.options = DataOptions(**resolve(keys, sensor.reflectance_scale))
         self.batch_size = self.options.batch_size
         self.parts = self.options.sets
+        self.sensors = [sensor if part.sensor is None else build_sensor(**part.sensor) for part in self.parts]
         augment = self.options.augment or {}
         check_options("data.augment", Augmentation, augment)
         self.augment = Augmentation(**augment)
@@ -92,19 +93,19 @@ class ScanDataModule(L.LightningDataModule):
             if self.options.next_to_pairs is not None:
                 source = self._open(self.options.next_to_pairs)
                 self.names = list(source.names)
-                self.scans = self._kept(source, "scans next to the pairs")
+                self.scans = self._kept(source, "scans next to the pairs", [self.sensor])
             return
         training, held = self.sources()
         self._order(training)  # refuses wrong weights before anything is read or written
-        self.training_source = self._kept(training, "training scans")
-        self.validation_source = self._kept(held, "validation scans")
+        self.training_source = self._kept(training, "training scans", self.sensors)
+        self.validation_source = self._kept(held, "validation scans", self.held_out_sensors)
 
     def sources(self) -> tuple[ScanSource, ScanSource]:
         """The training and the validation scans, not yet read.
 
         Without `validation.data`, each part of a mixture holds out one block.
         """
-        whole = [self._open(options) for options in self.parts]
+        whole = [self._open(part, sensor=sensor) for part, sensor in zip(self.parts, self.sensors, strict=True)]
         # A prefix makes the names of the parts' scans distinct.
         labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
         self.names = [f"{label}{name}" for label, source in zip(labels, whole, strict=True) for name in source.names]
@@ -129,9 +130,9 @@ class ScanDataModule(L.LightningDataModule):
         validation = _joined(held)
         return _joined(training), validation.subset(spread(len(validation), self.validation.scans))
 
-    def _open(self, options: SourceOptions, first_scene: int = 0) -> ScanSource:
+    def _open(self, options: SourceOptions, first_scene: int = 0, sensor: Sensor | None = None) -> ScanSource:
         images = {"reflectance": self.encoding.reflectance, "within_limits": True}
-        reading = Reading.of({**options.chosen, **images, "sensor": self.sensor.described()})
+        reading = Reading.of({**options.chosen, **images, "sensor": (sensor or self.sensor).described()})
         return open_source(options, reading, self.seed, first_scene)
 
     def _order(self, source: ScanSource | PairSource) -> Order:
@@ -158,16 +159,22 @@ class ScanDataModule(L.LightningDataModule):
         names = hashlib.sha256(os.fsencode("\n".join([*self.names, *revision]))).hexdigest()[:12]
         return f"{len(taken)} of {len(self.names)} scans, {names}"
 
-    def _kept(self, source: ScanSource, what: str) -> ScanSource:
+    @property
+    def held_out_sensors(self) -> list[Sensor]:
+        """Sensor of each part of the validation scans."""
+        return self.sensors if self.options.held_out is None else [self.sensor]
+
+    def _kept(self, source: ScanSource, what: str, sensors: Sequence[Sensor]) -> ScanSource:
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = list(source.parts) if isinstance(source, Mixture) else [source]
-        slow = sum(len(part) for part in parts if part.slow)
-        size = slow * (1 + self.encoding.reflectance) * math.prod(self.sensor.shape) * 4
+        channels = 1 + self.encoding.reflectance
+        shapes = [(len(part), channels, *sensor.shape) for part, sensor in zip(parts, sensors, strict=True)]
+        size = sum(math.prod(shape) * 4 for part, shape in zip(parts, shapes, strict=True) if part.slow)
         if size > self.options.memory_gib * 2**30:
             return source
         for i, part in enumerate(parts):
             if part.slow and len(part):
-                images = np.empty((len(part), 1 + self.encoding.reflectance, *self.sensor.shape), np.float32)
+                images = np.empty(shapes[i], np.float32)
                 for number in track(range(len(part)), f"reading {what}", least=16):
                     images[number] = part[number]
                 parts[i] = InMemory(images, part.names)
@@ -217,7 +224,8 @@ class ScanDataModule(L.LightningDataModule):
             scans = FlowDataset(self.scans, self.encoding, self.seed, "beside", None, self.noise_shape)
             return PairDataset(source, self.seed, purpose, scans, Permutations(len(self.scans), self.seed))
         augment = self.augment if purpose == "training" else None
-        return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further)
+        sensors = self.sensors if purpose == "training" else self.held_out_sensors
+        return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further, sensors)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
         self._ready()

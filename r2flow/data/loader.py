@@ -12,9 +12,10 @@ from r2flow import noise
 from r2flow.data.augment import Augmentation
 from r2flow.data.sources import ScanSource
 from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.sensors import Sensor
 
 Item = dict[str, Tensor]
-Further = Callable[[Tensor, np.random.Generator], Item]  # of x_1, (C, H, W), and the image's generator
+Further = Callable[[Tensor, Sensor, np.random.Generator], Item]  # of x_1, (C, H, W), its sensor, the image's draws
 
 
 class FlowDataset(Dataset[Item]):
@@ -27,6 +28,10 @@ class FlowDataset(Dataset[Item]):
     - u, (B,): uniform in [0, 1); the stage maps it to t;
     - k, (B,): number of the image in the run; a stage derives further draws for an image from (seed, purpose, k);
     - the keys of `further`: a stage's conditions, the same for every seed in validation.
+
+    Args:
+        sensors: Sensor of each part of a mixture; None: one sensor. Images of several sizes need a `further` that
+            crops them.
     """
 
     def __init__(
@@ -38,8 +43,12 @@ class FlowDataset(Dataset[Item]):
         augment: Augmentation | None = None,
         noise_shape: Sequence[int] | None = None,
         further: Further | None = None,
+        sensors: Sequence[Sensor] | None = None,
     ) -> None:
-        self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
+        self.source, self.seed, self.purpose = source, seed, purpose
+        self.encodings = [
+            encoding if s == encoding.sensor else encoding.through(s) for s in sensors or [encoding.sensor]
+        ]
         self.augment, self.noise_shape = augment, tuple(noise_shape or encoding.shape)
         self.further = further
 
@@ -54,12 +63,13 @@ class FlowDataset(Dataset[Item]):
         image = self.source[index]
         if self.augment:
             image = self.augment(image, self.seed, k)
-        x_1 = self.encoding.encode(torch.from_numpy(image))
+        encoding = self.encodings[self.source.locate(index)[0]]
+        x_1 = encoding.encode(torch.from_numpy(image))
         item = {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
         if self.further is None:
             return item
         seed = self.seed if self.purpose == "training" else 0
-        return item | self.further(x_1, noise.generator(seed, "condition", k))
+        return item | self.further(x_1, encoding.sensor, noise.generator(seed, "condition", k))
 
 
 class Order(Protocol):

@@ -40,7 +40,6 @@ class SourceOptions:
     drives: list[str | int] | None = None  # names or numbers of the drives to take; None takes all
     scenes: int = 512  # number of simulated scenes
     reading: Mapping[str, Any] | None = None  # fields of `r2flow.data.reading.Reading`: projection, convention, ...
-    weight: Positive | None = None  # of a part of `mixed`: relative share of a run's images
 
     def __post_init__(self) -> None:
         if not 1 <= self.scenes <= MOST_SCENES:
@@ -68,6 +67,14 @@ class SourceOptions:
         if self.root is None:
             raise InputError(f"data={self.name} needs the folder of its scans: data.root=FOLDER.")
         return str(self.root)
+
+
+@dataclass(frozen=True)
+class PartOptions(SourceOptions):
+    """One part of a mixture (`data.parts`)."""
+
+    weight: Positive | None = None  # relative share of a run's images
+    sensor: Mapping[str, Any] | None = None  # `build_sensor`; None: the run's. Only stage=transfer takes several
 
 
 @dataclass(frozen=True)
@@ -141,11 +148,11 @@ class DataOptions(SourceOptions):
     # The following properties need the `data` of `r2flow.data.resolving.resolve`.
 
     @property
-    def sets(self) -> list[SourceOptions]:
+    def sets(self) -> list[PartOptions]:
         """The sets of scans to train on; empty for pairs."""
         if self.name == MIXED:
-            return [SourceOptions(**part) for part in self.parts or ()]
-        single = SourceOptions(**{f.name: getattr(self, f.name) for f in fields(SourceOptions)})
+            return [PartOptions(**part) for part in self.parts or ()]
+        single = PartOptions(**{f.name: getattr(self, f.name) for f in fields(SourceOptions)})
         return [] if self.name == PAIRS else [single]
 
     @property

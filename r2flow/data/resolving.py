@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from r2flow.data.opening import SOURCES
-from r2flow.data.options import FOLDER, MIXED, PAIRS, SIMULATED, Data, DataOptions, SourceOptions
+from r2flow.data.options import FOLDER, MIXED, PAIRS, SIMULATED, Data, DataOptions, PartOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.sources import made_here
 from r2flow.errors import InputError
+from r2flow.lidar.sensors import build_sensor
 from r2flow.registry import check_options
 
 log = logging.getLogger(__name__)
@@ -28,7 +29,7 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     reading = {**{key: parent[key] for key in inherited if parent and parent.get(key) is not None}, **run.chosen}
 
     def whole(options: Mapping[str, Any], usual: Mapping[str, Any]) -> Data:
-        return {**options, "reading": _whole_reading(SourceOptions(**options), usual, scale)}
+        return {**options, "reading": _whole_reading(PartOptions(**options), usual, scale)}
 
     data = {**data, "reading": _whole_reading(run, reading, scale)}
     if run.name == MIXED:
@@ -66,17 +67,22 @@ def _checked_parts(run: DataOptions) -> list[Data]:
         example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
     for number, part in enumerate(run.parts):
-        _check_set(f"data.parts[{number}]", part)
+        _check_set(f"data.parts[{number}]", part, kind=PartOptions)
+        if part.get("sensor") is not None:
+            check_options(f"data.parts[{number}].sensor", build_sensor, part["sensor"])
     if len({part.get("weight") is None for part in run.parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
-    if sum(part["name"] == SIMULATED for part in run.parts) > 1:
-        raise InputError("data.parts: simulated scenes are numbered; give one simulated part, with all its scenes.")
+    simulated = [part.get("sensor") for part in run.parts if part["name"] == SIMULATED]
+    if any(sensor in simulated[:i] for i, sensor in enumerate(simulated)):
+        raise InputError("data.parts: simulated scenes are numbered; give one simulated part of a sensor.")
     return [{"scenes": run.scenes, **part} for part in run.parts]
 
 
-def _check_set(what: str, options: Mapping[str, Any], split: bool = True) -> None:
+def _check_set(
+    what: str, options: Mapping[str, Any], split: bool = True, kind: type[SourceOptions] = SourceOptions
+) -> None:
     """Refuse options that do not name a single set of scans or, with `split`, lack the split of a standard data set."""
-    check_options(what, SourceOptions, options)
+    check_options(what, kind, options)
     name = options.get("name")
     if name in (None, MIXED, PAIRS):
         raise InputError(f"{what} needs the name of a data set, found {name!r}.")

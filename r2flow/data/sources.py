@@ -64,6 +64,10 @@ class ScanSource(ABC):
     def subset(self, indices: Sequence[int]) -> "ScanSource":
         """A source of some of the scans, which never reads the others."""
 
+    def locate(self, index: int) -> tuple[int, int]:
+        """The part of a mixture that a scan is from, and the scan's number in that part."""
+        return 0, index
+
     def batch(self, indices: Sequence[int]) -> Tensor:
         """Several scans at once, (B, 2 or 1, H, W)."""
         return torch.from_numpy(np.stack([self[index] for index in indices]))

@@ -53,6 +53,7 @@ class Stage(L.LightningModule):
     generator_name: ClassVar[str | None] = None  # generator to train; None: the parent's, or a rectified flow
     needs_pairs: ClassVar[bool] = False  # whether it trains on pairs of x_0 and x_1
     needs_parent: ClassVar[bool] = False  # whether it must start from another run, even if it trains on scans
+    several_sensors: ClassVar[bool] = False  # whether the parts of a mixture may be scans of different sensors
     anneals: ClassVar[bool] = True  # whether the learning rate decays to 0 at the run's last step
 
     def __init__(
@@ -88,6 +89,8 @@ class Stage(L.LightningModule):
             raise InputError(f"stage={name} learns from pairs alone: leave data.scans out, or give stage=flow_map.")
         if on_pairs and not self.needs_pairs:
             raise InputError(f"stage={name} learns from scans, not from data=pairs; give stage=reflow.")
+        if not self.several_sensors and any(part.get("sensor") for part in data.get("parts") or ()):
+            raise InputError(f"stage={name} learns from scans of one sensor: leave sensor out of data.parts.")
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout uses torch's global generator: seeding it by position makes a resumed run draw the same numbers.

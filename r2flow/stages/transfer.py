@@ -10,11 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.errors import InputError
 from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
 from r2flow.generators.surroundings import steps_of
 from r2flow.generators.transfer import WEIGHTS
 from r2flow.lidar.known import every_row, random_points, random_rows
+from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Count, Portion, check_options
 from r2flow.stages.base import Batch, SingleLoss
@@ -28,8 +30,8 @@ class Tasks:
     random share of the rays (3 to 80 %).
 
     Args:
-        rows: Rows of a crop.
-        columns: Columns of a crop.
+        rows: Rows of a crop, at most those of the run's sensor.
+        columns: Columns of a crop, at most those of the run's sensor.
         halved: Share of crops at half the rows and a quarter of the columns, to train for coarser images.
         silent: Share of crops with unknown reflectance.
         unnumbered: Share of crops without the vectors learned per row, to train for other sensors.
@@ -41,13 +43,23 @@ class Tasks:
     silent: Portion = 0.05
     unnumbered: Portion = 0.1
 
-    def __call__(self, space: ModelSpace, x_1: Tensor, draws: np.random.Generator) -> Batch:
-        """`target`, `image` and `known` of a crop in model space, (C, h, w); `elevations` (h,), `steps` (2,)."""
+    def size(self, space: ModelSpace) -> tuple[int, int]:
+        """Rows and columns of a crop, for the space of the run's sensor."""
+        return min(self.rows, space.shape[1]), min(self.columns, space.shape[2])
+
+    def __call__(self, own: ModelSpace, x_1: Tensor, sensor: Sensor, draws: np.random.Generator) -> Batch:
+        """`x_1`, `image` and `known` of a crop in model space, (C, h, w); `elevations` (h,), `steps` (2,).
+
+        Args:
+            own: The generator's space, which determines the size of the crops.
+            sensor: Sensor of the scan x_1.
+        """
+        space = own if sensor == own.sensor else own.through(sensor)
         halve, silent, unnumbered, top, left = draws.random(5)
         elevations = space.rays[0, :, 0]
         if halve < self.halved and x_1.shape[1] >= 2 * self.rows and x_1.shape[2] >= 4 * self.columns:
             x_1, elevations = coarser(space, x_1), elevations.unflatten(0, (-1, 2)).mean(1)
-        rows, columns = min(self.rows, x_1.shape[1]), min(self.columns, x_1.shape[2])
+        rows, columns = self.size(own)
         first = int(top * (x_1.shape[1] - rows + 1))
         chosen = (torch.arange(columns) + int(left * x_1.shape[2])) % x_1.shape[2]
         part = x_1[:, first : first + rows].index_select(2, chosen)
@@ -58,7 +70,7 @@ class Tasks:
             known = known.clone()
             known[-1] = 0
         return {
-            "target": part, IMAGE: part * known, KNOWN: known, "elevations": elevations,
+            "x_1": part, IMAGE: part * known, KNOWN: known, "elevations": elevations,
             "steps": steps, "numbered": torch.tensor(unnumbered >= self.unnumbered),
         }  # fmt: skip
 
@@ -93,23 +105,38 @@ class Transfer(SingleLoss):
     """
 
     learns: ClassVar[type[Generator]] = TransferFlow
+    several_sensors = True
     generator_name = "transfer_flow"
     generator: TransferFlow
 
     def __init__(self, generator: Generator, tasks: Mapping[str, Any] | None = None, **options: Any) -> None:
         super().__init__(generator, **options)
         check_options("stage.tasks", Tasks, tasks or {})
-        self.further = partial(Tasks(**(tasks or {})), generator.space)
+        self.tasks = Tasks(**(tasks or {}))
+        self.further = partial(self.tasks, generator.space)
+
+    def check_data(self, name: str, data: Mapping[str, Any]) -> None:
+        super().check_data(name, data)
+        crop = self.tasks.size(self.generator.space)
+        for number, part in enumerate(data.get("parts") or ()):
+            if part.get("sensor") is not None:
+                sensor = build_sensor(**part["sensor"])
+                if sensor.shape[0] < crop[0] or sensor.shape[1] < crop[1]:
+                    raise InputError(
+                        f"data.parts[{number}]: crops of {crop[0]} x {crop[1]} need images as large, {sensor.name} has "
+                        f"{sensor.shape[0]} x {sensor.shape[1]}: give sensor.rows and sensor.columns, or smaller "
+                        "stage.tasks.rows and stage.tasks.columns."
+                    )
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        target = batch["target"]
-        noise = batch["x_0"][:, :, : target.shape[2], : target.shape[3]]
+        x_1 = batch["x_1"]
+        noise = batch["x_0"][:, :, : x_1.shape[2], : x_1.shape[3]]
         rows = self.generator.rows(batch["elevations"], batch["steps"], batch["numbered"])
         parts = self.generator.loss(
-            target, {IMAGE: batch[IMAGE], KNOWN: batch[KNOWN]}, (2 * u - 1).clamp(min=0), noise,
+            x_1, {IMAGE: batch[IMAGE], KNOWN: batch[KNOWN]}, (2 * u - 1).clamp(min=0), noise,
             batch["steps"], rows,
         )  # fmt: skip
         split = "train" if self.training else "val"
         for name, value in parts.items():
-            self.log(f"{split}/{name}", value, batch_size=len(target), sync_dist=True)
+            self.log(f"{split}/{name}", value, batch_size=len(x_1), sync_dist=True)
         return torch.stack([WEIGHTS[name] * value for name, value in parts.items()]).sum()

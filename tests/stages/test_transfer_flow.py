@@ -8,6 +8,7 @@ import torch
 from scipy.integrate import quad
 
 from r2flow import noise
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.errors import InputError
 from r2flow.generators import TransferFlow, build_generator, condition_of
 from r2flow.generators.transfer import Answers
@@ -16,6 +17,7 @@ from r2flow.lidar.sensors import build_sensor
 from r2flow.model.completion import completing
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
+from r2flow.simulator import simulate
 from r2flow.stages import build_stage
 from r2flow.stages.transfer import Tasks, Transfer, coarser
 from tests.conftest import tiny_options
@@ -217,14 +219,19 @@ def test_a_coarser_image_has_the_nearest_return_of_each_block(flow):
 
 def test_a_part_of_a_scan_and_what_is_known_of_it_depend_on_the_image_alone(flow, scans):
     x_1, tasks = flow.space.encoding.encode(scans[0]), Tasks(rows=4, columns=16)
-    parts = [[tasks(flow.space, x_1, noise.generator(0, "condition", k)) for k in range(40)] for _ in range(2)]
+    parts = [
+        [tasks(flow.space, x_1, flow.space.sensor, noise.generator(0, "condition", k)) for k in range(40)]
+        for _ in range(2)
+    ]
     for one, other in zip(*parts, strict=True):
         assert one.keys() == other.keys()
         assert all(torch.equal(one[name], other[name]) for name in one)
-        assert one["target"].shape == (2, 4, 16)
-        assert torch.equal(one["image"], one["target"] * one["known"])
+        assert one["x_1"].shape == (2, 4, 16)
+        assert torch.equal(one["image"], one["x_1"] * one["known"])
     assert len({float(one["known"].mean()) for one in parts[0]}) > 5
-    silent = Tasks(rows=4, columns=16, silent=0.99)(flow.space, x_1, noise.generator(0, "condition", 0))
+    silent = Tasks(rows=4, columns=16, silent=0.99)(
+        flow.space, x_1, flow.space.sensor, noise.generator(0, "condition", 0)
+    )
     assert silent["known"][0].any()
     assert not silent["known"][1].any()
 
@@ -238,9 +245,10 @@ def test_what_it_learns_from_lowers_the_loss(scans):
     learner = stage()
     learner.log = lambda *_, **__: None
     x_1 = learner.generator.space.encoding.encode(scans)
-    one = [learner.further(x, noise.generator(0, "condition", k)) for k, x in enumerate(x_1)]
+    sensor = learner.generator.space.sensor
+    one = [learner.further(x, sensor, noise.generator(0, "condition", k)) for k, x in enumerate(x_1)]
     batch = {name: torch.stack([part[name] for part in one]) for name in one[0]}
-    batch |= {"x_1": x_1, "x_0": torch.randn(x_1.shape), "k": torch.arange(3)}
+    batch |= {"x_0": torch.randn(x_1.shape), "k": torch.arange(3)}
     u, by = torch.tensor([0.2, 0.6, 0.9]), torch.optim.Adam(learner.parameters(), 1e-2)
     losses = []
     for _ in range(30):
@@ -251,6 +259,44 @@ def test_what_it_learns_from_lowers_the_loss(scans):
         losses.append(loss.item())
     assert losses[-1] < losses[0] - 0.5
     assert all(p.grad is not None and p.grad.isfinite().all() for p in learner.parameters())
+
+
+def test_a_batch_has_crops_of_several_sensors():
+    learner = stage(stage={"name": "transfer", "tasks": {"halved": 0}})
+    space = learner.generator.space
+    parts = [{"name": "simulated", "scenes": 4},
+             {"name": "simulated", "scenes": 4, "sensor": {"name": "vlp16", "columns": 64}}]  # fmt: skip
+    data = ScanDataModule(space.sensor, space.encoding, 0, name="mixed", parts=parts, validation={"share": 0.5})
+    data.further = learner.further
+    data.setup()
+    [batch] = data.val_dataloader()
+    assert batch["x_1"].shape == (4, 2, 8, 32)
+    sensors = [space.sensor] * 2 + [build_sensor("vlp16", columns=64)] * 2
+    for i, sensor in enumerate(sensors):
+        rows = [float(e) for e in sensor.rays()[0, :, 0]]
+        top = rows.index(float(batch["elevations"][i, 0]))
+        assert batch["elevations"][i].tolist() == rows[top : top + 8]
+        whole = torch.from_numpy(simulate(sensor, 0, 2 + i % 2).image)
+        crop = space.through(sensor).decode(batch["x_1"][i : i + 1])[0]
+        there = [j for j in range(sensor.columns) if torch.allclose(
+            whole.roll(-j, 2)[:, top : top + 8, :32], crop, rtol=1e-4, atol=1e-4)]  # fmt: skip
+        assert len(there) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "sensor", "word"),
+    [("rectify", {"name": "vlp16"}, "one sensor"), ("transfer", {"name": "vlp16", "columns": 16}, "crops of 8 x 32")],
+)
+def test_a_part_of_another_sensor_that_cannot_be_learned_from_is_refused(name, sensor, word):
+    part = {"name": "simulated", "scenes": 4}
+    config = {"data": {"name": "mixed", "batch_size": 4, "parts": [part, {**part, "sensor": sensor}]}}
+    if name == "rectify":
+        config["stage"] = {"name": name}
+        with pytest.raises(InputError, match=word):
+            build_stage({**CONFIG, **config, "seed": 0}, build_generator({**CONFIG, "backbone": tiny_options("hdit")}))
+    else:
+        with pytest.raises(InputError, match=word):
+            stage(**config)
 
 
 @pytest.mark.parametrize("other", ["rectify", "reflow"])
