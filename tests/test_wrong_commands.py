@@ -179,6 +179,7 @@ evaluate scans run --steps 1,,2
 evaluate scans run --sampler euler,heun2 --tolerance 0.1 # tolerance
 evaluate scans run --tolerance 0.1 # tolerance
 evaluate scans run --sensor vlp16
+evaluate scans scans --sensor vlp # Did you mean 'vlp16'? Your own is a YAML file
 evaluate image.npy # nothing to compare with
 evaluate simulated:x scans
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'

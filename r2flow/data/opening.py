@@ -28,7 +28,7 @@ from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensor_files import ENDINGS, read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
-from r2flow.registry import Registry, did_you_mean
+from r2flow.registry import Registry, UnknownName, did_you_mean
 from r2flow.store import MANIFEST, read_manifest
 
 log = logging.getLogger(__name__)
@@ -232,8 +232,12 @@ def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> S
     """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
     if isinstance(sensor, Sensor):
         return sensor if size is None else sensor.resized(*size)
-    build = read_sensor if sensor.lower().endswith(ENDINGS) else build_sensor
-    return build(sensor, *(size or (None, None)))
+    if sensor.lower().endswith(ENDINGS):
+        return read_sensor(sensor, *(size or (None, None)))
+    try:
+        return build_sensor(sensor, *(size or (None, None)))
+    except UnknownName as error:
+        raise UnknownName(f"{error} Your own is a YAML file: r2flow sensor SCANS --out NAME.yaml") from None
 
 
 def read(path: str | Path, sensor: Sensor | str | None = None) -> Tensor:
