@@ -16,6 +16,7 @@ from r2flow.cli.options import (
     OutOption,
     SamplerOptions,
     ScaleChoice,
+    SensorChoice,
     SensorOption,
     SizeOption,
     build_sized,
@@ -24,6 +25,7 @@ from r2flow.cli.options import (
     cores,
     grouped,
     numbers,
+    rows_and_columns,
 )
 from r2flow.errors import InputError
 
@@ -156,6 +158,8 @@ def completion(
     answers: Annotated[int, typer.Option(min=1, help="Completions per scan; 19 give 90 % intervals.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise; masks do not depend on it.")] = 0,
     batch_size: Annotated[int, typer.Option(min=1, help="Completions per batch.")] = 4,
+    sensor: SensorChoice = None,
+    size: SizeOption = None,
     reflectance_scale: ScaleChoice = None,
     device: DeviceOption = "auto",
     out: OutOption = Path("reports"),
@@ -163,6 +167,8 @@ def completion(
     """Mask scans and complete them by models and by interpolation: errors against evaluations."""
     import numpy as np
 
+    from r2flow.data.opening import named_sensor, own_reading
+    from r2flow.generators import TransferFlow
     from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
@@ -172,6 +178,12 @@ def completion(
     from r2flow.reports.pages import prepare_folder
 
     loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or [DENSIFY]}
+    stored = own_reading(real)
+    for name, model in loaded.items():
+        told = stored is not None and isinstance(model.generator, TransferFlow)
+        if sensor or size or told:
+            own = stored.sensor if stored and told else model.sensor
+            loaded[name] = model.through(named_sensor(sensor or own, rows_and_columns(size)))
     ways = [
         Way(name, model, completing(model.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
         for name, model in loaded.items()
@@ -181,7 +193,7 @@ def completion(
     masks = tasks.split() if tasks else list(TASKS)
     for task in masks:
         measured_by(task, first.sensor, 0)
-    scans = real_scans(first, [real], reflectance_scale, num)
+    scans = real_scans(first, [real], reflectance_scale or first.sensor.reflectance_scale, num)
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
     if not truths:
         raise InputError(f"{real}: no scan has a return, so there is nothing to hide.")

@@ -93,7 +93,7 @@ class Checkpoint:
     def through(self, sensor: Sensor, numbered: bool = True) -> "Checkpoint":
         """The same model for another sensor's images; see `TransferFlow.at`."""
         if not isinstance(self.generator, TransferFlow):
-            raise InputError(f"{self.path} is a model of one sensor: leave --to and --size out.")
+            raise InputError(f"{self.path} is a model of one sensor: leave --to, --sensor and --size out.")
         return replace(self, generator=self.generator.at(self.generator.space.through(sensor), numbered))
 
     def points(self, images: Tensor) -> list[np.ndarray]:
