@@ -15,7 +15,7 @@ from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
-from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
+from r2flow.evaluation.measuring import MetricResult, Work, gather_real, measure, real_rule
 from r2flow.evaluation.references import reference_sets
 from r2flow.evaluation.sets import sampled_set
 from r2flow.evaluation.statistics import FORMAT, Cache, key_of
@@ -25,6 +25,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.jsd_mmd import JSD, MMD
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import standard_normal
+from r2flow.reports.evaluation import Comparison, verdict
 from r2flow.samplers import build_sampler
 from tests.data.conftest import kitti_360  # noqa: F401  a fixture
 from tests.test_sampling import flow as without_config
@@ -309,3 +310,29 @@ def test_another_revision_of_the_simulator_draws_other_scans(monkeypatch):
     before = open_scans("simulated:0", READING, num=3).identity
     monkeypatch.setattr("r2flow.simulator.REVISION", 10**6)
     assert open_scans("simulated:0", READING, num=3).identity != before
+
+
+@pytest.mark.parametrize(
+    ("metric", "scans", "value", "words"),
+    [
+        ("kid_x", 200, 9.0, "not distinguishable"),
+        ("kid_x", 200, 11.0, "farther from the real scans than these are"),
+        ("kid_x", 200, 50.0, "no nearer to the real scans than a baseline"),
+        ("kid_x", 20, 9.0, "20 scans are too few"),
+        ("panel", 200, 9.0, "undecided"),  # the halves' distance is larger since they are fewer
+        ("panel", 200, 11.0, "farther from the real scans than these are"),
+    ],
+)
+def test_the_verdict_follows_from_reference_and_baselines(metric, scans, value, words):
+    cases = ("b", value + 1, 200, "judged"), ("a", value, scans, "judged"), ("real halves", 10.0, 100, "reference")
+    comparisons = [
+        Comparison(name, range(count), range(count), [MetricResult(metric, {metric: number}, {})], 0.0, kind)
+        for name, number, count, kind in (
+            *cases,
+            ("a, as many", 99.0, 100, "reference"),
+            ("noise", 50.0, 200, "baseline"),
+        )
+    ]
+    first, _ = verdict(comparisons)
+    assert first.startswith(f"a: nearest, {metric} {value:.3g} (reference: real halves 10, baseline: noise 50): ")
+    assert words in first

@@ -18,6 +18,8 @@ from r2flow.reports.tables import print_table, shown, table
 
 Kind = Literal["judged", "reference", "baseline"]
 ENDS = (" low", " high")  # suffixes of interval limits
+DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
+ENOUGH = 100  # least number of scans of a set for a verdict
 AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
 
 # Values that published tables print scaled: heading and factor, for printing only.
@@ -82,8 +84,40 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
         columns = ["", *numbers]
         print()
     print_table(lines, columns)
-    for remark in _remarks(comparisons):
-        print(f"  {remark}")
+    print(*(f"  {remark}" for remark in _remarks(comparisons)), *verdict(comparisons), sep="\n")
+
+
+def verdict(comparisons: Sequence[Comparison]) -> list[str]:
+    """One sentence per judged set, the nearest first: its first distance against real sets and the best baseline.
+
+    Distances but KID are larger for fewer scans: against a reference of other sizes only one outcome decides.
+    """
+    metric = next((m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)), "")
+    found: dict[Kind, list[tuple[float, Comparison]]] = {"judged": [], "reference": [], "baseline": []}
+    for one in comparisons:
+        values = [next(iter(m.figures.values())) for m in one.measured if m.metric == metric]
+        if values and math.isfinite(values[0]) and not (one.kind == "reference" and one.name.endswith(", as many")):
+            found[one.kind].append((values[0], one))
+    judged, real, baselines = (sorted(part, key=lambda pair: pair[0]) for part in found.values())
+    title, factor = heading(metric, metric)
+    known = ", ".join(f"{one.title} {value * factor:.3g}" for value, one in (*real[-1:], *baselines[:1]))
+    lines = []
+    for value, one in judged if real else []:
+        (reference, halves), best = real[-1], baselines[0][0] if baselines else math.inf
+        here, there = (min(len(pair.real), len(pair.generated)) for pair in (one, halves))
+        uneven = not metric.startswith("kid_") and (there > here if value > reference else there < here)
+        if value >= best:
+            tells = "no nearer to the real scans than a baseline"
+        elif min(here, there) < ENOUGH:
+            tells = f"{min(here, there)} scans are too few to say more; give {ENOUGH} or more"
+        elif uneven or reference >= best:
+            tells = "undecided, as the reference is of other numbers of scans or above a baseline"
+        else:
+            farther = "farther from the real scans than these are from each other"
+            tells = farther if value > reference else "not distinguishable from real scans by this figure"
+        first = "nearest, " if one is judged[0][1] and len(judged) > 1 else ""
+        lines.append(f"{one.name}: {first}{title} {value * factor:.3g} ({known}): {tells}.")
+    return lines
 
 
 def evaluation_page(
@@ -116,6 +150,7 @@ def evaluation_page(
         _protocol(comparisons),
         table(lines, columns),
         *([remarks] if remarks else []),
+        *verdict(comparisons),
         "## Sets",
         table(sets, ("comparison", "as", "set", "scans", "details")),
         "## Protocols",
