@@ -9,7 +9,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from r2flow.data.options import SourceOptions
-from r2flow.data.reading import Reading, lacks_reflectance
+from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS, scan_ending
@@ -120,7 +120,8 @@ class Layout(SourceKind):
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         paths = (path for drive in self.find_drives(options) for path in drive.scans)
-        return lacks_reflectance(paths, on_bad_scan, options.columns)
+        with leaving_out(on_bad_scan == "error"):
+            return lacks_reflectance(paths, on_bad_scan, options.columns)
 
 
 def kitti_360(root: Path) -> list[Drive]:

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -195,6 +196,17 @@ def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndar
     projected = read_projected(path, reading)
     xyz = projected.spread(projected.points.xyz[projected.chosen].astype(np.float32))
     return projected.image, np.ascontiguousarray(np.moveaxis(xyz, -1, 0))
+
+
+@contextmanager
+def leaving_out(advised: bool) -> Iterator[None]:
+    """Adds to the error of a scan, if `advised`, how a training leaves such scans out."""
+    try:
+        yield
+    except InputError as error:
+        if not advised:
+            raise
+        raise InputError(f"{error} In training data.reading.on_bad_scan=skip leaves such scans out.") from None
 
 
 def lacks_reflectance(

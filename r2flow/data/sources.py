@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.data.reading import Reading, read_image, read_points_image
+from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.errors import InputError
 from r2flow.lidar.beams import other_sensor
 from r2flow.lidar.scan_files import read_points, read_range_image
@@ -199,7 +199,9 @@ class ScanFiles(ScanSource):
     def _first_usable(self, index: int, read: Callable[[Path], Read]) -> Read:
         """Read a file, or with `on_bad_scan="skip"` the first usable file from this index on."""
         if self.reading.on_bad_scan != "skip":
-            return read(Path(self.paths[index]))
+            advised = self.reading.on_bad_scan == "error" and self.described.get("kind", "file") != "file"
+            with leaving_out(advised):
+                return read(Path(self.paths[index]))
         for candidate in (*range(index, len(self)), *range(index)):
             if candidate in self.bad:
                 continue
