@@ -124,11 +124,11 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow,
     for number, name in enumerate(("one.npy", "two.npy")):
         full_scan(tmp_path / "in" / name, number)
     asked = [*COMPLETE, tmp_path / "in", "-c", run, "--mask", "points:0.3", "--seed", 3, "--out", tmp_path / "out"]
-    assert "2 scans completed" in r2flow(*asked)[1]
+    assert "2 scans written" in r2flow(*asked)[1]
     first = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")}
     (tmp_path / "out" / "two.npy").unlink()
     stamp = (tmp_path / "out" / "one.npy").stat().st_mtime_ns
-    assert "1 scans completed" in (said := r2flow(*asked)[1])
+    assert "1 scans written" in (said := r2flow(*asked)[1])
     assert "1 were there already" in said
     assert (tmp_path / "out" / "one.npy").stat().st_mtime_ns == stamp
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")} == first
@@ -145,7 +145,7 @@ def test_a_scan_of_which_everything_is_known_comes_back_and_says_so(r2flow, run,
     code, said, _ = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out")
     assert code == 0
     assert np.array_equal(np.load(tmp_path / "out" / "one.npy"), image)
-    assert "one: everything is known" in said
+    assert "one: everything is known, so nothing was completed" in said
 
 
 def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(r2flow, run, tmp_path):  # noqa: F811
@@ -297,7 +297,7 @@ def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path
     assert (tmp_path / "out" / f"one{ending}").read_bytes() == before
     full_scan(tmp_path / "b" / f"two{ending}", 0)
     (tmp_path / "b" / f"one{ending}").unlink()
-    assert "1 scans completed" in r2flow(*COMPLETE, tmp_path / "b", *asked)[1]
+    assert "1 scans written" in r2flow(*COMPLETE, tmp_path / "b", *asked)[1]
     assert r2flow(*COMPLETE, tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
 
 
@@ -318,7 +318,7 @@ def test_prepared_scans_are_named_by_their_numbers_in_the_set(r2flow, run, tmp_p
     whole = open_scans(given).source
     for number in numbers:
         assert np.array_equal(np.load(tmp_path / "out" / f"prep-{number:06d}.npy")[:, ::2], whole[number][:, ::2])
-    assert "1 scans completed" in (said := r2flow(*asked, 4)[1])
+    assert "1 scans written" in (said := r2flow(*asked, 4)[1])
     assert "3 were there already" in said
 
 
@@ -331,7 +331,7 @@ def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_p
     np.save(tmp_path / "in" / "b.npy", image)
     code, said, _ = r2flow(*asked)
     assert code == 0
-    assert "1 scans completed" in said
+    assert "1 scans written" in said
     full_scan(tmp_path / "in" / "b.npy", 0)
     assert "another scan of the name b" in r2flow(*asked)[2]
 
@@ -364,7 +364,7 @@ def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path
     code, said, _ = r2flow(*COMPLETE, shared / "real" / "other_sensors" / scan, "-c", run, "--out", tmp_path / "out")
     assert code == 0
     assert beams in said
-    assert "1 scans completed" in said
+    assert "1 scans written" in said
 
 
 def test_the_errors_of_hidden_rays_stand_next_to_those_of_interpolation():

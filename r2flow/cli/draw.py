@@ -233,7 +233,7 @@ def complete(
     }  # fmt: skip
     done = write_completed(loaded, partial, out, job, sampler, about)
     skipped = len(partial) - len(done)
-    print(f"{len(done)} scans completed in {out}" + (f", {skipped} were there already" if skipped else ""))
+    print(f"{len(done)} scans written to {out}" + (f", {skipped} were there already" if skipped else ""))
     if errors := [error for error in done.values() if error is not None]:
         (mae, linear), (wrong, wrong_linear) = np.ma.masked_invalid(errors).mean(0).filled(np.nan)
         print(f"on hidden rays of {len(errors)} scans (linear interpolation in brackets):")
