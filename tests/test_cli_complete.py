@@ -336,6 +336,14 @@ def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_p
     assert "another scan of the name b" in r2flow(*asked)[2]
 
 
+def test_an_unusual_scale_that_is_estimated_is_told(r2flow, run, tmp_path):  # noqa: F811
+    xyz = sparse_scan(tmp_path / "one.ply")
+    write_points(tmp_path / "one.ply", xyz, np.linspace(0, 0.01, len(xyz), dtype=np.float32))
+    asked = *COMPLETE, tmp_path / "one.ply", "-c", run, "--from", "vlp16"
+    assert "reflectance is divided by 0.01, its largest" in r2flow(*asked, "--out", tmp_path / "a")[2]
+    assert r2flow(*asked, "--reflectance-scale", "0.01", "--out", tmp_path / "b")[2] == ""
+
+
 def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path):  # noqa: F811
     full_scan(tmp_path / "one.bin")
     mask = np.arange(8)[:, None] % 2 == np.zeros(64)

@@ -19,7 +19,7 @@ from r2flow.data.options import PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread
 from r2flow.errors import InputError, naming
-from r2flow.lidar.beams import full_reflectance, other_sensor
+from r2flow.lidar.beams import FULL_REFLECTANCE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.transfer import (
@@ -128,6 +128,8 @@ def _files(
             by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines.append(_described(spec, replace(fired, name=name), target, turns=True))
+        if scale is None and full == full_reflectance(scans) and full not in FULL_REFLECTANCE:
+            log.warning("%s: reflectance is divided by %g, its largest; --reflectance-scale names another", spec, full)
     elif source and not _same_image(source, target):
         lines.append(_described(spec, source, target))
 
