@@ -68,7 +68,10 @@ class ModelSpace:
         images = torch.as_tensor(images)
         if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != self.sensor.shape:
             h, w = self.sensor.shape
-            raise InputError(f"range images have the shape (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}.")
+            raise InputError(
+                f"range images have the shape (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}; for "
+                "scans of another sensor there is r2flow.lidar.projection.image_to_points."
+            )
         rays = self.sensor.rays()
         clouds = (image_to_points(image, rays) for image in images.float().cpu().numpy())
         return [np.column_stack(cloud) for cloud in clouds]
