@@ -64,7 +64,8 @@ def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> "Figure":
                 steps, values = smooth(*curves[name])
                 axes.plot(steps, values, **styles[label], ms=4, lw=1.1, markevery=max(len(steps) // 8, 1), label=label)
         axes.set(title=CURVES[name], xlabel="optimiser step")
-        if all((line.get_ydata() > 0).all() for line in axes.lines):
+        shown = np.concatenate([line.get_ydata() for line in axes.lines])
+        if 0 < 3 * shown.min() < shown.max():  # else its labels would be 1.11 x 10^0
             axes.set_yscale("log")
         axes.grid(alpha=0.25)
         handles = {line.get_label(): line for line in axes.lines}
@@ -110,7 +111,9 @@ def finish(
     write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"], replace=True)
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
-        print(f"{name}: {values[:tenth].mean():.4f} at the start, {values[-tenth:].mean():.4f} at step {steps[-1]}")
+        single = " (single batches: too few to compare)" if tenth == 1 and name.startswith("train/") else ""
+        change = f"{values[:tenth].mean():.4f} at the start, {values[-tenth:].mean():.4f} at step {steps[-1]}"
+        print(f"{name}: {change}{single}")
     print(
         f"""
 checkpoint    {path}

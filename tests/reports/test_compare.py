@@ -24,7 +24,7 @@ from r2flow.reports.compare import (
     rows_of,
 )
 from r2flow.reports.pages import write_page
-from r2flow.reports.training import read_curves, smooth
+from r2flow.reports.training import curves_figure, read_curves, smooth
 
 CONFIG: dict[str, Any] = {
     "name": "small",
@@ -211,3 +211,9 @@ def test_a_folder_that_is_no_run_is_named(tmp_path, content, words):
     (tmp_path / "thing" / "config.yaml").write_text(content)
     with pytest.raises(InputError, match=words):
         read_runs([tmp_path / "thing"])
+
+
+@pytest.mark.parametrize(("values", "scale"), [([1.1, 1.2], "linear"), ([0.1, 1.0], "log"), ([0.0, 1.0], "linear")])
+def test_losses_have_a_logarithmic_axis_where_it_has_labels(values, scale):
+    figure = curves_figure([("run", {"train/loss": (np.array([1, 2]), np.array(values))})])
+    assert figure.axes[0].get_yscale() == scale
