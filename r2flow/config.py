@@ -122,15 +122,11 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def check_tree(config: Mapping[str, Any]) -> None:
-    """Refuse a config that contains itself, possible in YAML and pickles, or is nested too deeply.
-
-    Raises:
-        ValueError: the config is refused.
-    """
-    try:
-        json.dumps(config, skipkeys=True, default=str)
-    except RecursionError:
-        raise ValueError("it is nested too deeply") from None
+    """Raise an error for what is no config: one that contains itself, as an anchor of YAML or a pickle can have it."""
+    json.dumps(config, skipkeys=True, default=str)
+    for key in ("stage", "data", "trainer"):
+        if not isinstance(config.get(key) or {}, Mapping):
+            raise ValueError(f"its '{key}' is not a group of keys")
 
 
 def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

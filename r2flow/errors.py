@@ -41,10 +41,12 @@ MENDABLE = {
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """Prefix the message of an InputError with the name of a file."""
+    """Puts a file's name before an InputError about it that does not have it."""
     try:
         yield
     except InputError as error:
+        if str(error).startswith(str(path)):
+            raise
         raise type(error)(f"{path}: {error}") from None
 
 

@@ -14,7 +14,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, naming
 
 
 @contextmanager
@@ -25,8 +25,7 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     file, even after a power cut. For a link, the target is replaced; devices and pipes are written to directly.
 
     Raises:
-        IsADirectoryError: `path` is a folder.
-        InputError: `path` is a socket, a block device or a broken link.
+        InputError: `path` is a folder, a socket, a block device or a link to nothing.
     """
     path = Path(path)
     is_stream = _is_stream(path)
@@ -78,40 +77,65 @@ def read_json(path: Path) -> Any:
     return parse_json(path.read_text(encoding="utf-8"))
 
 
-def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:
-    """Refuse a path that is not a regular file, is empty or has more than `largest` bytes, before it is opened."""
+@contextmanager
+def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Iterator[None]:
+    """Read a file in the block: its path is checked first, and every error becomes an InputError that names it."""
+    with telling(path):
+        refuse_unreadable(path, largest, what, least)
+        yield
+
+
+@contextmanager
+def telling(path: Path) -> Iterator[None]:
+    """Turn every error of a reader into an InputError of one line with the file's name."""
+    try:
+        with naming(path):
+            yield
+    except InputError:
+        raise
+    except OSError as error:
+        reason = " ".join(str(error.strerror or error).split())  # pyarrow's messages have several lines
+        raise InputError(f"{path} cannot be read: {reason}.") from None
+    except BaseException as error:  # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # Rust decoders
+            raise
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160].rstrip('.')}"
+        raise InputError(f"{path} is not a readable {path.suffix} file ({reason}). Is it damaged?") from error
+
+
+def refuse_unreadable(path: Path, largest: int, what: str = "file", least: int = 1) -> None:
+    """Refuse a path that is no regular file of `least` to `largest` bytes, before it is opened."""
     if path.is_symlink() and not path.exists():
-        raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
-    if not path.exists():
-        raise InputError(f"{path} does not exist. Is the path right?")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder, not a {what}; name a file in it.")
-    if not path.is_file():  # reading a pipe or a device may never end
-        raise InputError(f"{path} is not a regular file.")
-    size = path.stat().st_size
-    if size == 0:
-        raise InputError(f"{path} is empty (0 bytes); fetch or write it again.")
-    if size > largest:
+        problem = f"is a link to {path.readlink()}, which does not exist."
+    elif not path.exists():
+        problem = "does not exist. Is the path right?"
+    elif path.is_dir():
+        problem = f"is a folder, not a {what}; name a file in it."
+    elif not path.is_file():  # reading a pipe would wait for ever, a device never end
+        problem = "is not a regular file."
+    elif (size := path.stat().st_size) < least:
+        problem = f"is empty ({size} bytes); fetch or write it again."
+    elif size > largest:
         most = f"{largest / 2**30:g} GiB" if largest >= 2**30 else f"{largest / 2**20:g} MiB"
-        raise InputError(f"{path} has {size:,} bytes, too many for a {what} (at most {most}). Is it another file?")
+        problem = f"has {size:,} bytes, too many for a {what} (at most {most}). Is it another file?"
+    else:
+        return
+    raise InputError(f"{path} {problem}")
 
 
 def _is_stream(path: Path) -> bool:
-    """Whether a path is a character device or a pipe, which is written to directly."""
-    try:
-        kind = path.stat().st_mode
-    except FileNotFoundError:
-        if path.is_symlink():
-            raise InputError(
-                f"{path} is a link to {path.readlink()}, which does not exist; remove the link or name another file."
-            ) from None
+    """Whether a path is written into rather than replaced: a character device or a pipe."""
+    if path.is_symlink() and not path.exists():
+        raise InputError(
+            f"{path} is a link to {path.readlink()}, which does not exist; remove the link or name another file."
+        )
+    if not path.exists():
         return False
-    if stat.S_ISDIR(kind):
-        raise IsADirectoryError(errno.EISDIR, "is a folder; name a file to write to", str(path))
-    if stat.S_ISSOCK(kind) or stat.S_ISBLK(kind):
-        what = "socket" if stat.S_ISSOCK(kind) else "block device"
+    mode = path.stat().st_mode
+    others = {stat.S_IFDIR: "folder", stat.S_IFSOCK: "socket", stat.S_IFBLK: "block device"}
+    if what := others.get(stat.S_IFMT(mode)):
         raise InputError(f"{path} is a {what}; name a file to write to.")
-    return not stat.S_ISREG(kind)
+    return not stat.S_ISREG(mode)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -32,9 +32,9 @@ def test_the_file_has_the_usual_permissions(tmp_path):
 
 def test_a_folder_is_refused_by_its_name(tmp_path):
     (tmp_path / "out").mkdir()
-    with pytest.raises(IsADirectoryError) as raised, atomic_write(tmp_path / "out"):
+    with pytest.raises(InputError) as raised, atomic_write(tmp_path / "out"):
         pass
-    assert explain_mistake(raised.value) == f"{tmp_path / 'out'}: is a folder; name a file to write to"
+    assert str(raised.value) == f"{tmp_path / 'out'} is a folder; name a file to write to."
     assert os.listdir(tmp_path) == ["out"]
 
 
@@ -128,9 +128,8 @@ def test_a_link_to_nothing_is_refused_in_one_line(tmp_path):
 def test_links_in_a_circle_are_refused_in_one_line(tmp_path):
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
-    with pytest.raises(OSError, match="symbolic links") as raised, atomic_write(tmp_path / "a"):
+    with pytest.raises(InputError, match=f"{tmp_path / 'a'} is a link to b"), atomic_write(tmp_path / "a"):
         pass
-    assert explain_mistake(raised.value).startswith(f"{tmp_path / 'a'}: ")
 
 
 def test_a_read_only_folder_is_an_error_with_the_file_s_own_name(tmp_path, monkeypatch):

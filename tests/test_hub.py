@@ -40,7 +40,7 @@ def test_nothing_in_such_a_folder_is_unpickled(tmp_path):
     with pytest.raises(InputError, match="no checkpoint at"):
         HubFlow.from_pretrained(str(tmp_path))
     (tmp_path / FILE).write_bytes(pickle.dumps(Trap()))
-    with pytest.raises(InputError, match="not a safetensors file"):
+    with pytest.raises(InputError, match="not a readable .safetensors file"):
         HubFlow.from_pretrained(str(tmp_path))
 
 

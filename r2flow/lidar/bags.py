@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from r2flow.errors import InputError, naming, require
+from r2flow.files import telling
 from r2flow.lidar.scan_files.points import Points, check, column_points
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -41,22 +42,17 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points
         odd = next((file for file in folder.iterdir() if not (file.is_file() or file.is_dir())), None)
         check(odd is None, f"{odd} is not a regular file.")
     store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
-    try:
-        with (Reader1 if old else Reader2)(folder) as reader:
-            chosen = _choose(path, list(reader.connections), topic)
-            for connection, stamp, data in reader.messages(connections=chosen):
-                message = (store.deserialize_ros1 if old else store.deserialize_cdr)(data, connection.msgtype)
-                try:
-                    with naming(f"{path} at {stamp}"):
-                        points: Points | InputError = cloud_points(message)
-                except InputError as error:
-                    points = error
-                yield stamp, points
-    except InputError:
-        raise
-    except Exception as error:  # rosbags and the stores below it raise many kinds on damaged files
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        raise InputError(f"{path} is not a readable recording ({reason}). Is it damaged?") from None
+    # rosbags and the stores below it raise many kinds on damaged files
+    with telling(path), (Reader1 if old else Reader2)(folder) as reader:
+        chosen = _choose(path, list(reader.connections), topic)
+        for connection, stamp, data in reader.messages(connections=chosen):
+            message = (store.deserialize_ros1 if old else store.deserialize_cdr)(data, connection.msgtype)
+            try:
+                with naming(f"{path} at {stamp}"):
+                    points: Points | InputError = cloud_points(message)
+            except InputError as error:
+                points = error
+            yield stamp, points
 
 
 def _choose(path: Path, connections: list[Any], topic: str | None) -> list[Any]:

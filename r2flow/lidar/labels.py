@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.errors import InputError
-from r2flow.lidar.scan_files import Points, read_points
+from r2flow.files import reading
+from r2flow.lidar.scan_files import LARGEST_FILE, Points, read_points
+from r2flow.lidar.scan_files.points import check
 
 # SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue, people red, plants green,
 # buildings and fences brown; moving objects have the colour of static ones).
@@ -54,18 +55,15 @@ def read_labels(path: str | Path, scan: str | Path, points: Points | None = None
     path = Path(path)
     points = read_points(scan) if points is None else points
     rows = len(points.xyz) + points.dropped
-    if not path.is_file():
-        raise InputError(f"{path} is not a file of labels, or a link to a file that does not exist.")
-    size = path.stat().st_size  # checked first: a file of the wrong size is not loaded
-    if size != 4 * rows:
-        raise InputError(f"{path} holds {size} bytes, but {scan} has {rows} points, which need {4 * rows}: {LAYOUT}.")
-    try:
+    with reading(path, LARGEST_FILE, "file of labels", least=0):
+        size = path.stat().st_size  # checked first: a file of the wrong size is not loaded
+        check(
+            size == 4 * rows, f"it holds {size} bytes, but {scan} has {rows} points, which need {4 * rows}: {LAYOUT}."
+        )
         labels = np.fromfile(path, dtype="<u4")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
-    ids = (labels & 0xFFFF).astype(np.uint16)
-    # Big-endian integers and floats have their digits in the high bits: instances without a class.
-    instances = int(np.count_nonzero((ids == 0) & (labels > 0)))
-    if ids.max(initial=0) > LARGEST_CLASS or instances > rows / 2:
-        raise InputError(f"{path} does not look like {LAYOUT}. Is it damaged, big-endian or of floats?")
+        ids = (labels & 0xFFFF).astype(np.uint16)
+        # Big-endian integers and floats have their digits in the high bits: instances without a class.
+        instances = int(np.count_nonzero((ids == 0) & (labels > 0)))
+        whole = ids.max(initial=0) <= LARGEST_CLASS and instances <= rows / 2
+        check(whole, f"it does not look like {LAYOUT}. Is it damaged, big-endian or of floats?")
     return ids if points.kept is None else ids[points.kept]

@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 
 from r2flow.errors import InputError, naming
-from r2flow.files import atomic_write, refuse_unreadable
+from r2flow.files import atomic_write, reading
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import check_options
 
@@ -21,13 +21,8 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
         rows, columns: Image size; None: as in the file.
     """
     path = Path(path)
-    refuse_unreadable(path, LARGEST_FILE, "sensor's YAML")
-    try:
+    with reading(path, LARGEST_FILE, "sensor's YAML"):
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date of month 13
-        raise InputError(f"{path} is not readable YAML: {' '.join(str(error).split())[:160]}") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
     if not isinstance(options, dict) or not all(isinstance(key, str) for key in options):
         raise InputError(f"{path} is no sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
     options.pop("rays", None)  # the ray convention of a model, an option of training

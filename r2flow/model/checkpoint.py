@@ -17,13 +17,13 @@ from torch import Tensor, nn
 
 from r2flow.config import check_tree, learned
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, parse_json
+from r2flow.files import atomic_write, parse_json, telling
 from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
-from r2flow.model.published import FORMATS, format_of, garbled, inert, plain
+from r2flow.model.published import FORMATS, format_of, inert, plain
 from r2flow.model.sampling import sample
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
@@ -130,33 +130,21 @@ def find_checkpoint(path: str | Path) -> Path:
         return checkpoints[0]
     if name in MODELS and (path.is_dir() or not path.exists()):
         return find_model(name)
-    hint = f"Give a checkpoint file, a run folder or a model ({', '.join(MODELS)})."
+    problem = f"no checkpoint at {path}."
+    hint = f"Give a checkpoint file, a run folder or a model ({', '.join(MODELS)}).{did_you_mean(name, [*MODELS])}"
     if path.is_dir():
+        problem = f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt)."
         runs = sorted(str(folder.parent) for folder in path.glob(f"*/{FOLDER}") if checkpoints_of(folder.parent))
         hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
-        raise InputError(f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt). {hint}")
-    if path.exists():  # reading a pipe would block
-        raise InputError(f"{path} is not a regular file. {hint}")
-    raise InputError(f"no checkpoint at {path}. {hint}{did_you_mean(name, [*MODELS])}")
+    elif path.exists():  # reading a pipe would block
+        problem = f"{path} is not a regular file."
+    raise InputError(f"{problem} {hint}")
 
 
-def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """Read the dict in an r2flow checkpoint. Only tensors and plain values are read: a file cannot run code."""
-    content = _read(path, map_location)
-    if not isinstance(content, dict):
-        raise InputError(_not_a_checkpoint(path, Path(path).stat().st_size))
-    return content
-
-
-def _read(path: str | Path, map_location: Any = "cpu") -> Any:
-    """Content of a torch file, of r2flow or published; the latter may be a list."""
-    if not Path(path).is_file():  # reading a pipe would block
-        raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
-    try:
-        with open(path, "rb") as file:
-            return read_torch(file, path, map_location)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> Any:
+    """Read an r2flow checkpoint, a dict, or a published one. Only tensors and plain values: a file cannot run code."""
+    with telling(Path(path)), open(path, "rb") as file:
+        return read_torch(file, path, map_location)
 
 
 def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
@@ -181,12 +169,14 @@ def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         code = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
-        if code is None or not isinstance(error, pickle.UnpicklingError):
-            raise InputError(_not_a_checkpoint(name, file.seek(0, os.SEEK_END))) from None
-        raise InputError(
-            f"{name} is refused: it holds objects that would run code when loaded ({code[1]}), not only tensors and "
-            "plain values. Ask its author for a weights-only file."
-        ) from None
+        size = file.seek(0, os.SEEK_END)
+        problem = f"is not a checkpoint, or a damaged one ({size} bytes). Give a .ckpt of r2flow or a published file."
+        if code is not None and isinstance(error, pickle.UnpicklingError):
+            problem = (
+                f"is refused: it holds objects that would run code when loaded ({code[1]}), not only tensors and plain "
+                "values. Ask its author for a weights-only file."
+            )
+        raise InputError(f"{name} {problem}") from None
 
 
 def _refuse_unpacking(file: IO[bytes], name: object) -> None:
@@ -202,10 +192,6 @@ def _refuse_unpacking(file: IO[bytes], name: object) -> None:
     file.seek(0)
 
 
-def _not_a_checkpoint(name: object, size: int) -> str:
-    return f"{name} is not a checkpoint, or a damaged one ({size} bytes). Give a .ckpt of r2flow or a published file."
-
-
 def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averaged: bool = True) -> Checkpoint:
     """Load a generator from a checkpoint file (of r2flow or published), a run folder, or by a model's name.
 
@@ -216,17 +202,9 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         InputError: no usable checkpoint, or weights that do not fit the config.
     """
     path = find_checkpoint(path)
-    content = read_safetensors(path) if path.suffix == ".safetensors" else _read(path)
-    try:
+    with telling(path):
+        content = read_safetensors(path) if path.suffix == ".safetensors" else read_checkpoint(path)
         checkpoint = _built(content, path, averaged)
-    except InputError as error:
-        raise type(error)(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-        reason = (str(error).splitlines() or [""])[0][:160]
-        raise InputError(
-            f"{path} cannot be used: its content is not what r2flow writes ({type(error).__name__}: "
-            f"{reason}). Is it from another program, or damaged?"
-        ) from error
     return replace(checkpoint, generator=checkpoint.generator.to(device))
 
 
@@ -234,33 +212,27 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     """Build the generator of a file's content, on the CPU; see `load_checkpoint`."""
     published = format_of(content)
     if published is not None:
-        with garbled(path):
-            converted = published.read(content, path, averaged)
+        converted = published.read(content, path, averaged)
         config, weights, step, kind = converted.config, converted.weights, converted.step, "published"
         drawing: Mapping[str, Any] = {"sampler": converted.sampler}
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:
         state: Any = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
-        for key in ("data", "stage", "trainer"):
-            if not isinstance(config.get(key) or {}, Mapping):
-                raise InputError(f"its '{key}' is not a group of keys. Is it of another program?")
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         drawing = content
-    elif isinstance(content, dict):
-        systems = ", ".join(known.system for _, known in FORMATS.items())
-        raise InputError(
-            f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
-            f"(ours) nor a published layout ({systems}); found {', '.join(map(repr, list(content)[:6]))}."
-        )
     else:
-        raise InputError(_not_a_checkpoint(path, Path(path).stat().st_size))
+        systems = ", ".join(known.system for _, known in FORMATS.items())
+        found = ", ".join(map(repr, list(content)[:6])) if isinstance(content, dict) else type(content).__name__
+        raise InputError(
+            f"{path} is a torch file but is not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
+            f"(ours) nor a published layout ({systems}); found {found}."
+        )
     with made_with(config, str(path)):
         generator = build_generator(config)
-    check_weights(generator, weights, path)
-    generator.load_state_dict(weights)
-    if drawing.get("sampler"):
-        few = drawing.get("few")
-        with made_with(config, str(path)):
+        check_weights(generator, weights)
+        generator.load_state_dict(weights)
+        if drawing.get("sampler"):
+            few = drawing.get("few")
             generator.run_by(build_sampler(drawing["sampler"]), few and build_sampler(few), bool(drawing.get("fixed")))
     if published is not None and converted.finish is not None:
         converted.finish(generator, config)
@@ -284,21 +256,17 @@ def as_parent(config: Mapping[str, Any], path: Path, step: int, weights: str | N
 
 def read_safetensors(path: Path) -> dict[str, Any]:
     """Read weights and config of an r2flow `.safetensors`, in the layout of the other checkpoints."""
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        notes = parse_json(metadata[NOTES])
-        intact = notes.pop("digest", None) == _digest(notes, weights)
-        config, step = notes["config"], int(notes["step"])
-    except KeyError as error:
-        raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
-    except (SafetensorError, OSError, OverflowError, ValueError) as error:
-        raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
-    except (TypeError, AttributeError):
-        raise InputError(f"{path} holds weights, but its metadata is not r2flow's.") from None
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata() or {}
+        weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    if NOTES not in metadata:
+        raise InputError(f"{path} holds weights but no r2flow config (no '{NOTES}' in its metadata).")
+    notes = parse_json(metadata[NOTES])
+    intact = notes.pop("digest", None) == _digest(notes, weights)
+    config, step = notes["config"], int(notes["step"])
+    check_tree(config)
     if not intact:
         raise InputError(f"{path} is damaged: its checksum differs. Copy it again, or use another checkpoint.")
     state = {PREFIX + name: value for name, value in weights.items()}
@@ -335,7 +303,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
         file.write(data)
 
 
-def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
+def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
     """Check all names, shapes and types before loading."""
     expected = model.state_dict()
     missing, surplus = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
@@ -352,4 +320,4 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -
             or value.is_floating_point() != given.is_floating_point()
         ]
     if problems:
-        raise InputError(f"the weights in {path} do not fit its config: {problems[0]}.")
+        raise InputError(f"its weights do not fit its config: {problems[0]}.")

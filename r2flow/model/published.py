@@ -3,8 +3,7 @@
 An R2Flow file is a dict of cfg, weights, optimizer, lr_scheduler and num_images.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,17 +36,6 @@ class Format(NamedTuple):
     system: str  # name of the system
     holds: Callable[[Any], bool]  # whether the content of a torch file has this format
     read: Callable[[Any, Path, bool], Published]  # convert the content, with averaged or raw weights
-
-
-@contextmanager
-def garbled(path: Path) -> Iterator[None]:
-    """Raise `InputError` if the content of a published file lacks a part or has one of the wrong form."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(f"{path}: the published checkpoint lacks or garbles {error}.") from None
 
 
 def holds(content: Any) -> bool:

@@ -77,13 +77,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
         check_tree(config)
-        groups = [key for key in ("stage", "data", "trainer") if not isinstance(config.get(key, {}), Mapping)]
-        if groups:
-            raise ValueError(f"its {groups[0]} is not a group of keys")
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
-        reason = str(error).splitlines()[0] if isinstance(error, ValueError) else "it is not a config"
         raise InputError(
-            f"{path} is damaged ({reason}); remove it, and r2flow takes the config of the run's newest checkpoint."
+            f"{path} is damaged ({str(error).splitlines()[0]}); remove it, and r2flow takes the config of the run's "
+            "newest checkpoint."
         ) from None
     return dict(config)
 

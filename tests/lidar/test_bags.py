@@ -115,8 +115,8 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
     other.write_bytes(b"#ROSBAG V2.0\n" + bytes(400))
     for path, words in (
         (whole, "has no topic of point clouds"),
-        (cut, "not a readable recording"),
-        (other, "not a readable recording"),
+        (cut, "not a readable .mcap file"),
+        (other, "not a readable .bag file"),
         (tmp_path / "missing.mcap", "is not a .mcap"),
         (tmp_path, "no metadata.yaml"),
         (lone.parent, "ros2 bag reindex"),

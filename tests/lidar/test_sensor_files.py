@@ -45,10 +45,10 @@ def test_the_configs_of_built_in_sensors_are_sensor_files():
         ("", "is empty"),
         ("just text", "is no sensor"),
         ("1: 2", "is no sensor"),
-        ("name: [", "not readable YAML"),
-        ("name: !!python/object/apply:os.system [ls]", "not readable YAML"),
-        ("name: 2001-13-45", "not readable YAML"),
-        ("name: 0b_", "not readable YAML"),
+        ("name: [", "not a readable .yaml file"),
+        ("name: !!python/object/apply:os.system [ls]", "not a readable .yaml file"),
+        ("name: 2001-13-45", "not a readable .yaml file"),
+        ("name: 0b_", "not a readable .yaml file"),
         ("elevations: [2, 1]", "needs the option 'name'"),
         (MINE + "colums: 3", "Did you mean 'columns'?"),
         (MINE + "firing: [0, 1]", "firing must name"),
@@ -70,7 +70,7 @@ def test_files_that_are_not_yaml_are_refused(tmp_path):
     with pytest.raises(InputError, match="is a folder"):
         read_sensor(tmp_path)
     (tmp_path / "binary.yaml").write_bytes(bytes(range(128, 256)))
-    with pytest.raises(InputError, match="not readable YAML"):
+    with pytest.raises(InputError, match="not a readable .yaml file"):
         read_sensor(tmp_path / "binary.yaml")
     (tmp_path / "large.yaml").write_bytes(b"#" * (2 << 20))
     with pytest.raises(InputError, match="too many"):

@@ -385,12 +385,12 @@ def test_a_file_that_would_run_code_beside_its_config_is_refused(shared: Path, t
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda cfg: cfg["model"]["generator"].update(arch="stylegan"), "lacks or garbles 'stylegan'"),
-        (lambda cfg: cfg["dataset"].pop("min_depth"), "lacks or garbles 'min_depth'"),
+        (lambda cfg: cfg["model"]["generator"].update(arch="stylegan"), "KeyError: 'stylegan'"),
+        (lambda cfg: cfg["dataset"].pop("min_depth"), "KeyError: 'min_depth'"),
         (lambda cfg: cfg["dataset"].update(max_depth=1.0), "needs 0 < min_range < max_range"),
         (
             lambda cfg: cfg["model"]["generator"]["synthesis_kwargs"]["out_ch"][0].update(act="os.system"),
-            "lacks or garbles the activation 'os.system'",
+            "ValueError: the activation 'os.system'",
         ),
     ],
 )

@@ -333,8 +333,8 @@ CHANGES = {
     "found 90.0 and 80.0": lambda cfg: cfg["data"].update(min_depth=90.0),
     "its diffusion is of discrete steps": lambda cfg: cfg["diffusion"].update(timestep_type="discrete"),
     "it makes reflectance without range": lambda cfg: cfg["data"].update(train_depth=False),
-    "lacks or garbles 'data'": lambda cfg: cfg.pop("data"),
-    "lacks or garbles 'disparity'": lambda cfg: cfg["data"].update(depth_format="disparity"),
+    "KeyError: 'data'": lambda cfg: cfg.pop("data"),
+    "KeyError: 'disparity'": lambda cfg: cfg["data"].update(depth_format="disparity"),
     "no backbone for the published architecture 'refinenet'": lambda cfg: cfg["model"].update(architecture="refinenet"),
     "no log-SNR schedule named 'sigmoid'": lambda cfg: cfg["diffusion"].update(noise_schedule="sigmoid"),
 }

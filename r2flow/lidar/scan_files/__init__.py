@@ -4,14 +4,13 @@ points = read_points("000000.bin")
 write_points("000000.ply", points.xyz, points.reflectance)
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from r2flow.errors import InputError, naming, note_odd
-from r2flow.files import atomic_write, refuse_unreadable
+from r2flow.errors import InputError, note_odd
+from r2flow.files import atomic_write, reading
 from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
 from r2flow.lidar.scan_files.points import NoPointsError, Points, check, check_columns, column_points
 from r2flow.lidar.scan_files.tables import (
@@ -95,15 +94,13 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     path = Path(path)
     check_columns(columns)
     ending = _ending(path)
-    with _door(path):
-        if ending in (".bin", ".pcd.bin") and path.is_file() and path.stat().st_size == 0:
-            raise NoPointsError("it is empty (0 bytes); fetch or write it again.")
-        refuse_unreadable(path, LARGEST_FILE, "scan file")
+    raw = ending in (".bin", ".pcd.bin")
+    with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
         names, arrays = _READERS[ending](path, columns)
         check(names is None or columns is None, "it names its columns: leave --columns (data.reading.columns) out.")
         if names is None and columns is None and ending == ".pcd.bin":
             columns = ("x", "y", "z", "intensity", "ring")
-        return column_points(names or usual_names(len(arrays), columns), arrays, ending in (".bin", ".pcd.bin"))
+        return column_points(names or usual_names(len(arrays), columns), arrays, raw)
 
 
 def read_range_image(path: str | Path) -> np.ndarray | None:
@@ -135,30 +132,8 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
 def read_numbers(path: str | Path) -> np.ndarray:
     """The array of numbers in a .npy, of any shape and type, read without unpickling."""
     path = Path(path)
-    with _door(path):
-        refuse_unreadable(path, LARGEST_FILE, ".npy file")
-        with path.open("rb") as file:
-            return read_array(file, path.stat().st_size)
-
-
-@contextmanager
-def _door(path: Path) -> Iterator[None]:
-    """Turn every error of a reader into an InputError of one line with the file's name."""
-    try:
-        yield
-    except InputError as error:
-        if str(path) in str(error):
-            raise
-        with naming(path):
-            raise
-    except OSError as error:
-        reason = " ".join(str(error.strerror or error).split())  # pyarrow's messages have several lines
-        raise InputError(f"{path} cannot be read: {reason}.") from None
-    except BaseException as error:  # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # Rust decoders
-            raise
-        reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
-        raise InputError(f"{path} is not a readable {path.suffix} file ({reason}). Is it damaged?") from None
+    with reading(path, LARGEST_FILE, ".npy file"), path.open("rb") as file:
+        return read_array(file, path.stat().st_size)
 
 
 def write_points(
@@ -175,26 +150,21 @@ def write_points(
     """
     path = Path(path)
     ending = path.suffix.lower()
-    if ending not in WRITTEN or scan_ending(path.name) != ending:
-        raise InputError(f"{path}: scans are written as {', '.join(WRITTEN)}.")
-    if ending == ".bin" and reflectance is None:
-        raise InputError(f"{path}: KITTI's .bin needs a reflectance; give one, or choose .ply, .pcd or .npy.")
+    if ending not in WRITTEN or scan_ending(path.name) != ending or (ending == ".bin" and reflectance is None):
+        raise InputError(f"{path}: scans are written as {', '.join(WRITTEN)}, and as .bin only with a reflectance.")
     assert ring is None or ending == ".ply"
     columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "intensity": reflectance, "ring": ring}
     columns = {name: column for name, column in columns.items() if column is not None}
     with np.errstate(over="ignore"):  # float32 overflow is infinite
         table = np.column_stack([column for column in columns.values() if column is not None]).astype("<f4")
     assert np.isfinite(table).all(), "a coordinate or reflectance is NaN or infinite"
-    try:
-        with atomic_write(path) as file:
-            if ending == ".npy":
-                np.save(file, table)
-            elif ending == ".bin":
-                file.write(table.tobytes())
-            else:
-                {".pcd": write_pcd, ".ply": write_ply}[ending](file, table, tuple(columns))
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from None
+    with atomic_write(path) as file:
+        if ending == ".npy":
+            np.save(file, table)
+        elif ending == ".bin":
+            file.write(table.tobytes())
+        else:
+            {".pcd": write_pcd, ".ply": write_ply}[ending](file, table, tuple(columns))
 
 
 def scan_ending(name: str) -> str:
@@ -206,7 +176,6 @@ def _ending(path: Path) -> str:
     name = path.name.lower()
     if ending := scan_ending(name):
         return ending
-    for other, advice in ELSEWHERE.items():
-        if name.endswith(other):
-            raise InputError(f"{path} {advice.format(path=path)}.")
-    raise InputError(f"{path} has no ending of a scan file; known: {', '.join(SCAN_ENDINGS)}. Convert or rename it.")
+    unknown = f"has no ending of a scan file; known: {', '.join(SCAN_ENDINGS)}. Convert or rename it"
+    advice = next((advice for other, advice in ELSEWHERE.items() if name.endswith(other)), unknown)
+    raise InputError(f"{path} {advice.format(path=path)}.")

@@ -54,7 +54,7 @@ class Points:
 
 
 def check(holds: object, message: str) -> None:
-    """Raise an InputError unless a condition holds; `_door` adds the file's name."""
+    """Raise an InputError unless a condition holds; `r2flow.files.reading` adds the file's name."""
     if not holds:
         raise InputError(message)
 
