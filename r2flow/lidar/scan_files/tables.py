@@ -22,7 +22,7 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> Table:
     """Rows of little-endian float32: 4 of KITTI, 5 of nuScenes, or as many as `columns`."""
     content = path.read_bytes()
     head = content[:64]
-    text = head and all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head) or head.startswith(b"\x93NUMPY")
+    text = (head and all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head)) or head.startswith(b"\x93NUMPY")
     check(not text, f"it is not rows of float32: it begins with {head[:16]!r}, as text or another format.")
     usual = 5 if path.name.lower().endswith(".pcd.bin") else 4
     width = usual if columns is None else len(columns)
