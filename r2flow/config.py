@@ -143,9 +143,17 @@ def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return fixed
 
 
+def override(key: str, value: Any) -> str:
+    """An override KEY=VALUE in Hydra's grammar."""
+    if isinstance(value, list | tuple):
+        return f"{key}=[{','.join(override('', item)[1:] for item in value)}]"
+    if value is None or isinstance(value, bool):
+        return f"{key}={json.dumps(value)}"
+    if isinstance(value, str) and not value.replace("_", "").replace("-", "").isalnum():
+        value = "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value) + "'"
+    return f"{key}={value}"
+
+
 def as_override(key: str, path: str | Path) -> str:
-    """KEY=PATH quoted for a shell and for Hydra's grammar, in which a space or = needs quotes."""
-    text = str(path)
-    if not re.fullmatch(r"[\w./~-]+", text):
-        text = '"' + re.sub(r'(\\*)"', r'\1\1\\"', text) + '"'
-    return shlex.quote(f"{key}={text}")
+    """KEY=PATH as a shell and then Hydra's grammar read it back."""
+    return shlex.quote(f"{key}={path}" if re.fullmatch(r"[\w./~-]+", str(path)) else override(key, str(path)))

@@ -118,7 +118,18 @@ def test_the_groups_of_conf_are_groups_of_the_default_config(config):
 
 @pytest.mark.parametrize(
     "path",
-    ["runs/rf1", "runs/sweep/seed=1-5b990e", "my runs/a", "~/it's", 'a "b" c', "a\\b=c", "über,1", "a{b}[c]", "${x}"],
+    [
+        "runs/rf1",
+        "runs/sweep/seed=1-5b990e",
+        "my runs/a",
+        "~/it's",
+        'a "b" c',
+        "a\\b=c",
+        "über,1",
+        "a{b}[c]",
+        "${x}",
+        "a b\\",
+    ],
 )
 def test_an_override_that_is_printed_is_read_back(path: str):
     (text,) = shlex.split(as_override("stage.init", path))

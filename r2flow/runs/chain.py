@@ -12,11 +12,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from r2flow.config import flatten, key_of, rule
+from r2flow.config import flatten, key_of, override, rule
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, read_json
 from r2flow.model.checkpoint import checkpoints_of, step_of
-from r2flow.runs.composing import override
 from r2flow.runs.folder import read_config
 from r2flow.signals import LATER, code_of, listening
 

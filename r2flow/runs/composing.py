@@ -1,6 +1,5 @@
 """Composition of configs: Hydra on `conf/`, choices of registries and plug-ins, one-line error messages."""
 
-import json
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +19,7 @@ from hydra.core.override_parser.types import OverrideType, Sweep
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
+from r2flow.config import flatten
 from r2flow.errors import InputError
 from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
 
@@ -230,30 +230,10 @@ def explain(error: Exception) -> str:
     return " ".join(lines[:2])
 
 
-def override(key: str, value: Any) -> str:
-    """An override KEY=VALUE in Hydra's grammar."""
-    if isinstance(value, list | tuple):
-        return f"{key}=[{','.join(override('', item)[1:] for item in value)}]"
-    if value is None or isinstance(value, bool):
-        return f"{key}={json.dumps(value)}"
-    if isinstance(value, str) and not value.replace("_", "").replace("-", "").isalnum():
-        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
-        return f"{key}='{escaped}'"
-    return f"{key}={value}"
-
-
 def known_keys() -> list[str]:
     """All keys and groups of the default config."""
     with _hydra():
-        composed = hydra.compose("train")
-    keys: list[str] = []
-
-    def walk(node: DictConfig, prefix: str) -> None:
-        for key in map(str, node):
-            keys.append(prefix + key)
-            value = node._get_node(key)
-            if isinstance(value, DictConfig) and not value._is_none():
-                walk(value, f"{prefix}{key}.")
-
-    walk(composed, "")
-    return keys
+        settings = OmegaConf.to_container(hydra.compose("train"), resolve=False)
+    assert isinstance(settings, dict)
+    leaves = (key.split(".") for key, _ in flatten({str(key): value for key, value in settings.items()}))
+    return list(dict.fromkeys(".".join(leaf[: n + 1]) for leaf in leaves for n in range(len(leaf))))

@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from r2flow import __version__
-from r2flow.config import key_of
+from r2flow.config import key_of, override
 from r2flow.errors import InputError, explain_mistake, one_line, open_streams, tell_odd
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.runs.composing import (
@@ -36,7 +36,6 @@ from r2flow.runs.composing import (
     check_keys,
     compose,
     explain,
-    override,
     plain,
 )
 from r2flow.signals import LATER, Stopped, listening, stop_at_once

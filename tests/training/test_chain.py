@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from r2flow.config import override
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
 from r2flow.models import find_model
 from r2flow.runs import launch
 from r2flow.runs.chain import Link, is_finished, links_of
-from r2flow.runs.composing import compose, override
+from r2flow.runs.composing import compose
 from r2flow.training import build
 from tests.training.conftest import (
     TINY,
