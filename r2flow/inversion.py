@@ -126,13 +126,11 @@ def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     """
     u, v = x.double().flatten(), y.double().flatten()
     lengths = torch.linalg.vector_norm(u), torch.linalg.vector_norm(v)
-    if min(lengths) == 0:
-        raise InputError("slerp needs two directions, and one of its ends is zero.")
+    assert min(lengths) > 0, "an end of slerp is zero"
     u, v = u / lengths[0], v / lengths[1]
     # arccos of the inner product would lose half the digits of a small angle.
     angle = 2 * torch.atan2(torch.linalg.vector_norm(u - v), torch.linalg.vector_norm(u + v))
-    if math.pi - angle < 1e-6:
-        raise InputError("slerp has no shortest way between opposite ends.")
+    assert math.pi - angle > 1e-6, "opposite ends have no shortest way"
     w = weights.double()
     near = angle < 1e-9
     of_x = 1 - w if near else ((1 - w) * angle).sin() / angle.sin()

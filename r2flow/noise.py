@@ -8,7 +8,7 @@ samplers also count their steps (`Draws`).
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import index as index_of
+from numbers import Integral
 
 import numpy as np
 import torch
@@ -37,14 +37,10 @@ def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.G
     """
     assert purpose in PURPOSES, purpose
     assert index >= 0 <= step, (index, step)
-    try:
-        seed = index_of(seed)
-    except TypeError:
-        raise InputError(f"a seed must be a whole number, found {seed!r}.") from None
-    if not 0 <= seed < 2**64:
-        raise InputError(f"a seed must lie in [0, 2^64), found {seed}.")
-    # Philox4x64 counts blocks of four numbers in the low words of a 256-bit counter: with index and step in the two
-    # highest words, each pair has 2^128 blocks.
+    if not (isinstance(seed, Integral) and 0 <= seed < 2**64):
+        raise InputError(f"a seed must be a whole number in [0, 2^64), found {seed!r}.")
+    # Philox4x64 has a 128-bit key and a 256-bit counter that counts blocks of four draws in its low
+    # words: index and step go into the two highest words, which leaves 2^128 blocks to each pair.
     key = np.array([seed, zlib.crc32(purpose.encode())], dtype=np.uint64)
     counter = np.array([0, 0, step, index], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=counter))

@@ -18,7 +18,6 @@ from typing import Any
 
 from r2flow.errors import InputError
 from r2flow.registry import Registry, UnknownName
-from r2flow.signals import Stopped
 
 GROUP = "r2flow.plugins"
 
@@ -49,9 +48,7 @@ def load_plugins(names: Sequence[str]) -> None:
             continue
         try:
             file = _import(name)
-        except (KeyboardInterrupt, Stopped):
-            raise
-        except BaseException as error:  # modules may raise any exception, also SystemExit
+        except (Exception, SystemExit) as error:  # modules may raise any exception
             message = " ".join(str(error).split()) or "no message"
             raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {message}") from None
         _loaded.update({_identity(name), file})
@@ -76,17 +73,11 @@ def _import(name: str) -> str:
             raise ImportError("it is a folder without an __init__.py; to name a file, end it in .py")
         return _identity(file)
     path = _identity(name)
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path} is not a file")
     module_name = f"r2flow_plugin_{Path(path).stem}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None and spec.loader is not None  # noqa: PT018
     sys.modules[module_name] = module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[module_name]
-        raise
+    spec.loader.exec_module(module)
     return path
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import importlib
 import inspect
-import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
@@ -14,6 +14,7 @@ from r2flow.errors import InputError
 T = TypeVar("T")
 
 MISSING = "???"  # OmegaConf's mandatory value
+LARGEST = sys.float_info.max  # whole numbers can be larger
 
 
 class Bound(NamedTuple):
@@ -108,9 +109,7 @@ class Registry(Generic[T]):
             raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {names}.")
         chosen = dict(options)
         name = chosen.pop("name")
-        constructor = self[name]
-        if not callable(constructor):
-            raise TypeError(f"{self.kind} {name!r} is a value, not a constructor")
+        constructor: Any = self[name]
         check_options(f"{self.kind} '{name}'", constructor, chosen, given=len(args))
         return constructor(*args, **chosen)
 
@@ -129,17 +128,20 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
     parameters = _parameters(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
-    keywords = _by_keyword(parameters[given:])
+    if problem := next(_problems(_by_keyword(parameters[given:]), options), None):
+        raise InputError(f"{what}{problem}")
+
+
+def _problems(known: Mapping[str, inspect.Parameter], options: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with options: unknown, of a value that the annotation does not allow, or missing."""
     for key, value in options.items():
-        if key not in keywords:
-            hint = did_you_mean(key, keywords)
-            raise InputError(f"{what} has no option {key!r}; it knows: {', '.join(keywords) or 'none'}.{hint}")
-        wanted = _wanted(keywords[key].annotation)
-        if wanted and not any(fits(value) for _, fits in wanted):
-            raise InputError(f"{what}: {key} must be {' or '.join(word for word, _ in wanted)}, found {value!r}.")
-    for key, parameter in keywords.items():
-        if parameter.default is parameter.empty and key not in options:
-            raise InputError(f"{what} needs the option {key!r}.")
+        if key not in known:
+            yield f" has no option {key!r}; it knows: {', '.join(known) or 'none'}.{did_you_mean(key, known)}"
+        elif (wanted := _wanted(known[key].annotation)) and not any(fits(value) for _, fits in wanted):
+            yield f": {key} must be {' or '.join(word for word, _ in wanted)}, found {value!r}."
+    yield from (
+        f" needs the option {key!r}." for key, p in known.items() if p.default is p.empty and key not in options
+    )
 
 
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
@@ -180,7 +182,7 @@ LIST: Check = ("a list", lambda v: isinstance(v, list | tuple))
 PLAIN: dict[Any, Check] = {
     bool: ("true or false", lambda v: isinstance(v, bool)),
     int: ("a whole number", lambda v: isinstance(v, int) and not isinstance(v, bool)),
-    float: ("a finite number", lambda v: isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < math.inf),
+    float: ("a finite number", lambda v: isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= LARGEST),
     str: ("a word", lambda v: isinstance(v, str)),
     NoneType: ("null", lambda v: v is None),
     list: LIST,

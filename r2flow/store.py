@@ -15,7 +15,6 @@ import json
 import logging
 import math
 import multiprocessing
-import re
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -86,16 +85,13 @@ class Store:
 
     def begin(self, **notes: Any) -> None:
         """Write the manifest if it is missing: the recipe and `notes`."""
-        try:
-            if not self.check():
-                self.write_manifest(**notes)
-                self.check()  # another process may have taken the folder in between
-            for leftover in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):  # of killed writers
-                with suppress(FileNotFoundError):
-                    if time.time() - leftover.stat().st_mtime > STALE:
-                        leftover.unlink()
-        except PermissionError:
-            raise InputError(f"{self.folder} cannot be written to; give another by {self.option}.") from None
+        if not self.check():
+            self.write_manifest(**notes)
+            self.check()  # another process may have taken the folder in between
+        for leftover in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):  # of killed writers
+            with suppress(FileNotFoundError):
+                if time.time() - leftover.stat().st_mtime > STALE:
+                    leftover.unlink()
 
     def write_manifest(self, **notes: Any) -> None:
         """Write or overwrite the manifest: the recipe and `notes`."""
@@ -211,8 +207,8 @@ class Store:
             else:
                 time.sleep(PATIENCE)
             if waiting and time.monotonic() - since > QUIET:
-                lock, since = self._lock(waiting[0]), math.inf  # log once
-                log.warning("%s: waiting for %s, which makes it", self.files(waiting[0])[0], _holder(lock))
+                since = math.inf  # log once
+                log.warning("waiting for another process, which makes %s", self.files(waiting[0])[0])
             left = waiting
 
     def _attempts(self, items: list[int], work: Callable[[int], None], workers: int) -> Iterator[tuple[int, bool]]:
@@ -284,15 +280,6 @@ def _begin_worker(store: Store, work: Callable[[int], None]) -> None:
 def _attempt(item: int) -> bool:
     store, work = _job
     return store.attempt(item, work)
-
-
-def _holder(lock: Path) -> str:
-    """Name the process that holds a lock, by its PID on Linux."""
-    with suppress(OSError):
-        locks, inode = Path("/proc/locks").read_text(), lock.stat().st_ino
-        if match := re.search(rf" (\d+) \S+:{inode} ", locks):
-            return f"process {match[1]}"
-    return f"the process that holds {lock}"
 
 
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:

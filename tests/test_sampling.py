@@ -184,9 +184,9 @@ def test_slerp_between_nearly_parallel_ends_is_the_straight_mean(angle):
 
 
 def test_slerp_refuses_ends_without_a_way():
-    with pytest.raises(InputError, match="opposite"):
+    with pytest.raises(AssertionError, match="opposite"):
         slerp(torch.ones(4), -torch.ones(4), torch.tensor([0.5]))
-    with pytest.raises(InputError, match="is zero"):
+    with pytest.raises(AssertionError, match="is zero"):
         slerp(torch.ones(4), torch.zeros(4), torch.tensor([0.5]))
 
 
@@ -310,7 +310,7 @@ def test_one_channel_is_that_of_both():
     (ranges,) = sample(alone, 1, steps=2, channels="range")
     assert ranges.images.shape == (1, 1, 8, 64)
     assert alone.model.in_channels == 1  # it never computes any reflectance
-    with pytest.raises(InputError, match="range alone"):
+    with pytest.raises(InputError, match="one of both, range,"):
         next(sample(alone, 1, channels="reflectance"))
     with pytest.raises(InputError, match="found 'depth'"):
         next(sample(checkpoint, 1, channels="depth"))
@@ -363,13 +363,13 @@ def test_settings_may_be_numpy_s_and_torch_s():
 
 @pytest.mark.parametrize("seed", [1.9, 1.0, "1", math.nan])
 def test_a_seed_is_a_whole_number(seed):
-    with pytest.raises(InputError, match="a seed must be a whole number, found"):
+    with pytest.raises(InputError, match="a seed must be a whole number in"):
         flow().sample(1, seed, steps=1)
 
 
 def test_seeds_of_numpy_are_those_of_python():
     assert torch.equal(flow().sample(1, np.uint8(3), steps=1), flow().sample(1, 3, steps=1))
-    with pytest.raises(InputError, match=r"a seed must lie in \[0, 2\^64\), found -1"):
+    with pytest.raises(InputError, match=r"a seed must be a whole number in \[0, 2\^64\), found -1"):
         flow().sample(1, -1, steps=1)
 
 

@@ -105,14 +105,11 @@ def region(
 
 def _columns(width: int, sector: tuple[float, float]) -> tuple[int, int]:
     begin, end = sector
-    if not all(math.isfinite(a) and abs(a) <= 360 for a in sector):
-        raise InputError(f"a sector needs two azimuths in degrees within -360 to 360, found {begin:g},{end:g}.")
-    if begin == end:
-        raise InputError(f"the sector {begin:g},{end:g} is empty; -180,180 is the full turn.")
     turn = 360.0 if end - begin >= 360 else (end - begin) % 360 or 360.0
-    if turn * width < 360 * (1 - 1e-9):
+    if begin == end or max(abs(begin), abs(end)) > 360 or not turn * width >= 360 * (1 - 1e-9):
         raise InputError(
-            f"the sector {begin:.15g},{end:.15g} is narrower than a column, {360 / width:g} degrees; make it wider."
+            f"the sector {begin:.15g},{end:.15g} is narrower than a column, {360 / width:g} degrees, or not "
+            "within -360 to 360 degrees; -180,180 is the full turn."
         )
     fuzz = 1e-9 * width  # rounding must not add a pixel if the sector ends between two
     left = math.floor((180 - (begin + turn)) / 360 * width + fuzz)

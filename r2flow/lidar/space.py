@@ -37,10 +37,9 @@ class ModelSpace:
 
     def check_channels(self, channels: str) -> None:
         """Refuse channels that images of this space do not have."""
-        if channels not in CHANNELS:
-            raise InputError(f"channels must be {', '.join(CHANNELS[:-1])} or {CHANNELS[-1]}, found {channels!r}.")
-        if channels == "reflectance" and not self.encoding.reflectance:
-            raise InputError("this model was trained on range alone and has no reflectance.")
+        own = CHANNELS if self.encoding.reflectance else CHANNELS[:2]
+        if channels not in own:
+            raise InputError(f"channels must be one of {', '.join(own)}, which this model has, found {channels!r}.")
 
     def decode(self, x: Tensor, channels: str = "both") -> Tensor:
         """Decode model space, (B, C, h, w), to metres and reflectance, (B, 2 or 1, h, w).
@@ -79,9 +78,6 @@ class ModelSpace:
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:
     """The model space of a config with the keys `sensor` and `encoding`."""
-    for key in ("sensor", "encoding"):
-        if key not in config:
-            raise InputError(f"the config has no '{key}'.")
     options = dict(config["sensor"])
     convention: Convention = options.pop("rays", "centre")
     check_options("sensor", build_sensor, options)

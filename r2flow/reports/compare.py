@@ -86,7 +86,7 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     runs = []
     for path, label in zip(folders, labels(folders), strict=True):
         config = read_config(path) or {}
-        if not {"stage", "backbone", "data"} <= config.keys():
+        if not {"stage", "backbone", "data", "sensor", "encoding"} <= config.keys():
             raise InputError(f"{path / CONFIG} is not the config of a run.")
         architecture = json.dumps([config.get(key) for key in ("sensor", "encoding", "backbone")], sort_keys=True)
         if architecture not in costs:

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 import r2flow
-from r2flow.errors import InputError, explain_mistake, printable
+from r2flow.errors import InputError, printable
 from r2flow.files import atomic_write
 from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row
@@ -92,10 +92,7 @@ def write_json(page: Page, path: Path) -> None:
 def prepare_folder(out: str | Path) -> Path:
     """Create the folder, to fail before measuring if it is not writable."""
     out = Path(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(explain_mistake(error)) from None
+    out.mkdir(parents=True, exist_ok=True)
     if not os.access(out, os.W_OK):
         raise InputError(f"{out} cannot be written to; give another --out.")
     return out

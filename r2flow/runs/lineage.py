@@ -68,12 +68,10 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     """
     config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     if parent is None:
-        if _on_pairs(config):
-            stage = config["stage"]["name"]
-            what = f"stage={stage} starts from" if STAGES[stage].needs_pairs else "data=pairs are drawn by"
-            raise InputError(f"{what} a trained flow: give stage.init=RUN.")
-        if STAGES[config["stage"]["name"]].needs_parent:
-            raise InputError(f"stage={config['stage']['name']} starts from another run: give stage.init=RUN.")
+        stage = config["stage"]["name"]
+        if _on_pairs(config) or STAGES[stage].needs_parent:
+            what = f"stage={stage} starts from" if STAGES[stage].needs_parent else "data=pairs are drawn by"
+            raise InputError(f"{what} a trained run: give stage.init=RUN.")
         config["generator"] = generator_of(config, parent)
         return _with_data(config)
     keys = [key_of(text) for text in asked]

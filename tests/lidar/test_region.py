@@ -63,7 +63,7 @@ def test_the_whole_image_keeps_its_order():
 @pytest.mark.parametrize(
     ("sector", "rows", "words"),
     [
-        ((10, 10), None, "is empty"),
+        ((10, 10), None, "narrower than a column"),
         ((10, 10 + 1e-13), None, "10,10.0000000000001 is narrower than a column, 5 degrees"),
         ((0, -360 + 4.9), None, "narrower than a column"),
         ((math.nan, 10), None, "degrees"),

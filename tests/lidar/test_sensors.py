@@ -9,6 +9,7 @@ import yaml
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
+from r2flow.lidar.space import build_space
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "sensor"
 
@@ -122,16 +123,17 @@ def test_a_user_s_own_sensor_is_built():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"elevations": [2, "a"]}, "must be numbers"),
-        ({"elevations": [2, 10**400]}, "must be numbers"),
-        ({"elevations": [2, 1], "max_range": 10**400}, "must be numbers"),
+        ({"elevations": [2, "a"]}, "each a finite number"),
+        ({"elevations": [2, 10**400]}, "each a finite number"),
+        ({"elevations": [2, 1], "max_range": 10**400}, "max_range must be a finite number"),
         ({"elevations": [1, 2]}, "fall from the top"),
-        ({"elevations": [2, math.nan]}, "fall from the top"),
+        ({"elevations": [2, math.nan]}, "each a finite number"),
         ({"elevations": [90, 2]}, "within (-90, 90)"),
         ({"elevations": [2, 1], "firing": [0, 0]}, "firing must name"),
-        ({"elevations": [2, 1], "firing": [0, 1.0]}, "must be numbers"),
-        ({"elevations": [2, 1], "height": math.inf}, "height must be metres above the ground"),
-        ({"elevations": [2, 1], "max_range": math.nan}, "min_range < max_range"),
+        ({"elevations": [2, 1], "firing": [0, 1.0]}, "each a whole number"),
+        ({"elevations": [2, 1], "height": math.inf}, "height must be a finite number"),
+        ({"elevations": [2, 1], "height": 0}, "height must be metres above the ground"),
+        ({"elevations": [2, 1], "max_range": math.nan}, "max_range must be a finite number"),
         ({"name": "vlp16", "elevations": [2, 1]}, "another one"),
         ({"elevations": [1, 0], "min_range": 5, "max_range": 4}, "min_range < max_range"),
         ({"elevations": [1, 0], "columns": 0}, "columns"),
@@ -144,6 +146,6 @@ def test_a_user_s_own_sensor_is_built():
 )
 def test_an_impossible_sensor_of_a_user_is_refused(options, words):
     with pytest.raises(InputError) as error:
-        build_sensor(**{"name": "mine", **options})
+        build_space({"sensor": {"name": "mine", **options}, "encoding": {}})
     assert words in str(error.value)
     assert "\n" not in str(error.value)

@@ -203,7 +203,7 @@ def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path, 
     [
         ("a: 1", "config.yaml is not the config of a run"),
         ("stage: [unclosed", "config.yaml is damaged"),
-        ("{stage: {name: rectify}, backbone: {name: hdit}, data: {}}", "thing: the config has no 'sensor'"),
+        ("{stage: {name: rectify}, backbone: {name: hdit}, data: {}}", "config.yaml is not the config of a run"),
     ],
 )
 def test_a_folder_that_is_no_run_is_named(tmp_path, content, words):
