@@ -254,20 +254,16 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
 def check_trainer(options: Mapping[str, Any]) -> None:
     """Refuse options that Lightning would change silently or answer with a traceback."""
     check_options("trainer", TrainerRanges, {f.name: options.get(f.name) for f in fields(TrainerRanges)})
-    if str(options["precision"]) in ("16-true", "bf16-true"):
-        raise InputError(
-            f"trainer.precision={options['precision']} rounds the times of a flow to three digits; use "
-            f"{options['precision'].replace('true', 'mixed')}."
-        )
-    gpu = torch.cuda.is_available()
-    if options["accelerator"] in ("gpu", "cuda") and not gpu:
-        raise InputError("trainer.accelerator=gpu, but torch sees no GPU here; use trainer=cpu.")
-    on_cpu = options["accelerator"] == "cpu" or (options["accelerator"] == "auto" and not gpu)
-    if on_cpu and str(options["precision"]) in ("16-mixed", "16", "16-true"):
-        raise InputError(
-            f"trainer.precision={options['precision']} is not available on a CPU (Lightning would silently use "
-            "bfloat16); use bf16-mixed or 32-true."
-        )
+    precision, accelerator, gpu = str(options["precision"]), options["accelerator"], torch.cuda.is_available()
+    on_cpu = accelerator == "cpu" or (accelerator == "auto" and not gpu)
+    mixed, cpu_too = precision.replace("true", "mixed"), "bf16-mixed or 32-true"
+    for wrong, problem in (
+        (precision in ("16-true", "bf16-true"), f"{precision} rounds the times of a flow to three digits; use {mixed}"),
+        (accelerator in ("gpu", "cuda") and not gpu, "accelerator=gpu, but torch sees no GPU here; use trainer=cpu"),
+        (on_cpu and precision in ("16-mixed", "16"), f"{precision} becomes bfloat16 on a CPU; use {cpu_too}"),
+    ):
+        if wrong:
+            raise InputError(f"trainer: {problem}.")
 
 
 def fit(run: Run) -> Result:

@@ -18,7 +18,7 @@ LIMIT_TOLERANCE = 1e-5
 
 
 class RangeFormat:
-    """Maps ranges r in metres, (..., 1, H, W), to values y in [0, 1], (..., channels, H, W), and back."""
+    """Maps ranges r in metres, (..., 1, H, W), to values y in [0, 1], (..., channels, H, W), and back: r / r_max."""
 
     channels = 1
 
@@ -26,10 +26,10 @@ class RangeFormat:
         self.min_range, self.max_range = sensor.min_range, sensor.max_range
 
     def forward(self, r: Tensor) -> Tensor:
-        raise NotImplementedError
+        return r / self.max_range
 
     def inverse(self, y: Tensor) -> Tensor:
-        raise NotImplementedError
+        return y * self.max_range
 
 
 class LogScale(RangeFormat):
@@ -84,16 +84,6 @@ class InverseDepth(Inverse):
         return torch.where(inside, super().inverse(y), 0.0)
 
 
-class Metric(RangeFormat):
-    """r / r_max."""
-
-    def forward(self, r: Tensor) -> Tensor:
-        return r / self.max_range
-
-    def inverse(self, y: Tensor) -> Tensor:
-        return y * self.max_range
-
-
 class Cartesian(RangeFormat):
     """(x, y, z) / r_max, mapped from [-1, 1] to [0, 1]; a ray without return is at the origin."""
 
@@ -116,7 +106,7 @@ FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
     shifted_log=ShiftedLog,
     inverse=Inverse,
     inverse_depth=InverseDepth,
-    metric=Metric,
+    metric=RangeFormat,
     cartesian=Cartesian,
 )
 

@@ -261,14 +261,11 @@ def read_safetensors(path: Path) -> dict[str, Any]:
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata() or {}
         weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    if NOTES not in metadata:
-        raise InputError(f"{path} holds weights but no r2flow config (no '{NOTES}' in its metadata).")
-    notes = parse_json(metadata[NOTES])
-    intact = notes.pop("digest", None) == _digest(notes, weights)
+    notes = parse_json(metadata.get(NOTES, "{}"))
+    if notes.pop("digest", None) != _digest(notes, weights):
+        raise InputError(f"{path} is not of r2flow, or damaged: its checksum differs. Use another checkpoint.")
     config, step = notes["config"], int(notes["step"])
     check_tree(config)
-    if not intact:
-        raise InputError(f"{path} is damaged: its checksum differs. Copy it again, or use another checkpoint.")
     state = {PREFIX + name: value for name, value in weights.items()}
     drawing = {key: notes.get(key) for key in ("sampler", "few", "fixed")}
     return {"config": config, "global_step": step, "state_dict": state, **drawing}

@@ -56,14 +56,12 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     runs: list[Path] = []
     others: list[Path] = []
     for path in paths:
-        if not path.exists():
-            raise InputError(f"{path} does not exist.")
         inside = [run.parent for level in ("", "*/", "*/*/") for run in sorted(path.glob(f"{level}{CONFIG}"))]
         inside = [run for run in inside if not run.name.startswith(".")]
         runs += inside[:1] if path in inside else inside
         others += [] if inside else [path]
-    if others and not runs:
-        raise InputError(f"{others[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
+    if wrong := [path for path in others if not runs or not path.exists()]:
+        raise InputError(f"{wrong[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
     for path in others:
         if path.suffix not in (".yaml", ".log"):  # files of a sweep's folder
             log.warning("%s holds no run and is skipped.", path)

@@ -12,7 +12,6 @@ from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import Reading, read_labelled_scan
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, SimulatedScans, spread, warn_of_other_sensor
-from r2flow.errors import InputError
 from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import read_range_image
 
@@ -50,8 +49,6 @@ class View(NamedTuple):
 
 def scans_of(path: Path) -> list[Path]:
     """A scan file, or the scans of a folder."""
-    if not path.exists():
-        raise InputError(f"{path} does not exist.")
     if not path.is_dir():
         return [path]
     return [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]

@@ -55,10 +55,9 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
     links: list[Link] = []
     for name, difference in chain.items():
-        if not isinstance(difference, Mapping) or not isinstance(difference.get("stage") or {}, Mapping):
-            raise InputError(f"chain.{name} and its stage must be groups of keys; found {difference!r}.")
-        if not re.fullmatch(r"[\w-][\w.-]*", str(name)):
-            raise InputError(f"chain: a link is a folder, which cannot be called {name!r}.")
+        groups = isinstance(difference, Mapping) and isinstance(difference.get("stage") or {}, Mapping)
+        if not groups or not re.fullmatch(r"[\w-][\w.-]*", str(name)):
+            raise InputError(f"chain.{name}: a link has a folder's name and groups of keys; found {difference!r}.")
         settings = dict(difference)
         parent = settings.pop("init", None)
         overrides = [override(key, value) for key, value in flatten(settings) if (key, value) != ("experiment", None)]

@@ -2,12 +2,13 @@
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import hydra
 from hydra import initialize_config_dir
@@ -22,6 +23,8 @@ from omegaconf import DictConfig, OmegaConf
 from r2flow.config import flatten
 from r2flow.errors import InputError
 from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
+
+T = TypeVar("T")
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
@@ -47,12 +50,7 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
         [f"hydra.searchpath=[{','.join(f'file://{Path(folder).resolve()}' for folder in folders)}]"] if folders else []
     )
     with _hydra():
-        try:
-            config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
-        except MissingConfigException as error:
-            if not add_choice(error):
-                raise
-            config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
+        config = with_choices(partial(hydra.compose, "train", [*overrides, *search], return_hydra_config=True))
         HydraConfig.instance().set_config(config)
         return plain(config)
 
@@ -136,8 +134,18 @@ def add_choices(group: str) -> None:
         store.store(name, node, group=group)
 
 
-def add_choice(error: MissingConfigException) -> bool:
-    """Whether a choice that Hydra did not find is in a registry, such as a plug-in's; adds all registries' choices.
+def with_choices(compose: Callable[[], T]) -> T:
+    """The result of a composition; if it lacks a choice that a registry has, such as a plug-in's, of a second one."""
+    try:
+        return compose()
+    except MissingConfigException as error:
+        if not _add_choice(error):
+            raise
+        return compose()
+
+
+def _add_choice(error: MissingConfigException) -> bool:
+    """Whether a choice that Hydra did not find is in a registry; adds all registries' choices.
 
     A name that resembles a file's is not looked up if that would import torch. All groups get their choices, since the
     same command may name several.
@@ -184,19 +192,24 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
                 "=, as 'KEY=\"a value\"'."
             ) from None
         key, value = parsed.key_or_group, parsed.value()
-        if not key:
-            raise InputError(f"{text} names no key: give KEY=VALUE.")
-        if key == "hydra":
-            raise InputError(f"{text}: hydra has keys of its own, as hydra.sweep.dir=FOLDER.")
         names = value if isinstance(value, list) else [value]
-        if key in groups and (parsed.is_delete() or "" in names or not all(isinstance(name, CHOICE) for name in names)):
+        empty = parsed.is_delete() or "" in names or not all(isinstance(name, CHOICE) for name in names)
+        if not key:
+            problem = " names no key: give KEY=VALUE"
+        elif key == "hydra":
+            problem = ": hydra has keys of its own, as hydra.sweep.dir=FOLDER"
+        elif key in groups and empty:
             if key == "experiment" and (parsed.is_delete() or value is None):  # the default
                 continue
-            raise InputError(f"{text} leaves the run without its {key}: give one of {', '.join(choices(key))}.")
-        if parsed.is_delete() and key.partition(".")[0] not in MAY_GO:
-            raise InputError(f"{text}: every run has its {key}; give {key}=VALUE.")
-        named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
-        converted += [f"{key}=null", f"++{text}"] if named and parsed.type == OverrideType.CHANGE else [text]
+            problem = f" leaves the run without its {key}: give one of {', '.join(choices(key))}"
+        elif parsed.is_delete() and key.partition(".")[0] not in MAY_GO:
+            problem = f": every run has its {key}; give {key}=VALUE"
+        else:
+            named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
+            replaced = named and parsed.type == OverrideType.CHANGE
+            converted += [f"{key}=null", f"++{text}"] if replaced else [text]
+            continue
+        raise InputError(f"{text}{problem}.")
     if "size=small" in converted and not any(re.match(r"\+?experiment=[^\[]", text) for text in converted):
         raise InputError("size=small is a form of one experiment: give experiment=NAME, such as r2dm.")
     return converted

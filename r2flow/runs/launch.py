@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -30,13 +30,13 @@ from r2flow.plugins import load_plugins, take_plugins
 from r2flow.runs.composing import (
     CONF,
     REGISTRIES,
-    add_choice,
     add_choices,
     as_hydra_takes,
     check_keys,
     compose,
     explain,
     plain,
+    with_choices,
 )
 from r2flow.signals import LATER, Stopped, listening, stop_at_once
 
@@ -162,15 +162,13 @@ def _run_hydra(arguments: Sequence[str], job: Task) -> None:
     decorated = hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(task)
     resolver = functools.partial(job_folder, tuple(arguments))
     OmegaConf.register_new_resolver("job_folder", resolver, replace=True)
-    try:
+
+    def composed() -> None:
         sys.argv = [original[0], *arguments]
-        try:
-            decorated()
-        except MissingConfigException as error:
-            if not add_choice(error):
-                raise
-            sys.argv = [original[0], *arguments]
-            decorated()
+        decorated()
+
+    try:
+        with_choices(composed)
     finally:
         sys.argv = original
 
@@ -206,7 +204,7 @@ def _job(
     except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print more lines
         message = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
         print(f"error: {message}", file=sys.stderr)
-        raise SystemExit(2) from None
+        code = 2
     if code:
         raise SystemExit(code)
 

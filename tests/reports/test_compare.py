@@ -141,7 +141,7 @@ def test_a_sweep_s_files_and_folders_without_a_run_are_passed_over(tmp_path, cap
     assert find_runs(sorted(tmp_path.iterdir())) == [tmp_path / "a"]
     assert "logs holds no run" in caplog.text
     assert "multirun" not in caplog.text
-    with pytest.raises(InputError, match="none does not exist"):
+    with pytest.raises(InputError, match="none is not a run"):
         find_runs([tmp_path / "a", tmp_path / "none"])
     with pytest.raises(InputError, match="logs is not a run"):
         find_runs([tmp_path / "logs", tmp_path / "multirun.yaml"])
