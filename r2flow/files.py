@@ -21,11 +21,8 @@ from r2flow.errors import InputError, naming
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file that replaces `path` when the block ends without an error.
 
-    The file is synced before the rename and the folder after it, so that a reader finds the old or the complete new
-    file, even after a power cut. For a link, the target is replaced; devices and pipes are written to directly.
-
-    Raises:
-        InputError: `path` is a folder, a socket, a block device or a link to nothing.
+    It is flushed to the disk before the rename and the folder after it: a reader, or a power cut, finds the old file or
+    the whole new one. A link stays, and its target is replaced. A device or a pipe is written into.
     """
     path = Path(path)
     is_stream = _is_stream(path)

@@ -29,11 +29,7 @@ def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.G
         seed: Run seed, 0 <= seed < 2^64.
         purpose: One of `PURPOSES`.
         index: Number of the image, scene or epoch, 0 <= index < 2^64.
-        step: Step of a sampler, or part of a GAN's step, for the same index, 0 <= step < 2^64.
-
-    Raises:
-        InputError: the seed is not a whole number or outside its range.
-        OverflowError: an index or a step outside its range.
+        step: Step of what draws several times for one index, a sampler or a GAN's batch, 0 <= step < 2^64.
     """
     assert purpose in PURPOSES, purpose
     assert index >= 0 <= step, (index, step)

@@ -119,9 +119,6 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
 
     Args:
         given: Number of positional arguments passed in addition to the options.
-
-    Raises:
-        InputError: an unknown option, a missing option, or a value that the annotation does not allow.
     """
     if not isinstance(options, Mapping):
         raise InputError(f"{what} must be a group of keys, found {options!r}.")

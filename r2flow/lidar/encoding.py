@@ -156,9 +156,6 @@ class Encoding:
         """Map range in metres and reflectance in [0, 1], (..., 2 or 1, H, W), to (..., channels, H, W).
 
         A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`; nearly -1 under `shifted_log`).
-
-        Raises:
-            InputError: reflectance is a channel of the model, and the image has no reflectance.
         """
         r = image[..., :1, :, :]
         if self.limits == "open":

@@ -46,10 +46,6 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         chain: Config differences by name; `init` names the link that a link starts from.
         folder: The chain's folder; each link has a subfolder of its name.
         given: The user's command line. Its overrides follow the link's own, for every link that they concern.
-
-    Raises:
-        InputError: a link starts from one that does not come before it, `stage.init` is given for all links, or a link
-            names plug-ins, which only the command line may do.
     """
     if any(key_of(text) == "stage.init" for text in given):
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")

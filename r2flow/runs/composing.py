@@ -88,11 +88,7 @@ class Keys:
 
 
 def check_keys(config: Mapping[str, Any]) -> None:
-    """Check the top-level keys of a config.
-
-    Raises:
-        InputError: an unknown key, a missing key, or a value of the wrong type.
-    """
+    """Check the top-level keys of a config."""
     check_options("the config", Keys, config)
 
 
@@ -175,11 +171,7 @@ MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~
 
 
 def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
-    """Convert overrides for Hydra: `KEY={name: NAME, ...}` replaces the whole value, since NAME has its own options.
-
-    Raises:
-        InputError: a config group without a choice, or an override outside Hydra's grammar.
-    """
+    """Convert overrides for Hydra: `KEY={name: NAME, ...}` replaces the whole value, since NAME has its own options."""
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
     converted: list[str] = []
     parser = OverridesParser.create()

@@ -41,11 +41,7 @@ def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 @contextmanager
 def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
-    """Lock a run's folder for one process. The lock is released when its process ends, even if killed.
-
-    Raises:
-        InputError: another process holds the lock for more than `patience` seconds.
-    """
+    """Lock a run's folder for one process. The lock is released when its process ends, even if killed."""
     path, holder = Path(run, ".lock"), Path(run, ".lock.holder")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -62,11 +58,7 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
 
 
 def read_config(run: str | Path) -> dict[str, Any] | None:
-    """The config of a run folder, or None. If the file is missing, the config of the newest checkpoint.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The config of a run folder, or None. If the file is missing, the config of the newest checkpoint."""
     path = Path(run, CONFIG)
     stored = (content.get("config") for _, content in _whole(run))
     config = _read_yaml(path) if path.is_file() else next((kept for kept in stored if isinstance(kept, dict)), None)
@@ -95,9 +87,6 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
 
     Args:
         state: The stage's state_dict; checkpoints with other names or shapes are skipped.
-
-    Raises:
-        InputError: the folder holds a run of another config, or no checkpoint fits its config.
     """
     for leftover in Path(run, FOLDER).glob(".*.part"):  # of killed writers
         leftover.unlink(missing_ok=True)
@@ -125,11 +114,7 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
 
 
 def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
-    """Refuse a run folder of another config, ignoring keys that depend on the data or a trained parent.
-
-    Raises:
-        InputError: the folder holds a run of another config.
-    """
+    """Refuse a run folder of another config, ignoring keys that depend on the data or a trained parent."""
     old = read_config(run)
     if old is None or not checkpoints_of(run):
         return

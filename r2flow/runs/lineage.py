@@ -36,11 +36,7 @@ class Parent:
 
 
 def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
-    """The parent named by a config's `stage.init`, if any.
-
-    Raises:
-        InputError: it is missing, not finished, or not usable as a parent.
-    """
+    """The parent named by a config's `stage.init`, if any."""
     init = config["stage"].get("init")
     if init is None:
         return None
@@ -62,9 +58,6 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
 
     Args:
         asked: Overrides of the command line, as `backbone=hdit` or `backbone.depths=[1]`.
-
-    Raises:
-        InputError: the command line contradicts the parent, or a stage that needs a parent has none.
     """
     config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     if parent is None:
@@ -103,8 +96,7 @@ ABSENT = object()
 
 
 def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapping[str, Any], parent: Parent) -> Any:
-    """The parent's value of a key, or ours if the command line gives it and it may differ; refuses values that do not
-    fit the parent's weights."""
+    """The parent's value of a key, or ours if the command line gives it and it may differ."""
     group, may_differ = key.partition(".")[0], inherited(key, config) == "unless_given"
     if key == group and (ours is None or not isinstance(theirs, Mapping) or (may_differ and key in asked)):
         return ours if isinstance(theirs, Mapping) and may_differ and key in asked else theirs
@@ -180,11 +172,7 @@ def pairs_of(parent: Checkpoint | Parent, options: Mapping[str, Any], weights: s
 
 
 def check_finished(init: Path, parent: Checkpoint) -> None:
-    """Require that a run folder given as `init` is finished; a checkpoint file may be of any step.
-
-    Raises:
-        InputError: the run in the folder is not finished.
-    """
+    """Require that a run folder given as `init` is finished; a checkpoint file may be of any step."""
     wanted = parent.config.get("trainer", {}).get("max_steps", 0)
     if init.expanduser().is_dir() and name_of(parent.path) is None and parent.step < wanted:
         raise InputError(

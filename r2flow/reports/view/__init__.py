@@ -54,10 +54,7 @@ def page(
         labels: Semantic ids of each scan, (H, W) or (T, H, W), or None.
 
     Returns:
-        The page: about 50 kB, and 130 kB per image of 64 x 1024. Captions are escaped.
-
-    Raises:
-        InputError: no scan, or more than `MOST` pixels.
+        The page, about 50 kB and 130 kB for each image of 64 x 1024. Texts in it are never read as HTML.
     """
     stacks = [_frames_of(scan) for scan in images]
     count, pixels = sum(map(len, stacks)), sum(stack[:, 0].size for stack in stacks)
