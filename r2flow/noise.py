@@ -64,19 +64,12 @@ class Draws:
     purpose: str = "evaluation"
 
     def start(self, shape: tuple[int, ...]) -> Tensor:
-        """x_0 of each scan, (B, *shape) float32 on the CPU: `standard_normal` of the scans' numbers."""
-        return self._of_step(shape, 0)
+        """x_0 of each scan, (B, *shape) float32 on the CPU: the rows are `standard_normal` of the scans' numbers."""
+        return self.step(shape, 0)
 
     def step(self, shape: tuple[int, ...], j: int) -> Tensor:
-        """Noise of each scan in step j >= 1, (B, *shape) float32 on the CPU."""
-        assert j >= 1
-        return self._of_step(shape, j)
-
-    def _of_step(self, shape: tuple[int, ...], j: int) -> Tensor:
-        noise = torch.empty(len(self.numbers), *shape)
-        for row, number in zip(noise, self.numbers, strict=True):
-            row.copy_(standard_normal(shape, self.seed, self.purpose, number, j))
-        return noise
+        """Noise of each scan in step j, (B, *shape) float32 on the CPU; that of step 0 is the start's."""
+        return torch.stack([standard_normal(shape, self.seed, self.purpose, number, j) for number in self.numbers])
 
 
 def seed_torch(seed: int, purpose: str, index: int = 0) -> None:

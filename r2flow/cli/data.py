@@ -116,7 +116,7 @@ def sensor(
     from r2flow.lidar.sensors import SENSORS
     from r2flow.progress import track
     from r2flow.reports.tables import print_table
-    from r2flow.reports.views import scans_of
+    from r2flow.reports.view.panels import scans_of
 
     if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
         raise InputError(f"--out must be a .yaml file, as for --sensor; found {out}.")

@@ -19,8 +19,7 @@ from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, ch
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.reports.view.panels import Panel
-    from r2flow.reports.views import View
+    from r2flow.reports.view.panels import Panel, View
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +30,7 @@ MOST = 256  # largest number of each per page
 def views(scans: Sequence[str], how: ReadingOptions, most: int) -> "list[View]":
     """Load scans as views, at most `most` per folder."""
     from r2flow.data.opening import own_reading
-    from r2flow.reports.views import views_of
+    from r2flow.reports.view.panels import views_of
 
     loaded: list[View] = []
     for spec in scans:
