@@ -121,6 +121,18 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{key}", value
 
 
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
+    """Keys whose values differ between two configs, with a text of both values."""
+    before, now = dict(flatten(old)), dict(flatten(new))
+    keys = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
+    return {key: f"{key}={str(before.get(key))[:80]} there, {str(now.get(key))[:80]} here" for key in keys}
+
+
+def at_most_three(texts: Sequence[str]) -> str:
+    """The first of some texts, and how many more there are."""
+    return "; ".join(texts[:3]) + (f" (and {len(texts) - 3} more)" if len(texts) > 3 else "")
+
+
 def check_tree(config: Mapping[str, Any]) -> None:
     """Raise an error for what is no config: one that contains itself, as an anchor of YAML or a pickle can have it."""
     json.dumps(config, skipkeys=True, default=str)

@@ -29,6 +29,7 @@ from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from r2flow.config import at_most_three, differences
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, parse_json, read_json
 from r2flow.lidar.scan_files import FIRM_ENDINGS
@@ -70,10 +71,10 @@ class Store:
         """Whether the folder has a manifest; refuses a folder with another recipe or with scans."""
         if (self.folder / MANIFEST).is_file():
             recipe = read_manifest(self.folder, self.kind)["recipe"]
-            if other := difference(recipe, self.described):
+            if other := [*differences(recipe, self.described).values()]:
                 raise InputError(
-                    f"{self.folder} holds other {self.kind}: {other}. Give the same settings, or another folder by "
-                    f"{self.option}."
+                    f"{self.folder} holds other {self.kind}: {at_most_three(other)}. Give the same settings, or "
+                    f"another folder by {self.option}."
                 )
             return True
         scan = next((path for path in self.folder.glob("*") if path.name.endswith(FIRM_ENDINGS)), None)
@@ -218,10 +219,10 @@ class Store:
             return
         # Spawn, since torch's threads do not survive a fork.
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(workers, len(items)), context, _begin_worker, (self, work))
+        pool = ProcessPoolExecutor(min(workers, len(items)), context, _begin_worker)
         try:
             with out_of_reach():
-                futures = {pool.submit(_attempt, item): item for item in items}
+                futures = {pool.submit(self.attempt, item, work): item for item in items}
             for future in as_completed(futures):
                 yield futures[future], future.result()
         except BrokenProcessPool:
@@ -266,20 +267,10 @@ class FileStore(Store):
         return all(file.is_file() for file in self.files(item))
 
 
-_job: tuple[Store, Callable[[int], None]]  # store and work of a worker process
-
-
-def _begin_worker(store: Store, work: Callable[[int], None]) -> None:
+def _begin_worker() -> None:
     """Ignore Ctrl-C in a worker, and end it with the parent process."""
-    global _job
-    _job = (store, work)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
-
-
-def _attempt(item: int) -> bool:
-    store, work = _job
-    return store.attempt(item, work)
 
 
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
@@ -303,20 +294,6 @@ def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
 def checksum(content: Any) -> str:
     """SHA-256 of a JSON-serialisable value."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str | None:
-    """Describe the first setting that differs; None if all are equal."""
-    for key in {**there, **here}:
-        old, new = there.get(key), here.get(key)
-        if old == new:
-            continue
-        if isinstance(old, dict) and isinstance(new, dict):
-            return f"{key}: {difference(old, new)}"
-        if isinstance(old, list) and isinstance(new, list):
-            return f"{key} differ ({len(old)} values there, {len(new)} values here)"
-        return f"{key} is {old} there, {new} here"
-    return None
 
 
 def _digest(tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any]) -> str:

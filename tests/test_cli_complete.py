@@ -351,7 +351,7 @@ def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path): 
     asked = *COMPLETE, tmp_path / "one.bin", "-c", run, "--mask", tmp_path / "mask.npy", "--out", tmp_path / "out"
     assert r2flow(*asked)[0] == 0
     assert "1 were there already" in r2flow(*asked)[1]
-    assert "reflectance_scale is None there, 2.0 here" in r2flow(*asked, "--reflectance-scale", 2)[2]
+    assert "reflectance_scale=None there, 2.0 here" in r2flow(*asked, "--reflectance-scale", 2)[2]
     np.save(tmp_path / "mask.npy", ~mask)
     code, _, error = r2flow(*asked)
     assert code == 2

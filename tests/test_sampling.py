@@ -258,7 +258,7 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     (tmp_path / "000001.npy").unlink()
     assert write(5) == [0, 1, 4]
     assert {name: (tmp_path / name).read_bytes() for name in names()[:4]} == whole
-    with pytest.raises(InputError, match="holds other samples: seed is 0 there, 1 here"):
+    with pytest.raises(InputError, match="holds other samples: seed=0 there, 1 here"):
         write(2, seed=1)
     assert names() == [f"{number:06d}.npy" for number in range(5)]
     monkeypatch.setattr("r2flow.reports.outputs.draw", mock.Mock(side_effect=MemoryError))

@@ -20,13 +20,14 @@ from typing import Any
 import numpy as np
 from safetensors import safe_open
 
+from r2flow.config import at_most_three, differences
 from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.reading import Reading, lacks_reflectance, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_range_image
-from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, difference, read_manifest
+from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, read_manifest
 
 log = logging.getLogger(__name__)
 
@@ -188,12 +189,12 @@ def refuse_other_images(folder: Path, recipe: Mapping[str, Any], reading: Readin
     for fields in (recipe["reading"], reading.described()):
         sensor = {key: value for key, value in fields["sensor"].items() if key not in irrelevant}
         images.append({**sensor, "projection": fields["projection"], "convention": fields["convention"]})
-    if differing := difference(*images):
+    if differing := [*differences(*images).values()]:
         stored = Reading.of(recipe["reading"])
         raise InputError(
             f"{folder} was prepared for other images (sensor {stored.sensor.name}, "
             f"{stored.sensor.shape[0]}x{stored.sensor.shape[1]}, {stored.projection}, {stored.convention}): "
-            f"{differing}. Give the run the same, or prepare the scans for it."
+            f"{at_most_three(differing)}. Give the run the same, or prepare the scans for it."
         )
 
 

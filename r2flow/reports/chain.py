@@ -69,10 +69,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     print_table(rows, COLUMNS)
     before = [row for row in rows if row["flow"] == cells[0][0]][-1]
     ends = [f"{row['flow']} in {row['steps']} ({row['mean']:.3f})" for row in (before, rows[-1])]
-    learned = {
-        **flows[last].config,
-        "data": first.config.get("data", {}),
-    }  # the chain's scans are those of its first run
+    learned = flows[last].config | {"data": first.config.get("data", {})}  # the chain's scans are its first run's
     print(
         f"""
 pictures      {out / "chain.png"} (every generator, few and many steps), {out / "samples.png"} ({last})

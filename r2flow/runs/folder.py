@@ -12,7 +12,7 @@ import yaml
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from r2flow.config import check_tree, flatten, rule
+from r2flow.config import at_most_three, check_tree, differences, flatten, rule
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.model.checkpoint import FOLDER, checkpoints_of, read_checkpoint, step_of
@@ -20,13 +20,6 @@ from r2flow.model.checkpoint import FOLDER, checkpoints_of, read_checkpoint, ste
 log = logging.getLogger(__name__)
 
 CONFIG = "config.yaml"
-
-
-def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
-    """Keys whose values differ between two configs, with a text of both values."""
-    before, now = dict(flatten(old)), dict(flatten(new))
-    keys = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-    return {key: f"{key}={before.get(key)} there, {now.get(key)} here" for key in keys}
 
 
 def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
@@ -127,11 +120,10 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
 
 
 def _another_config(run: str | Path, differing: list[str]) -> str:
-    more = f" (and {len(differing) - 3} more)" if len(differing) > 3 else ""
     length = all(text.startswith("trainer.max_steps=") for text in differing)
     more_steps = f", stage.init={run} name=OTHER to learn on from its weights" if length else ""
     return (
-        f"{run} holds a run of another config: {'; '.join(differing[:3])}{more}. "
+        f"{run} holds a run of another config: {at_most_three(differing)}. "
         f"Give the same command to resume it{more_steps}, or name=OTHER for a new one."
     )
 

@@ -269,11 +269,11 @@ def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("changes", "options", "said"),
     [
-        ({"max_range": 100.0}, {}, "max_range is 80.0 there, 100.0 here"),
-        ({"columns": 32}, {}, "columns is 16 there, 32 here"),
-        ({"elevations": (3.0, 1.0, -9.0, -20.0)}, {}, "elevations differ (4 values there, 4 values here)"),
-        ({}, {"projection": "unfolding"}, "projection is spherical there, unfolding here"),
-        ({}, {"convention": "reference"}, "convention is centre there, reference here"),
+        ({"max_range": 100.0}, {}, "max_range=80.0 there, 100.0 here"),
+        ({"columns": 32}, {}, "columns=16 there, 32 here"),
+        ({"elevations": (3.0, 1.0, -9.0, -20.0)}, {}, "there, [3.0, 1.0, -9.0, -20.0] here"),
+        ({}, {"projection": "unfolding"}, "projection=spherical there, unfolding here"),
+        ({}, {"convention": "reference"}, "convention=centre there, reference here"),
     ],
 )
 def test_scans_prepared_for_other_images_are_refused(clouds, tmp_path, changes: dict, options: dict, said: str):
@@ -287,9 +287,9 @@ def test_scans_prepared_for_other_images_are_refused(clouds, tmp_path, changes: 
 def test_another_recipe_is_refused_in_the_same_folder(clouds: Path, tmp_path: Path):
     make(tmp_path, plan_of(clouds))
     before = files(tmp_path)
-    with pytest.raises(InputError, match=r"holds other scans: .*convention is centre there, reference here"):
+    with pytest.raises(InputError, match=r"holds other scans: .*convention=centre there, reference here"):
         make(tmp_path, plan_of(clouds, convention="reference"))
-    with pytest.raises(InputError, match=r"holds other scans: scans is 10 there, 6 here"):
+    with pytest.raises(InputError, match=r"holds other scans: .*scans=10 there, 6 here"):
         make(tmp_path, plan_of(clouds / "drive0"))
     assert files(tmp_path) == before
 
@@ -318,7 +318,7 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tm
     for name in ("drive0/000001.bin", "drive0/000003.bin", "drive0/000004.bin", "drive0/000005.bin"):
         (root / name).write_bytes(b"")
     plan = plan_of(root)
-    with pytest.raises(InputError, match=r"000001.bin: it is empty \(0 bytes\)"):
+    with pytest.raises(InputError, match=r"000001.bin: it holds no points"):
         make(tmp_path / "out", plan)
     with pytest.raises(InputError, match="is not finished: the same r2flow prepare command resumes"):
         prepared_in(tmp_path / "out", SMALL)

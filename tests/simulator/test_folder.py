@@ -57,8 +57,8 @@ def test_files_that_exist_are_kept_and_missing_ones_are_made(tmp_path):
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (SimulatedFolder(Path(), SMALL, 1), "seed is 0 there, 1 here"),
-        (SimulatedFolder(Path(), SENSORS["vlp16"], 0), "sensor: .*hdl64e"),
+        (SimulatedFolder(Path(), SMALL, 1), "seed=0 there, 1 here"),
+        (SimulatedFolder(Path(), SENSORS["vlp16"], 0), r"reading.sensor.columns=\d+ there"),
     ],
     ids=["seed", "sensor"],
 )
