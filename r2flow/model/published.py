@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.generators import Generator
-from r2flow.registry import Registry, did_you_mean, lazy
+from r2flow.registry import Registry, lazy
 
-ARCHITECTURES = {"nat_hdit": "hdit"} | {name: name for name in ("hdit", "adm_unet", "efficient_unet")}
+ARCHITECTURES = Registry(
+    "published architecture", nat_hdit="hdit", hdit="hdit", adm_unet="adm_unet", efficient_unet="efficient_unet"
+)
 BACKBONE = "backbone."  # prefix of a flow's network in the generator
 
 
@@ -47,7 +48,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     weights = {BACKBONE + name: value for name, value in content["weights"].items()}
     batch = content["cfg"].get("training", {}).get("batch_size", 1)
     step = int(content.get("num_images", 0)) // max(int(batch), 1)
-    return Published(published_config(content["cfg"], path), weights, step, {"name": "euler"}, follow_rings)
+    return Published(published_config(content["cfg"]), weights, step, {"name": "euler"}, follow_rings)
 
 
 def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -> dict[str, Any]:
@@ -57,13 +58,13 @@ def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -
     return {"name": name, "rows": rows, "columns": columns, "min_range": near, "max_range": far}
 
 
-def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
     """Convert a published checkpoint's `cfg` (data, model, flow, training, finetuning) to an r2flow config."""
     data, model = cfg["data"], cfg["model"]
     return {
         "sensor": {**sensor_of("hdl64e", data["resolution"], data), "rays": "reference"},
         "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
-        "backbone": backbone_of(model, path),
+        "backbone": backbone_of(model),
         "data": {
             "name": data["dataset"],
             "reading": {"projection": str(data["projection"]).split("-")[0], "convention": "reference"},
@@ -72,17 +73,11 @@ def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
     }
 
 
-def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def backbone_of(model: Mapping[str, Any]) -> dict[str, Any]:
     """Backbone options from a published config's `model`."""
-    architecture = str(model["architecture"])
-    if architecture not in ARCHITECTURES:
-        raise InputError(
-            f"{path}: no backbone for the published architecture {architecture!r}; known: "
-            f"{', '.join(ARCHITECTURES)}.{did_you_mean(architecture, ARCHITECTURES)}"
-        )
     heads, blocks = model["attn_num_heads"], model["num_residual_blocks"]
     common = {
-        "name": ARCHITECTURES[architecture],
+        "name": ARCHITECTURES[str(model["architecture"])],
         "base_channels": model["base_channels"],
         "time_channels": model["temb_channels"],
         "position": model["coords_encoding"],

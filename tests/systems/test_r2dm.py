@@ -331,11 +331,11 @@ def test_unfolded_scans_look_along_the_rings_of_the_weights(shared, tmp_path):
 
 CHANGES = {
     "found 90.0 and 80.0": lambda cfg: cfg["data"].update(min_depth=90.0),
-    "its diffusion is of discrete steps": lambda cfg: cfg["diffusion"].update(timestep_type="discrete"),
-    "it makes reflectance without range": lambda cfg: cfg["data"].update(train_depth=False),
+    "only diffusions of range in continuous time": lambda cfg: cfg["diffusion"].update(timestep_type="discrete"),
+    "only diffusions of range": lambda cfg: cfg["data"].update(train_depth=False),
     "KeyError: 'data'": lambda cfg: cfg.pop("data"),
     "KeyError: 'disparity'": lambda cfg: cfg["data"].update(depth_format="disparity"),
-    "no backbone for the published architecture 'refinenet'": lambda cfg: cfg["model"].update(architecture="refinenet"),
+    "no published architecture named 'refinenet'": lambda cfg: cfg["model"].update(architecture="refinenet"),
     "no log-SNR schedule named 'sigmoid'": lambda cfg: cfg["diffusion"].update(noise_schedule="sigmoid"),
 }
 

@@ -182,8 +182,8 @@ def decompress_lzf(stream: bytes, size: int) -> bytes:
             raise ValueError("a copy refers to before the beginning")
         pattern = output[start : start + length]
         output += pattern if distance >= length else (pattern * (length // distance + 1))[:length]
-    if len(output) != size or position != end:
-        raise ValueError(f"the compressed data do not unpack to the declared {size} bytes")
+    whole = len(output) == size and position == end
+    check(whole, f"its compressed data do not unpack to the declared {size} bytes. Is it damaged?")
     return bytes(output)
 
 

@@ -20,7 +20,7 @@ def holds(content: Any) -> bool:
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """Load a published diffusion, sampled by 256 ancestral steps as in its scripts."""
-    config = published_config(content["cfg"], path)
+    config = published_config(content["cfg"])
     state = content["ema_weights" if averaged else "weights"]
     weights = {
         BACKBONE + name.removeprefix(NETWORK): value for name, value in state.items() if name.startswith(NETWORK)
@@ -29,15 +29,13 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     return Published(config, weights, int(content.get("global_step", 0)), sampler, follow_rings)
 
 
-def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
     """Convert a published checkpoint's `cfg` (data, model, diffusion, training) to our config."""
     data, diffusion = cfg["data"], cfg["diffusion"]
-    if diffusion["timestep_type"] != "continuous":
-        raise InputError(f"{path}: its diffusion is of discrete steps; only those of continuous time are read.")
-    if not data["train_depth"]:
-        raise InputError(f"{path}: it makes reflectance without range, of which no scan can be made.")
+    if diffusion["timestep_type"] != "continuous" or not data["train_depth"]:
+        raise InputError("only diffusions of range in continuous time are read, which its config does not describe.")
     limits = {"min_depth": MIN_RANGE, "max_depth": MAX_RANGE}
-    config = flow_config({**cfg, "data": {**limits, **data, "data_format": RANGES[data["depth_format"]]}}, path)
+    config = flow_config({**cfg, "data": {**limits, **data, "data_format": RANGES[data["depth_format"]]}})
     config["encoding"]["limits"] = "open"
     config["generator"] = {
         "name": "diffusion",
