@@ -125,7 +125,11 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str
     """Keys whose values differ between two configs, with a text of both values."""
     before, now = dict(flatten(old)), dict(flatten(new))
     keys = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-    return {key: f"{key}={str(before.get(key))[:80]} there, {str(now.get(key))[:80]} here" for key in keys}
+    return {key: f"{key}={_brief(before.get(key))} there, {_brief(now.get(key))} here" for key in keys}
+
+
+def _brief(value: Any) -> str:
+    return f"a list of {len(value)}" if isinstance(value, list | tuple) and len(value) > 6 else str(value)
 
 
 def at_most_three(texts: Sequence[str]) -> str:
@@ -134,7 +138,7 @@ def at_most_three(texts: Sequence[str]) -> str:
 
 
 def check_tree(config: Mapping[str, Any]) -> None:
-    """Raise an error for what is no config: one that contains itself, as an anchor of YAML or a pickle can have it."""
+    """Raise an error for a config that contains itself, possible in YAML and pickles, or lacks a group of keys."""
     json.dumps(config, skipkeys=True, default=str)
     for key in ("stage", "data", "trainer"):
         if not isinstance(config.get(key) or {}, Mapping):
@@ -167,5 +171,5 @@ def override(key: str, value: Any) -> str:
 
 
 def as_override(key: str, path: str | Path) -> str:
-    """KEY=PATH as a shell and then Hydra's grammar read it back."""
+    """KEY=PATH quoted for a shell and for Hydra's grammar, in which a space or = needs quotes."""
     return shlex.quote(f"{key}={path}" if re.fullmatch(r"[\w./~-]+", str(path)) else override(key, str(path)))

@@ -41,7 +41,7 @@ MENDABLE = {
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """Puts a file's name before an InputError about it that does not have it."""
+    """Prefix the message of an InputError with the name of a file, unless it begins with it."""
     try:
         yield
     except InputError as error:

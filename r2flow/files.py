@@ -101,14 +101,14 @@ def telling(path: Path) -> Iterator[None]:
 
 
 def refuse_unreadable(path: Path, largest: int, what: str = "file", least: int = 1) -> None:
-    """Refuse a path that is no regular file of `least` to `largest` bytes, before it is opened."""
+    """Refuse a path that is not a regular file of `least` to `largest` bytes, before it is opened."""
     if path.is_symlink() and not path.exists():
         problem = f"is a link to {path.readlink()}, which does not exist."
     elif not path.exists():
         problem = "does not exist. Is the path right?"
     elif path.is_dir():
         problem = f"is a folder, not a {what}; name a file in it."
-    elif not path.is_file():  # reading a pipe would wait for ever, a device never end
+    elif not path.is_file():  # reading a pipe or a device may never end
         problem = "is not a regular file."
     elif (size := path.stat().st_size) < least:
         problem = f"is empty ({size} bytes); fetch or write it again."
@@ -121,7 +121,7 @@ def refuse_unreadable(path: Path, largest: int, what: str = "file", least: int =
 
 
 def _is_stream(path: Path) -> bool:
-    """Whether a path is written into rather than replaced: a character device or a pipe."""
+    """Whether a path is a character device or a pipe, which is written to directly."""
     if path.is_symlink() and not path.exists():
         raise InputError(
             f"{path} is a link to {path.readlink()}, which does not exist; remove the link or name another file."

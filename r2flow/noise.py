@@ -29,14 +29,14 @@ def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.G
         seed: Run seed, 0 <= seed < 2^64.
         purpose: One of `PURPOSES`.
         index: Number of the image, scene or epoch, 0 <= index < 2^64.
-        step: Step of what draws several times for one index, a sampler or a GAN's batch, 0 <= step < 2^64.
+        step: Step of a sampler, or part of a GAN's step, for the same index, 0 <= step < 2^64.
     """
     assert purpose in PURPOSES, purpose
     assert index >= 0 <= step, (index, step)
     if not (isinstance(seed, Integral) and 0 <= seed < 2**64):
         raise InputError(f"a seed must be a whole number in [0, 2^64), found {seed!r}.")
-    # Philox4x64 has a 128-bit key and a 256-bit counter that counts blocks of four draws in its low
-    # words: index and step go into the two highest words, which leaves 2^128 blocks to each pair.
+    # Philox4x64 counts blocks of four numbers in the low words of a 256-bit counter: with index and step in the two
+    # highest words, each pair has 2^128 blocks.
     key = np.array([seed, zlib.crc32(purpose.encode())], dtype=np.uint64)
     counter = np.array([0, 0, step, index], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=counter))
@@ -64,11 +64,11 @@ class Draws:
     purpose: str = "evaluation"
 
     def start(self, shape: tuple[int, ...]) -> Tensor:
-        """x_0 of each scan, (B, *shape) float32 on the CPU: the rows are `standard_normal` of the scans' numbers."""
+        """x_0 of each scan, (B, *shape) float32 on the CPU: `standard_normal` of the scans' numbers."""
         return self.step(shape, 0)
 
     def step(self, shape: tuple[int, ...], j: int) -> Tensor:
-        """Noise of each scan in step j, (B, *shape) float32 on the CPU; that of step 0 is the start's."""
+        """Noise of each scan in step j, (B, *shape) float32 on the CPU; step 0 is the start."""
         return torch.stack([standard_normal(shape, self.seed, self.purpose, number, j) for number in self.numbers])
 
 

@@ -355,7 +355,7 @@ def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path): 
     np.save(tmp_path / "mask.npy", ~mask)
     code, _, error = r2flow(*asked)
     assert code == 2
-    assert "mask is" in error
+    assert "mask=" in error
 
 
 @pytest.mark.slow

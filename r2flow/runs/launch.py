@@ -133,7 +133,7 @@ def _forgotten_plugins(arguments: Sequence[str]) -> str:
 
 
 def _checked_arguments(arguments: list[str]) -> list[str]:
-    """Order the command line: Hydra's flags, then its overrides."""
+    """Order the command line: Hydra's flags, then its overrides. Refuses a single folder for all runs of a sweep."""
     parser = get_args_parser()
 
     def refuse(message: str) -> NoReturn:

@@ -62,8 +62,9 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     if parent is None:
         stage = config["stage"]["name"]
-        if _on_pairs(config) or STAGES[stage].needs_parent:
-            what = f"stage={stage} starts from" if STAGES[stage].needs_parent else "data=pairs are drawn by"
+        needs = STAGES[stage].needs_parent or STAGES[stage].needs_pairs
+        if needs or config["data"]["name"] == "pairs":
+            what = f"stage={stage} starts from" if needs else "data=pairs are drawn by"
             raise InputError(f"{what} a trained run: give stage.init=RUN.")
         config["generator"] = generator_of(config, parent)
         return _with_data(config)
@@ -96,7 +97,8 @@ ABSENT = object()
 
 
 def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapping[str, Any], parent: Parent) -> Any:
-    """The parent's value of a key, or ours if the command line gives it and it may differ."""
+    """The parent's value of a key, or ours if the command line gives it and it may differ; refuses values that do not
+    fit the parent's weights."""
     group, may_differ = key.partition(".")[0], inherited(key, config) == "unless_given"
     if key == group and (ours is None or not isinstance(theirs, Mapping) or (may_differ and key in asked)):
         return ours if isinstance(theirs, Mapping) and may_differ and key in asked else theirs

@@ -173,7 +173,7 @@ def test_a_killed_chain_ends_as_the_one_left_alone(
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["experiment=reflow"], "stage=reflow starts from a trained flow: give stage.init=RUN"),
+        (["experiment=reflow"], "stage=reflow starts from a trained run: give stage.init=RUN"),
         (["experiment=reflow", "stage.init=nowhere"], "no checkpoint at nowhere"),
         (
             ["experiment=reflow", "stage.init=RF1", "backbone.depths=[1,2]"],
