@@ -219,10 +219,10 @@ class Store:
             return
         # Spawn, since torch's threads do not survive a fork.
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(workers, len(items)), context, _begin_worker)
+        pool = ProcessPoolExecutor(min(workers, len(items)), context, _begin_worker, (self, work))
         try:
             with out_of_reach():
-                futures = {pool.submit(self.attempt, item, work): item for item in items}
+                futures = {pool.submit(_attempt, item): item for item in items}
             for future in as_completed(futures):
                 yield futures[future], future.result()
         except BrokenProcessPool:
@@ -267,10 +267,20 @@ class FileStore(Store):
         return all(file.is_file() for file in self.files(item))
 
 
-def _begin_worker() -> None:
+_job: tuple[Store, Callable[[int], None]]  # of a worker process: large work is not sent with every item
+
+
+def _begin_worker(store: Store, work: Callable[[int], None]) -> None:
     """Ignore Ctrl-C in a worker, and end it with the parent process."""
+    global _job
+    _job = (store, work)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
+
+
+def _attempt(item: int) -> bool:
+    store, work = _job
+    return store.attempt(item, work)
 
 
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:

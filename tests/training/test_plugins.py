@@ -1,10 +1,10 @@
 """Modules from outside: by name, by path, by entry point; never because a file names them."""
 
-import copy
 import importlib
 import importlib.metadata
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,17 @@ def eager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(plugins, "_loaded", set(plugins._loaded))
     monkeypatch.setattr(STAGES, "_entries", dict(STAGES._entries))
     return path
+
+
+@pytest.fixture(autouse=True)
+def choices_before() -> Iterator[None]:
+    """The choices that a test adds to Hydra's are forgotten again; other tests compose every choice."""
+    stored = ConfigStore.instance().repo
+    before = {group: set(stored.get(group, ())) for group in REGISTRIES}
+    yield
+    for group, names in before.items():
+        for name in set(stored.get(group, ())) - names:
+            del stored[group][name]
 
 
 @pytest.mark.parametrize(
@@ -169,7 +180,6 @@ def test_what_is_in_a_registry_without_a_yaml_file_becomes_a_choice(group: str, 
     registry: Registry[Any] = getattr(importlib.import_module(module), table)
     original = next(iter(registry.items()))[1]
     monkeypatch.setattr(registry, "_entries", {**registry._entries, "somebodys": original})
-    monkeypatch.setattr(ConfigStore.instance(), "repo", copy.deepcopy(ConfigStore.instance().repo))
     config = compose([f"{group}=somebodys"])
     assert config[group]["name"] == "somebodys"
     assert set(choices(group)) >= {"somebodys"}
