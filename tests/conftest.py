@@ -1,14 +1,25 @@
 """Shared by all tests: where reference tensors and real scans lie, and small sensors."""
 
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from r2flow import errors
+from r2flow import cli, errors
+from r2flow.data.opening import find_drives
+from r2flow.data.prepared import plan_files, prepare
+from r2flow.data.reading import Reading
+from r2flow.generators import build_generator
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.stages import build_stage
+from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -16,6 +27,16 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a worker for each core: more threads 
     torch.set_num_threads(1)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+
+# A flow of 8 x 64.
+CONFIG: dict[str, Any] = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 64, "rays": "centre"},
+    "encoding": {"format": "logscale", "reflectance": True},
+    "backbone": {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
+    "data": {"name": "simulated", "batch_size": 4},
+    "stage": {"name": "rectify"},
+    "seed": 0,
+}
 
 TINY: dict[str, dict[str, Any]] = {
     "hdit": {"base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
@@ -32,6 +53,18 @@ TINY["pyramid"] = {
 def tiny_options(name: str) -> dict[str, Any]:
     """Options of a backbone that builds in milliseconds and takes images of 16 x 64."""
     return {"name": name, **TINY.get(name, {})}
+
+
+def write_run(folder: Path, flow: Checkpoint, stage: dict[str, Any], scale: float = 1.0) -> Path:
+    """A run folder with the weights of a flow, times a number."""
+    weights = dict(flow.generator.named_parameters())
+    state = flow.generator.state_dict()
+    content = {
+        "state_dict": {f"generator.{name}": scale * v if name in weights else v for name, v in state.items()},
+        "config": {**flow.config, "stage": stage}, "global_step": 7, "sampler": flow.generator.sampler.asdict(),
+    }  # fmt: skip
+    AtomicCheckpointIO().save_checkpoint(content, folder / "checkpoints" / "step-00000007.ckpt")
+    return folder
 
 
 @pytest.fixture(scope="session")
@@ -53,3 +86,74 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 def _from_the_start() -> None:
     torch.manual_seed(0)
     errors._odd.clear()
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> tuple[Path, dict]:
+    """A checkpoint of ours with random weights, averaged and raw, and the averaged ones."""
+    stage = build_stage(CONFIG, build_generator(CONFIG))
+    parameters = dict(stage.named_parameters())
+    raw = {name: torch.randn_like(v) if name in parameters else v for name, v in stage.state_dict().items()}
+    averaged = {name: v + 1 if name in parameters else v for name, v in raw.items()}
+    content = {"state_dict": averaged, "current_model_state": raw, "config": CONFIG, "global_step": 7}
+    path = tmp_path / "run" / "checkpoints" / "step-00000007.ckpt"
+    AtomicCheckpointIO().save_checkpoint(content, path)
+    return path, averaged
+
+
+@pytest.fixture
+def r2flow(monkeypatch, capsys):
+    """Runs a verb in this process: (exit code, standard output, standard error)."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as exit:
+            code = exit.code if isinstance(exit.code, int) else 1
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    """A scan of the ground 1.73 m below, as a KITTI .bin."""
+    sensor = SENSORS["hdl64e"]
+    e = sensor.rays()[0].numpy()
+    r = np.where(e < -0.03, -1.73 / np.sin(np.minimum(e, -0.03)), 0)
+    image = np.stack([r, np.full_like(r, 0.3)]).astype(np.float32)
+    write_points(tmp_path / "ground.bin", *image_to_points(image, sensor.rays()))
+    return tmp_path / "ground.bin"
+
+
+def write_scan(path: Path, number: int, reflectance: float = 0.5) -> None:
+    """A scan whose only return lies at 5 + number metres."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    r = 5.0 + number
+    write_points(path, np.array([[r, 0.01, -0.05 * r]], np.float32), np.array([reflectance], np.float32))
+
+
+@pytest.fixture
+def kitti_360(tmp_path: Path) -> Path:
+    for drive in (0, 2, 3, 4, 10):
+        for frame in range(3):
+            name = f"data_3d_raw/2013_05_28_drive_{drive:04d}_sync/velodyne_points/data/{frame:010d}.bin"
+            write_scan(tmp_path / name, drive * 3 + frame)
+    return tmp_path
+
+
+@pytest.fixture
+def numbered(tmp_path: Path) -> Path:
+    """Twelve scans in a folder, at 5 to 16 m."""
+    for number in range(12):
+        write_scan(tmp_path / "scans" / f"{number:06d}.bin", number)
+    return tmp_path / "scans"
+
+
+def prepare_folder(root: Path, out: Path, sensor: Sensor, layout: str = "folder") -> Path:
+    """The scans of a data set, prepared."""
+    prepare(out, plan_files(layout, root, find_drives(layout, root), Reading(sensor)))
+    return out

@@ -15,30 +15,8 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import Checkpoint, checkpoints_of, load_checkpoint, save_checkpoint
-from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
-
-CONFIG = {
-    "sensor": {"name": "hdl64e", "rows": 8, "columns": 64, "rays": "centre"},
-    "encoding": {"format": "logscale", "reflectance": True},
-    "backbone": {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
-    "data": {"name": "simulated", "batch_size": 4},
-    "stage": {"name": "rectify"},
-    "seed": 0,
-}
-
-
-@pytest.fixture
-def saved(tmp_path: Path) -> tuple[Path, dict]:
-    """A checkpoint of ours with random weights, averaged and raw, and the averaged ones."""
-    stage = build_stage(CONFIG, build_generator(CONFIG))
-    parameters = dict(stage.named_parameters())
-    raw = {name: torch.randn_like(v) if name in parameters else v for name, v in stage.state_dict().items()}
-    averaged = {name: v + 1 if name in parameters else v for name, v in raw.items()}
-    content = {"state_dict": averaged, "current_model_state": raw, "config": CONFIG, "global_step": 7}
-    path = tmp_path / "run" / "checkpoints" / "step-00000007.ckpt"
-    AtomicCheckpointIO().save_checkpoint(content, path)
-    return path, averaged
+from tests.conftest import CONFIG
 
 
 def test_the_averaged_weights_are_the_model(saved):

@@ -10,47 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow import cli, load
+from r2flow import load
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
-from tests.data.conftest import write_scan
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.conftest import write_scan
 
 
-@pytest.fixture
-def r2flow(monkeypatch, capsys):
-    """Runs a verb in this process: (exit code, standard output, standard error)."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as exit:
-            code = exit.code if isinstance(exit.code, int) else 1
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
-
-
-@pytest.fixture
-def scan(tmp_path: Path) -> Path:
-    """A scan of the ground 1.73 m below, as a KITTI .bin."""
-    from r2flow.lidar.projection import image_to_points
-    from r2flow.lidar.scan_files import write_points
-
-    sensor = SENSORS["hdl64e"]
-    e = sensor.rays()[0].numpy()
-    r = np.where(e < -0.03, -1.73 / np.sin(np.minimum(e, -0.03)), 0)
-    image = np.stack([r, np.full_like(r, 0.3)]).astype(np.float32)
-    write_points(tmp_path / "ground.bin", *image_to_points(image, sensor.rays()))
-    return tmp_path / "ground.bin"
-
-
-def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path):  # noqa: F811
+def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path):
     path, _ = saved
     code, out, _ = r2flow("sample", path, "--num", 3, "--steps", 2, "--seed", 5, "--out", tmp_path / "a")
     assert code == 0
@@ -66,7 +34,7 @@ def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path)
     assert sorted(p.suffix for p in (tmp_path / "c").glob("00000*")) == [".npy"] * 3 + [".png"] * 3
 
 
-def test_the_formats_hold_the_same_scan(r2flow, saved, tmp_path):  # noqa: F811
+def test_the_formats_hold_the_same_scan(r2flow, saved, tmp_path):
     r2flow("sample", saved[0], "--num", 1, "--steps", 2, "-o", tmp_path, "--pictures", 0)
     image = np.load(tmp_path / "000000.npy")
     ply, kitti = read_points(tmp_path / "000000.ply"), read_points(tmp_path / "000000.bin")
@@ -107,7 +75,7 @@ def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path)
     assert said.splitlines() == [str(tmp_path / "views" / name) for name in names]
 
 
-def test_info_says_what_is_in_a_checkpoint(r2flow, saved):  # noqa: F811
+def test_info_says_what_is_in_a_checkpoint(r2flow, saved):
     code, said, _ = r2flow("info", saved[0])
     assert code == 0
     for words in ("hdit", "2 x 8 x 64", "hdl64e", "logscale", "backbone.base_channels"):
@@ -118,7 +86,7 @@ def test_info_says_what_is_in_a_checkpoint(r2flow, saved):  # noqa: F811
     assert json.loads(said)["step"] == 7
 
 
-def test_export_writes_the_averaged_weights(r2flow, saved, tmp_path):  # noqa: F811
+def test_export_writes_the_averaged_weights(r2flow, saved, tmp_path):
     path, averaged = saved
     out = tmp_path / "a.safetensors"
     code, said, _ = r2flow("export", path.parent.parent, "--to", "safetensors", "--out", out)
@@ -219,7 +187,7 @@ def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_pat
 
 
 @pytest.mark.parametrize("device", ["nope", "meta", "cpu:3", "cuda:99", None])
-def test_a_model_is_loaded_on_a_device_that_is_here(saved, device):  # noqa: F811
+def test_a_model_is_loaded_on_a_device_that_is_here(saved, device):
     with pytest.raises(InputError, match="^device") as refused:
         load(saved[0], device)
     assert str(device) in str(refused.value)
@@ -238,7 +206,7 @@ def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
     assert done.stdout.strip() == "[]"
 
 
-def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, shared, tmp_path):  # noqa: F811
+def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, shared, tmp_path):
     published, out = shared / "oracle" / "published_format.pth", tmp_path / "out"
     drawn = ("--num", 1, "--steps", 1, "--pictures", 0, "--out", out)
     code, _, error = r2flow("sample", published, *drawn, "--format", "npy,ply")

@@ -20,31 +20,18 @@ from r2flow.model.completion import Completed
 from r2flow.noise import generator
 from r2flow.reports.completed import hidden_errors
 from r2flow.simulator import simulate
-from r2flow.stages.checkpointing import AtomicCheckpointIO
-from tests.data.conftest import prepare_folder
-from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.conftest import prepare_folder, write_run
 from tests.test_completion import network, scans
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 VLP16 = SENSORS["vlp16"]
 COMPLETE = "complete", "--pictures", "0"
-
-
-def write_run(path: Path, **options) -> Path:
-    """A run folder with a transfer flow of random weights, 8 x 64."""
-    made = network(**options)
-    content = {
-        "state_dict": {f"generator.{name}": value for name, value in made.generator.state_dict().items()},
-        "config": {**made.config, "stage": {"name": "transfer"}}, "global_step": 7,
-        "sampler": made.generator.sampler.asdict(),
-    }  # fmt: skip
-    AtomicCheckpointIO().save_checkpoint(content, path / "checkpoints" / "step-00000007.ckpt")
-    return path
+TRANSFER = {"name": "transfer"}
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_run(tmp_path_factory.mktemp("complete") / "run")
+    return write_run(tmp_path_factory.mktemp("complete") / "run", network(), TRANSFER)
 
 
 def full_scan(path: Path, number: int = 0) -> np.ndarray:
@@ -69,7 +56,7 @@ def sparse_scan(path: Path, steps: int = 900) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ending", [".bin", ".npy"])
-def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, ending):  # noqa: F811
+def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, ending):
     image = full_scan(tmp_path / f"one{ending}")
     code, said, error = r2flow(
         "complete", tmp_path / f"one{ending}", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
@@ -93,7 +80,7 @@ def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, end
     assert "what is known" in (tmp_path / "out" / "one.html").read_text()
 
 
-def test_a_sparser_sensor_is_found_and_its_points_come_back(r2flow, run, tmp_path):  # noqa: F811
+def test_a_sparser_sensor_is_found_and_its_points_come_back(r2flow, run, tmp_path):
     xyz = sparse_scan(tmp_path / "in" / "room.pcd")
     code, said, _ = r2flow(*COMPLETE, tmp_path / "in", "-c", run, "--num", 2, "--out", tmp_path / "out")
     assert code == 0
@@ -114,13 +101,13 @@ def test_a_sparser_sensor_is_found_and_its_points_come_back(r2flow, run, tmp_pat
     assert "vlp16 with 16 beams" in named[1]
 
 
-def test_answers_are_read_as_samples_are(r2flow, run, tmp_path):  # noqa: F811
+def test_answers_are_read_as_samples_are(r2flow, run, tmp_path):
     full_scan(tmp_path / "one.npy")
     r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--num", 2, "--out", tmp_path / "out")
     assert len(open_scans(tmp_path / "out")) == 2  # neither pictures nor spread
 
 
-def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow, run, tmp_path):  # noqa: F811
+def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow, run, tmp_path):
     for number, name in enumerate(("one.npy", "two.npy")):
         full_scan(tmp_path / "in" / name, number)
     asked = [*COMPLETE, tmp_path / "in", "-c", run, "--mask", "points:0.3", "--seed", 3, "--out", tmp_path / "out"]
@@ -140,7 +127,7 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow,
     assert np.array_equal(image[:, kept], answer[:, kept])
 
 
-def test_a_scan_of_which_everything_is_known_comes_back_and_says_so(r2flow, run, tmp_path):  # noqa: F811
+def test_a_scan_of_which_everything_is_known_comes_back_and_says_so(r2flow, run, tmp_path):
     image = full_scan(tmp_path / "one.npy")
     code, said, _ = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out")
     assert code == 0
@@ -148,7 +135,7 @@ def test_a_scan_of_which_everything_is_known_comes_back_and_says_so(r2flow, run,
     assert "one: everything is known, so nothing was completed" in said
 
 
-def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(r2flow, run, tmp_path):  # noqa: F811
+def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(r2flow, run, tmp_path):
     """Returns come back to the bit and some gaps return; without the option all gaps are rays without a return."""
     image = full_scan(tmp_path / "one.npy")
     image[:, ::2, ::3] = 0
@@ -164,7 +151,7 @@ def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(r2flow, run, tmp_path
     assert "fill_gaps" in error
 
 
-def test_simulated_scans_are_seen_through_another_sensor(r2flow, run, tmp_path):  # noqa: F811
+def test_simulated_scans_are_seen_through_another_sensor(r2flow, run, tmp_path):
     code, said, _ = r2flow(
         *COMPLETE, "simulated:3", "-c", run, "--from", "vlp16", "--scans", 1, "--steps", 1, "--out", tmp_path / "out"
     )
@@ -173,8 +160,8 @@ def test_simulated_scans_are_seen_through_another_sensor(r2flow, run, tmp_path):
     assert np.load(tmp_path / "out" / "simulated-3-000000.npy").shape == (2, 8, 64)
 
 
-def test_a_model_of_range_alone_leaves_reflectance_out(r2flow, tmp_path):  # noqa: F811
-    path = write_run(tmp_path / "run", reflectance=False)
+def test_a_model_of_range_alone_leaves_reflectance_out(r2flow, tmp_path):
+    path = write_run(tmp_path / "run", network(reflectance=False), TRANSFER)
     full_scan(tmp_path / "one.bin")
     code, said, _ = r2flow(*COMPLETE, tmp_path / "one.bin", "-c", path, "--mask", "rows:2", "--out", tmp_path / "out")
     assert code == 0
@@ -182,8 +169,8 @@ def test_a_model_of_range_alone_leaves_reflectance_out(r2flow, tmp_path):  # noq
     assert read_points(tmp_path / "out" / "one.ply").reflectance is None
 
 
-def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):  # noqa: F811
-    path = write_run(tmp_path / "run", name="diffusion")
+def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):
+    path = write_run(tmp_path / "run", network("diffusion"), TRANSFER)
     image = full_scan(tmp_path / "one.npy")
     asked = *COMPLETE, tmp_path / "one.npy", "-c", path, "--mask", "rows:2", "--out", tmp_path / "out"
     code, _, error = r2flow(*asked, "--sampler", "repaint", "--steps", 2)
@@ -202,7 +189,7 @@ def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):  # noqa: F8
         (["--from", "vlp16"], "is a range image of 8x64, those of the model are 8x64: --from vlp16 has 16 rows"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message):  # noqa: F811
+def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message):
     full_scan(tmp_path / "one.npy")
     np.save(tmp_path / "mask.npy", np.ones((4, 4), bool))
     given = [option.format(folder=tmp_path) for option in options]
@@ -229,7 +216,7 @@ def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message
         ),
     ],
 )
-def test_scans_that_cannot_be_completed_are_one_line(r2flow, run, tmp_path, made, message):  # noqa: F811
+def test_scans_that_cannot_be_completed_are_one_line(r2flow, run, tmp_path, made, message):
     made(tmp_path / "one.npy")
     code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out")
     assert code == 2
@@ -239,7 +226,7 @@ def test_scans_that_cannot_be_completed_are_one_line(r2flow, run, tmp_path, made
 
 
 @pytest.mark.parametrize("sensor", [[], ["--from", "vlp32c"]])
-def test_points_of_which_none_is_in_view_are_one_line(r2flow, run, tmp_path, sensor):  # noqa: F811
+def test_points_of_which_none_is_in_view_are_one_line(r2flow, run, tmp_path, sensor):
     xyz, reflectance = image_to_points(scans()[0].numpy(), SENSOR.rays())
     write_points(tmp_path / "far.bin", 500 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True), reflectance)
     code, _, error = r2flow(*COMPLETE, tmp_path / "far.bin", "-c", run, *sensor, "--out", tmp_path / "out")
@@ -249,7 +236,7 @@ def test_points_of_which_none_is_in_view_are_one_line(r2flow, run, tmp_path, sen
     assert not (tmp_path / "out").exists()
 
 
-def test_no_error_is_told_where_no_ray_returns_in_both(r2flow, run, tmp_path):  # noqa: F811
+def test_no_error_is_told_where_no_ray_returns_in_both(r2flow, run, tmp_path):
     np.save(tmp_path / "one.npy", np.zeros((2, 8, 64), np.float32))
     code, said, error = r2flow(
         *COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
@@ -260,7 +247,7 @@ def test_no_error_is_told_where_no_ray_returns_in_both(r2flow, run, tmp_path):  
     assert "wrong in ray-drop" in said
 
 
-def test_the_folder_of_the_scans_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811
+def test_the_folder_of_the_scans_is_not_written_into(r2flow, run, tmp_path):
     """There the note on the answers would be taken for one on the scans."""
     sparse_scan(tmp_path / "in" / "room.pcd")
     for what in (tmp_path / "in" / "room.pcd", tmp_path / "in", tmp_path):
@@ -271,7 +258,7 @@ def test_the_folder_of_the_scans_is_not_written_into(r2flow, run, tmp_path):  # 
     assert [path.name for path in (tmp_path / "in").iterdir()] == ["room.pcd"]
 
 
-def test_a_file_of_an_answer_s_name_is_no_answer(r2flow, run, tmp_path):  # noqa: F811
+def test_a_file_of_an_answer_s_name_is_no_answer(r2flow, run, tmp_path):
     full_scan(tmp_path / "one.npy")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "one.npy").write_text("mine")
@@ -282,7 +269,7 @@ def test_a_file_of_an_answer_s_name_is_no_answer(r2flow, run, tmp_path):  # noqa
 
 
 @pytest.mark.parametrize("ending", [".npy", ".bin"])
-def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path, ending):  # noqa: F811
+def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path, ending):
     for number, drive in enumerate("ab"):
         full_scan(tmp_path / drive / f"one{ending}", number)
     asked = "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
@@ -309,7 +296,7 @@ def prepared(folder: Path, numbers: list[int]) -> Path:
     return folder / "prep"
 
 
-def test_prepared_scans_are_named_by_their_numbers_in_the_set(r2flow, run, tmp_path):  # noqa: F811
+def test_prepared_scans_are_named_by_their_numbers_in_the_set(r2flow, run, tmp_path):
     given = prepared(tmp_path, [0, 1, 0, 1])
     asked = *COMPLETE, given, "-c", run, "--mask", "rows:2", "--out", tmp_path / "out", "--scans"
     for most, numbers in ((1, [2]), (2, [1, 2, 3])):  # evenly spread
@@ -322,7 +309,7 @@ def test_prepared_scans_are_named_by_their_numbers_in_the_set(r2flow, run, tmp_p
     assert "3 were there already" in said
 
 
-def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_path):  # noqa: F811
+def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_path):
     full_scan(tmp_path / "in" / "a.npy", 0)
     image = full_scan(tmp_path / "in" / "b.npy", 1)
     np.save(tmp_path / "in" / "b.npy", np.where(image == image.max(), np.nan, image))
@@ -336,7 +323,7 @@ def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_p
     assert "another scan of the name b" in r2flow(*asked)[2]
 
 
-def test_an_unusual_scale_that_is_estimated_is_told(r2flow, run, tmp_path):  # noqa: F811
+def test_an_unusual_scale_that_is_estimated_is_told(r2flow, run, tmp_path):
     xyz = sparse_scan(tmp_path / "one.ply")
     write_points(tmp_path / "one.ply", xyz, np.linspace(0, 0.01, len(xyz), dtype=np.float32))
     asked = *COMPLETE, tmp_path / "one.ply", "-c", run, "--from", "vlp16"
@@ -344,7 +331,7 @@ def test_an_unusual_scale_that_is_estimated_is_told(r2flow, run, tmp_path):  # n
     assert r2flow(*asked, "--reflectance-scale", "0.01", "--out", tmp_path / "b")[2] == ""
 
 
-def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path):  # noqa: F811
+def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path):
     full_scan(tmp_path / "one.bin")
     mask = np.arange(8)[:, None] % 2 == np.zeros(64)
     np.save(tmp_path / "mask.npy", mask)
@@ -368,7 +355,7 @@ def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path): 
         ("rellis_vlp32c/vel000104.bin", "32 beams"),
     ],
 )
-def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path, scan, beams):  # noqa: F811
+def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path, scan, beams):
     code, said, _ = r2flow(*COMPLETE, shared / "real" / "other_sensors" / scan, "-c", run, "--out", tmp_path / "out")
     assert code == 0
     assert beams in said
@@ -433,7 +420,7 @@ def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(
         ("rows:4", ("--sampler", "replace", "--steps", 1), "street", "32x256"),
     ],
 )
-def test_the_model_is_chosen_by_what_is_missing(r2flow, tmp_path, mask, more, model, size):  # noqa: F811
+def test_the_model_is_chosen_by_what_is_missing(r2flow, tmp_path, mask, more, model, size):
     image = simulate(SENSORS["hdl64e"].resized(64, 512), 5, 0).image
     write_points(tmp_path / "one.ply", *image_to_points(image, SENSORS["hdl64e"].resized(64, 512).rays()))
     asked = (tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, "--out", tmp_path / "out")
@@ -444,7 +431,7 @@ def test_the_model_is_chosen_by_what_is_missing(r2flow, tmp_path, mask, more, mo
     assert len(read_points(tmp_path / "out" / "one.ply").xyz) > 1000
 
 
-def test_scans_for_two_models_are_refused_together(r2flow, tmp_path):  # noqa: F811
+def test_scans_for_two_models_are_refused_together(r2flow, tmp_path):
     sensor = SENSORS["hdl64e"].resized(64, 512)
     image = simulate(sensor, 5, 0).image
     for name, kept in (("cut", np.s_[:, :, 300:]), ("thin", np.s_[:, ::4])):

@@ -24,8 +24,7 @@ from r2flow.metrics.sums import SumMetric
 from r2flow.model.checkpoint import Checkpoint, save_checkpoint
 from r2flow.reports.paper import read_results
 from r2flow.samplers import build_sampler
-from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.conftest import CONFIG
 from tests.test_evaluation import SENSOR, folder, generated, images, real  # noqa: F401  fixtures
 
 QUICK = ("--metrics", "jsd,mmd", "--size", "8x64", "--workers", 0)
@@ -133,7 +132,7 @@ def points(r2flow, real, tmp_path):  # noqa: F811
     return measure
 
 
-def test_several_samplers_and_steps_make_a_set_each(points, saved, tmp_path):  # noqa: F811
+def test_several_samplers_and_steps_make_a_set_each(points, saved, tmp_path):
     rows, page = points(saved[0], "--sampler", "euler,heun2", "--steps", "1,2", "--bootstrap", 8)
     assert [(row["flow"].partition(", ")[2], row["evaluations"]) for row in rows] == [
         ("euler", 1), ("euler", 2), ("heun2", 2), ("heun2", 4),
@@ -162,7 +161,7 @@ def test_an_adaptive_solver_is_one_set(r2flow, points, saved, real):  # noqa: F8
     assert (code, "no option 'steps'" in said) == (2, True)
 
 
-def test_an_evaluation_resumes(points, saved, monkeypatch):  # noqa: F811
+def test_an_evaluation_resumes(points, saved, monkeypatch):
     import r2flow.evaluation.measuring as measuring
 
     first, _ = points(saved[0], "--steps", "1,2", "--batch-size", 2)

@@ -16,30 +16,15 @@ from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.samplers import build_sampler
-from r2flow.stages.checkpointing import AtomicCheckpointIO
-from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.conftest import write_run
 from tests.test_sampling import network, scans
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 
 
-def write_checkpoint(path: Path, reflectance: bool = True) -> Path:
-    """A run folder with a flow of small random weights."""
-    flow = network(reflectance)
-    weights = {f"generator.backbone.{name}": 0.3 * value for name, value in flow.model.state_dict().items()}
-    weights |= {
-        f"generator.backbone.{name}": value
-        for name, value in flow.model.named_buffers()
-        if f"generator.backbone.{name}" in weights
-    }
-    content = {"state_dict": weights, "config": {**flow.config, "stage": {"name": "rectify"}}, "global_step": 7}
-    AtomicCheckpointIO().save_checkpoint(content, path / "checkpoints" / "step-00000007.ckpt")
-    return path
-
-
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    return write_checkpoint(tmp_path / "run")
+    return write_run(tmp_path / "run", network(), {"name": "rectify"}, 0.3)
 
 
 @pytest.fixture
@@ -51,7 +36,7 @@ def files(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):  # noqa: F811
+def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):
     out = tmp_path / "between"
     code, said, _ = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8)
     assert code == 0
@@ -65,7 +50,7 @@ def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):  # noqa: 
     assert "4 scans" in said
 
 
-def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # noqa: F811
+def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):
     part = tmp_path / "part"
     code, said, _ = r2flow("sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", part)
     assert code == 0
@@ -85,7 +70,7 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # no
     assert (np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 4).all()
 
 
-def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
+def test_one_channel_is_written_alone(r2flow, run, tmp_path):
     for channels in ("both", "range", "reflectance"):
         out = tmp_path / channels
         assert r2flow("sample", run, "--num", 1, "--steps", 2, "--channels", channels, "-o", out)[0] == 0
@@ -97,7 +82,7 @@ def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
     assert {path.suffix for path in (tmp_path / "reflectance").iterdir()} == {".npy", ".png", ".json"}
 
 
-def test_named_grids_are_sampled_on(r2flow, run, tmp_path):  # noqa: F811
+def test_named_grids_are_sampled_on(r2flow, run, tmp_path):
     images = {}
     for grid in ("uniform", "power:2", "power-start:1.5"):
         out = tmp_path / grid.replace(":", "-")
@@ -116,8 +101,8 @@ def test_what_is_not_asked_for_is_not_imported():
     assert done.stdout.split("\n") == ["[]", "[]", ""]
 
 
-def test_a_model_of_range_alone_has_no_reflectance_to_compute(r2flow, tmp_path):  # noqa: F811
-    alone = write_checkpoint(tmp_path / "range", reflectance=False)
+def test_a_model_of_range_alone_has_no_reflectance_to_compute(r2flow, tmp_path):
+    alone = write_run(tmp_path / "range", network(reflectance=False), {"name": "rectify"}, 0.3)
     assert r2flow("sample", alone, "--num", 1, "--steps", 2, "-o", tmp_path / "o")[0] == 0
     assert np.load(tmp_path / "o" / "000000.npy").shape == (1, 8, 64)
     assert read_points(tmp_path / "o" / "000000.ply").reflectance is None

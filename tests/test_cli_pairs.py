@@ -13,13 +13,11 @@ from r2flow.data.pairs import PairSource, PairStore
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.reports.pairs import place
 from r2flow.runs.lineage import pairs_of
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 QUICK = ("--sampler", "euler", "--steps", 2, "--batch-size", 4, "--num", 10)
 
 
-def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
+def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     path, _ = saved
     code, said, _ = r2flow("pairs", path, *QUICK)
     assert code == 0
@@ -35,7 +33,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
     assert "pairs/s" not in said  # nothing was left to make
 
 
-def test_an_unfinished_run_draws_no_pairs(r2flow, saved):  # noqa: F811
+def test_an_unfinished_run_draws_no_pairs(r2flow, saved):
     from r2flow.model.checkpoint import read_checkpoint
     from r2flow.stages.checkpointing import AtomicCheckpointIO
 
@@ -50,7 +48,7 @@ def test_an_unfinished_run_draws_no_pairs(r2flow, saved):  # noqa: F811
 
 
 @pytest.mark.slow
-def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(saved, tmp_path: Path):  # noqa: F811
+def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(saved, tmp_path: Path):
     path, _ = saved
 
     def make(out: Path, **environment: str) -> subprocess.Popen:

@@ -16,8 +16,7 @@ from r2flow.data.opening import SOURCES, open_prepared
 from r2flow.data.reading import Reading, read_scan
 from r2flow.lidar.sensors import SENSORS
 from r2flow.store import read_manifest
-from tests.data.conftest import kitti_360, numbered, write_scan  # noqa: F401  fixtures
-from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.conftest import write_scan
 from tests.training.conftest import TINY, in_process
 
 SMALL = SENSORS["hdl64e"].resized(4, 16)
@@ -27,7 +26,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):  # noqa: F811
+def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
     out = tmp_path / "out"
     typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 4)
     code, said, _ = r2flow(*typed, "--workers", 1)
@@ -40,7 +39,7 @@ def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):  # noqa: F811
     assert np.abs(source[5] - raw).max() <= 1e-3
 
 
-def test_the_same_command_makes_a_damaged_shard_again(r2flow, kitti_360, tmp_path):  # noqa: F811
+def test_the_same_command_makes_a_damaged_shard_again(r2flow, kitti_360, tmp_path):
     out = tmp_path / "out"
     typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--size", "4x16", "--shard-scans", 4, "--workers", 1)
     r2flow(*typed)
@@ -53,7 +52,7 @@ def test_the_same_command_makes_a_damaged_shard_again(r2flow, kitti_360, tmp_pat
     assert files(out) == whole
 
 
-def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):  # noqa: F811
+def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):
     root = Path(__file__).parents[1]
     config = yaml.safe_load((root / "conf" / "data" / "nuscenes.yaml").read_text())
     r, e = np.full(3, 10.0), np.deg2rad([10.0, 0.0, -30.0])  # the first and the last out of an HDL-64E's view
@@ -98,7 +97,7 @@ def test_the_command_killed_and_started_twice_ends_with_the_same_bytes(tmp_path:
     assert files(folder) == one
 
 
-def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):  # noqa: F811
+def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):
     """Rows of time, z, y, x, reflectance and ring: every verb and run that reads them is told by one option."""
     wide = tmp_path / "wide"
     wide.mkdir()
@@ -133,7 +132,7 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):  # no
         assert "columns must name x, y and z" in error
 
 
-def test_a_run_is_told_the_columns_too(numbered, tmp_path):  # noqa: F811
+def test_a_run_is_told_the_columns_too(numbered, tmp_path):
     wide = tmp_path / "wide"
     wide.mkdir()
     for path in sorted(numbered.iterdir()):

@@ -11,7 +11,6 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import read_manifest
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.training.conftest import TINY, in_process
 
 MINE = Sensor("mine", (12.0, 5.0, 1.0, 0.0, -1.5, -4.0, -9.0, -20.0), columns=128)
@@ -30,7 +29,7 @@ def scans(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: Path, tmp_path: Path):
     out = tmp_path / "conf" / "mine.yaml"
     code, printed, error = r2flow("sensor", scans, "--out", out)
     assert (code, error) == (0, "")
@@ -61,7 +60,7 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     assert (tmp_path / "views" / "000000.png").stat().st_size > 10_000
 
 
-def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_path: Path):  # noqa: F811
+def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_path: Path):
     pandar = SENSORS["pandar64"]
     draw, e = np.random.default_rng(0), pandar.rays().numpy()[0]
     r = np.minimum(np.where(e < 0, 1.5 / np.sin(np.maximum(-e, 1e-9)), np.inf), 40 / np.cos(e))
@@ -86,7 +85,7 @@ def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_pat
     assert (code, error) == (0, "")
 
 
-def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, tmp_path: Path):
     out = tmp_path / "mine.yaml"
     r2flow("sensor", scans, "--out", out)
     assert yaml.safe_load(out.read_text())["reflectance_scale"] == 255
@@ -111,13 +110,13 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     ("s_KITTI-360.yaml", "s_KITTI_360"), ("2nd car.yaml", "my_2nd_car"), ("vlp16.yaml", "my_vlp16"),
     ("Größe.yaml", "Gr__e"), ("_.yml", "my__"),
 ])  # fmt: skip
-def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, file: str, name: str):  # noqa: F811
+def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, file: str, name: str):
     code, _, error = r2flow("sensor", scans, "--out", tmp_path / file, "--num", 1)
     assert (code, error) == (0, "")
     assert read_sensor(tmp_path / file).name == name
 
 
-def test_a_sensor_s_file_is_replaced_only_when_asked(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+def test_a_sensor_s_file_is_replaced_only_when_asked(r2flow, scans: Path, tmp_path: Path):
     out = tmp_path / "mine.yaml"
     out.write_text("mine by hand")
     code, _, error = r2flow("sensor", scans, "--out", out)
@@ -140,7 +139,7 @@ SCALES = {
     "folder",
     [*list(SCALES)[:2], *(pytest.param(folder, marks=pytest.mark.slow) for folder in list(SCALES)[2:])],
 )
-def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: Path, tmp_path: Path, folder):  # noqa: F811
+def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: Path, tmp_path: Path, folder):
     data, prepared = shared / "real" / "other_sensors" / folder, tmp_path / "my" / "prepared"
     mine = tmp_path / "conf" / "sensor" / "mine.yaml"
     code, _, error = r2flow("sensor", data, "--out", mine)

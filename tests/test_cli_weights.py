@@ -9,7 +9,6 @@ import torch
 from r2flow.metrics.extractors.pointnet import PointNet
 from r2flow.metrics.extractors.weights import SOURCES
 from tests.metrics.conftest import untrained
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +23,7 @@ def here(said: str) -> dict[str, bool]:
     return {row[0]: row[2] != "no" for row in rows}
 
 
-def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):  # noqa: F811
+def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):
     code, said, _ = r2flow("weights")
     assert code == 0
     for words in (

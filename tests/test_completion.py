@@ -12,7 +12,7 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete, completing
 from r2flow.noise import generator
 from r2flow.samplers import build_sampler
-from tests.test_checkpoints import CONFIG
+from tests.conftest import CONFIG
 
 SHAPE = 8, 64
 

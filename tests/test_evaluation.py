@@ -27,7 +27,6 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import standard_normal
 from r2flow.reports.evaluation import Comparison, verdict
 from r2flow.samplers import build_sampler
-from tests.data.conftest import kitti_360  # noqa: F401  a fixture
 from tests.test_sampling import flow as without_config
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
@@ -283,7 +282,7 @@ def test_intervals_hold_their_figure(real, generated):
     assert found.protocol["interval"] == {"bootstrap draws": 30, "level": 0.95, "seed": 0}
 
 
-def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path):  # noqa: F811
+def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path):
     real = open_scans(f"kitti_360:{kitti_360}", READING, "train")
     other = open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)
     found = reference_sets(real, {"generated": other})

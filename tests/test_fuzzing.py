@@ -22,9 +22,8 @@ from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from r2flow.store import Store
-from tests.data.conftest import prepare_folder
+from tests.conftest import CONFIG, prepare_folder
 from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
-from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 
 ROOT, SEED = Path(__file__).resolve().parents[1], 20261120
 EACH = 320  # damaged files made of each original
@@ -134,13 +133,13 @@ def refuse_findings(folder: Path, run: Path, each: int) -> dict[str, tuple[int, 
     return {name: (made, read) for _, name, made, read in said}
 
 
-def test_damaged_files_are_one_line_or_what_was_written(tmp_path: Path, saved):  # noqa: F811
+def test_damaged_files_are_one_line_or_what_was_written(tmp_path: Path, saved):
     """A few of each kind, in each run of the tests."""
     assert len(refuse_findings(tmp_path / "fuzz", saved[0], 4)) >= 25
 
 
 @pytest.mark.slow
-def test_ten_thousand_damaged_files_are_one_line_or_what_was_written(tmp_path: Path, saved):  # noqa: F811
+def test_ten_thousand_damaged_files_are_one_line_or_what_was_written(tmp_path: Path, saved):
     found = refuse_findings(tmp_path / "fuzz", saved[0], EACH)
     if all(importlib.util.find_spec(name) for name in ("pyarrow", "laspy", "lazrs")):
         assert sum(made for made, _ in found.values()) >= 10_000

@@ -11,8 +11,7 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import jump
 from r2flow.generators import FlowMap, build_generator
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, weights_hash
-from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.conftest import CONFIG
 
 grown = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "street" / "growing.py"))["grown"]
 STREET_LIKE = {**CONFIG, "backbone": {**CONFIG["backbone"], "position": "none"}}
@@ -64,7 +63,7 @@ def test_the_means_of_a_grown_map_jump_as_the_map_does():
         assert torch.allclose(found, expected, atol=1e-5)
 
 
-def test_a_grown_map_learns_on_as_a_map(r2flow, tmp_path):  # noqa: F811
+def test_a_grown_map_learns_on_as_a_map(r2flow, tmp_path):
     small = flow(generator={"name": "flow_map"})
     out, run = tmp_path / "larger.safetensors", tmp_path / "run"
     save_checkpoint(grown(small, (16, 128)), out)

@@ -19,7 +19,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.model.sampling import sample
 from r2flow.training import build, compose, fit
-from tests.test_checkpoints import CONFIG
+from tests.conftest import CONFIG
 from tests.training.conftest import scans, tiny  # noqa: F401  a fixture
 
 pytestmark = [

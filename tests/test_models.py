@@ -21,8 +21,6 @@ from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
 from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
 from r2flow.simulator import simulate
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 PACKAGED = [name for name, model in MODELS.items() if model.page is None]
 
@@ -82,7 +80,7 @@ assert scans.shape == (2, *flow.generator.space.shape)
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_sample_without_a_checkpoint_draws_from_the_default_model(r2flow, tmp_path, monkeypatch):  # noqa: F811
+def test_sample_without_a_checkpoint_draws_from_the_default_model(r2flow, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, said, _ = r2flow("sample", "--num", 1, "--steps", 1, "--pictures", 0, "--out", "scans")
     assert code == 0
@@ -91,7 +89,7 @@ def test_sample_without_a_checkpoint_draws_from_the_default_model(r2flow, tmp_pa
     assert Path("scans/000000.ply").read_bytes() == Path("named/000000.ply").read_bytes()
 
 
-def test_a_run_or_a_file_of_a_models_name_comes_first(saved, tmp_path, monkeypatch):  # noqa: F811
+def test_a_run_or_a_file_of_a_models_name_comes_first(saved, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert is_checkpoint("street")
     Path("street").mkdir()  # which holds no run
@@ -107,7 +105,7 @@ def test_a_run_or_a_file_of_a_models_name_comes_first(saved, tmp_path, monkeypat
 
 
 @pytest.fixture
-def released(saved, tmp_path, monkeypatch) -> Path:  # noqa: F811
+def released(saved, tmp_path, monkeypatch) -> Path:
     """The file of a model `large` that does not come with the package."""
     monkeypatch.setenv("R2FLOW_MODELS", str(tmp_path / "models"))
     path = tmp_path / "downloads" / "some.safetensors"
@@ -117,7 +115,7 @@ def released(saved, tmp_path, monkeypatch) -> Path:  # noqa: F811
     return path
 
 
-def test_a_released_model_is_added_from_a_file(r2flow, released, tmp_path):  # noqa: F811
+def test_a_released_model_is_added_from_a_file(r2flow, released, tmp_path):
     with pytest.raises(InputError, match=r"large is not here .*example.org/some.safetensors and give r2flow weights"):
         load_checkpoint("large")
     assert "no" in next(line for line in r2flow("weights")[1].splitlines() if line.startswith("large")).split()
@@ -128,7 +126,7 @@ def test_a_released_model_is_added_from_a_file(r2flow, released, tmp_path):  # n
     assert name_of(model_file("large")) == "large"
 
 
-def test_another_file_is_no_model(r2flow, released):  # noqa: F811
+def test_another_file_is_no_model(r2flow, released):
     released.write_bytes(released.read_bytes() + b" ")
     with pytest.raises(InputError, match="is not the model large, or damaged"):
         add_model("large", released)
@@ -142,7 +140,7 @@ def test_another_file_is_no_model(r2flow, released):  # noqa: F811
         add_model("street", released)
 
 
-def test_half_precision_rounds_large_weights_alone(saved, tmp_path):  # noqa: F811
+def test_half_precision_rounds_large_weights_alone(saved, tmp_path):
     original = load_checkpoint(saved[0])
     save_checkpoint(original, tmp_path / "half.safetensors", half=True)
     save_checkpoint(original, tmp_path / "again.safetensors", half=True)

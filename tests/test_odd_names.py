@@ -13,16 +13,14 @@ from r2flow.errors import InputError, explain_mistake
 from r2flow.files import atomic_write
 from r2flow.reports.pages import blank_figure
 from r2flow.reports.pictures import figure_pixels
-from tests.data.conftest import write_scan
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.conftest import write_scan
 
 ODD = [r"a$b$c", r"$\frac$", "a\nb", os.fsdecode(b"caf\xe9"), "ä ß 日", "-x", "a'b\"c"]
 NAMES = ["".join(ODD), *(pytest.param(name, marks=pytest.mark.slow) for name in ODD)]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, monkeypatch, name):  # noqa: F811
+def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     folder = Path(f"./{name}")
     folder.mkdir()
@@ -38,7 +36,7 @@ def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, mon
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypatch, name):  # noqa: F811
+def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     Path(f"./{name}.bin").write_bytes(b"\0" * 30)
     code, _, err = r2flow("show", f"./{name}.bin", "-o", "out")
@@ -49,7 +47,7 @@ def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_models_of_any_name_sample(r2flow, saved, tmp_path, monkeypatch, name):  # noqa: F811
+def test_models_of_any_name_sample(r2flow, saved, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(saved[0].parents[1], f"./{name}")
     code, _, err = r2flow("sample", f"./{name}", "-o", f"./{name}/s", "--num", 1, "--steps", 1)

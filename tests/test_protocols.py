@@ -17,8 +17,6 @@ from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.protocols import PAPER, R2FLOW, published_choice
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
-from tests.data.conftest import kitti_360  # noqa: F401  a fixture
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import SENSOR, folder, generated, images  # noqa: F401  a fixture
 
 READING = Reading(SENSOR, convention="reference")
@@ -93,7 +91,7 @@ def test_real_points_are_the_measured_ones_and_generated_ones_bin_corners(measur
     assert abs(other / found - 1) > 0.02
 
 
-def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(kitti_360, monkeypatch):  # noqa: F811
+def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(kitti_360, monkeypatch):
     monkeypatch.setattr("r2flow.evaluation.measuring.REAL_SCANS", 5)
     scans = open_scans(f"kitti_360:{kitti_360}", READING)
     order = [name.split("/")[1][17:21] for name in scans.source.names]

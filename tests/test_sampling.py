@@ -23,8 +23,8 @@ from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
 from r2flow.runs.composing import compose
 from r2flow.samplers import build_sampler
+from tests.conftest import CONFIG
 from tests.fields import Field
-from tests.test_checkpoints import CONFIG
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 M, S = 0.2, 0.4

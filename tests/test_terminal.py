@@ -12,8 +12,6 @@ import torch
 import r2flow.training
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow as run_verb  # noqa: F401  a fixture
 from tests.training.conftest import scans, tiny  # noqa: F401  a fixture
 
 R2FLOW = [sys.executable, "-m", "r2flow.cli"]
@@ -39,7 +37,7 @@ def test_a_training_outlives_the_reader_of_its_output(tmp_path: Path, scans: Pat
     assert (tmp_path / "run" / "checkpoints" / "step-00000020.ckpt").is_file()
 
 
-def test_info_ends_quietly_with_its_reader(tmp_path: Path, saved):  # noqa: F811
+def test_info_ends_quietly_with_its_reader(tmp_path: Path, saved):
     line, code, error = one_line_of(["info", str(saved[0])], tmp_path)
     assert line.startswith("path")
     assert (code, error) == (0, "")
@@ -52,27 +50,27 @@ def test_a_name_is_read_as_utf_8_in_every_locale(tmp_path: Path):
     assert "run_dir: rün" in done.stdout.decode()
 
 
-def test_a_name_does_not_control_the_terminal(run_verb, tmp_path: Path, monkeypatch):  # noqa: F811
+def test_a_name_does_not_control_the_terminal(r2flow, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, _, error = run_verb("info", "a\033[31mb")
+    code, _, error = r2flow("info", "a\033[31mb")
     assert code == 2
     assert "\033" not in error
     assert r"a\x1b[31mb" in error
 
 
-def test_weights_that_are_not_finite_are_named(run_verb, saved, tmp_path: Path):  # noqa: F811
+def test_weights_that_are_not_finite_are_named(r2flow, saved, tmp_path: Path):
     loaded = load_checkpoint(saved[0])
     name, parameter = next(iter(loaded.generator.named_parameters()))
     with torch.no_grad():
         parameter.view(-1)[0] = torch.nan
     save_checkpoint(loaded, tmp_path / "nan.safetensors")
-    (line,) = [line for line in run_verb("info", tmp_path / "nan.safetensors")[1].splitlines() if "not finite" in line]
+    (line,) = [line for line in r2flow("info", tmp_path / "nan.safetensors")[1].splitlines() if "not finite" in line]
     assert line.endswith(name)
-    assert "not finite" not in run_verb("info", saved[0])[1]
+    assert "not finite" not in r2flow("info", saved[0])[1]
 
 
-def test_a_comparison_without_a_run_leaves_no_folder(run_verb, tmp_path: Path):  # noqa: F811
-    assert run_verb("compare", tmp_path / "nowhere", "--out", tmp_path / "o")[0] == 2
+def test_a_comparison_without_a_run_leaves_no_folder(r2flow, tmp_path: Path):
+    assert r2flow("compare", tmp_path / "nowhere", "--out", tmp_path / "o")[0] == 2
     assert not (tmp_path / "o").exists()
 
 

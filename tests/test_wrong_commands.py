@@ -31,7 +31,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
-from tests.test_checkpoints import CONFIG
+from tests.conftest import CONFIG
 
 VERBS = """
 nope # No such command 'nope'

@@ -8,7 +8,6 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from reference_cases import relative
 from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
 
 from r2flow.backbones import build_backbone, configurations
@@ -16,6 +15,7 @@ from r2flow.backbones.cost import count_macs
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
 from tests.conftest import tiny_options
+from tests.reference import relative
 
 CONF = Path(__file__).parents[2] / "conf"
 LISTED = {  # under these names in the oracle

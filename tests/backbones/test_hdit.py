@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from reference_cases import assert_gradients, load_case, relative
 from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
@@ -10,6 +9,7 @@ from r2flow.backbones.encodings import Rotary
 from r2flow.backbones.hdit import Attention, BlockOptions, HDiT, Neighbourhood
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import build_sensor
+from tests.reference import assert_gradients, load_case, relative
 
 SMALL = {"base_channels": 16, "depths": (1, 1, 1), "num_heads": (1, 2, 4), "time_channels": 32}
 
@@ -57,7 +57,7 @@ def from_case(case) -> HDiT:
 
 @pytest.mark.parametrize("name", CASES)
 def test_output_and_gradients_are_the_references(shared, name):
-    case = load_case(shared / "oracle" / f"{name}.pt")
+    case = load_case(shared, f"{name}.pt")
     model = from_case(case)
     x = case["x"].clone().requires_grad_()
     output = model(case["t"], x)
@@ -69,7 +69,7 @@ def test_output_and_gradients_are_the_references(shared, name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_scalar_time_holds_for_the_whole_batch(shared, name):
-    case = load_case(shared / "oracle" / f"{name}.pt")
+    case = load_case(shared, f"{name}.pt")
     model = from_case(case)
     with torch.no_grad():
         assert relative(model(case["t_scalar"], case["x"][:1]), case["output_t_scalar"]) < 5e-5
@@ -81,7 +81,7 @@ def test_a_scalar_time_holds_for_the_whole_batch(shared, name):
 
 @pytest.mark.parametrize("index", range(4))
 def test_circular_attention_blocks_are_the_references(shared, index):
-    case = load_case(shared / "oracle" / "units_circular_na.pt")["cases"][index]
+    case = load_case(shared, "units_circular_na.pt")["cases"][index]
     options = BlockOptions(
         case["dim"], case["num_heads"], case["embed_dim"], case["max_harmonics"],
         Neighbourhood(tuple(case["kernel_size"]), True, "auto"), dropout=0.0,

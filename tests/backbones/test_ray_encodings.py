@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from reference_cases import load_case
 
 from r2flow.backbones.encodings import ENCODINGS, FourierFeatures, Rotary, SphericalHarmonics, position_name, rotate
 from r2flow.errors import InputError
+from tests.reference import load_case
 
 
 @pytest.fixture
 def units(shared):
-    return load_case(shared / "oracle" / "units_encodings.pt")
+    return load_case(shared, "units_encodings.pt")
 
 
 def test_fourier_features_are_the_references(units):

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from reference_cases import assert_gradients, load_case
 
 from r2flow.backbones import BACKBONES, Backbone, build_backbone
 from r2flow.backbones.convolutions import Resample, SinusoidalTime
 from r2flow.errors import InputError
 from r2flow.registry import check_options
+from tests.reference import assert_gradients, load_case
 
 CASES = {"eff_16x64_polar": "efficient_unet", "adm_16x64_fourier": "adm_unet"}
 
@@ -30,7 +30,7 @@ def from_case(name: str, case: dict) -> Backbone:
 
 @pytest.mark.parametrize("name", CASES)
 def test_output_and_gradients_are_the_references(shared, name):
-    case = load_case(shared / "oracle" / f"{name}.pt")
+    case = load_case(shared, f"{name}.pt")
     model = from_case(name, case)
     x = case["x"].clone().requires_grad_()
     output = model(case["t"], x)
@@ -42,7 +42,7 @@ def test_output_and_gradients_are_the_references(shared, name):
 
 
 def test_resampling_is_the_references(shared):
-    units = load_case(shared / "oracle" / "units_encodings.pt")
+    units = load_case(shared, "units_encodings.pt")
     cases = [case for case in units["resample"] if "direction" not in case["kw"]]  # no model resamples one axis
     for case in cases:
         options = case["kw"]
@@ -53,7 +53,7 @@ def test_resampling_is_the_references(shared):
 
 
 def test_time_features_are_the_references(shared):
-    units = load_case(shared / "oracle" / "units_encodings.pt")
+    units = load_case(shared, "units_encodings.pt")
     torch.testing.assert_close(SinusoidalTime(64)(units["sin_t"]), units["sin64"], rtol=0, atol=1e-5)
 
 

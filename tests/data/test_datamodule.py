@@ -13,7 +13,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from tests.data.conftest import prepare_folder, write_scan
+from tests.conftest import prepare_folder, write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 

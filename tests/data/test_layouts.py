@@ -5,7 +5,7 @@ import pytest
 from r2flow.data.layouts import Layout
 from r2flow.data.opening import SOURCES, find_drives
 from r2flow.errors import InputError
-from tests.data.conftest import write_scan
+from tests.conftest import write_scan
 
 
 def names(drives) -> list[str]:

@@ -29,7 +29,7 @@ from r2flow.noise import standard_normal
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
 from r2flow.store import Store
-from tests.data.conftest import prepare_folder, write_scan
+from tests.conftest import prepare_folder, write_scan
 from tests.fields import Field
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)

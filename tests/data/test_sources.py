@@ -9,7 +9,7 @@ from r2flow.data.sources import InMemory, ScanFiles, holdout_block, spread
 from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from tests.data.conftest import write_scan
+from tests.conftest import write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 

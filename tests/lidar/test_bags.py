@@ -9,7 +9,6 @@ import pytest
 from r2flow.errors import InputError
 from r2flow.lidar.bags import read_bag
 from r2flow.lidar.scan_files import read_points
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed")
 
@@ -90,7 +89,7 @@ def test_each_cloud_is_read_as_it_was_recorded(tmp_path: Path, storage: str):
             np.testing.assert_array_equal(points.ring, np.arange(len(xyz)) % 32)
 
 
-def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):  # noqa: F811
+def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):
     file = record(tmp_path / "drive", "MCAP", ("/front", "/rear"))
     out = tmp_path / "scans"
     code, _, error = r2flow("unpack", file, "--out", out)
@@ -104,7 +103,7 @@ def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):  # n
     assert (code, said) == (0, f"1 scans in {tmp_path / 'one'}\n")
 
 
-def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Path):  # noqa: F811
+def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Path):
     whole = record(tmp_path / "text", "MCAP", kind="text")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(record(tmp_path / "drive", "MCAP").read_bytes()[:300])
@@ -130,7 +129,7 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
         list(read_bag(tmp_path / "drive", "/rear"))
 
 
-def test_a_pipe_in_a_bag_is_refused(r2flow, tmp_path: Path):  # noqa: F811
+def test_a_pipe_in_a_bag_is_refused(r2flow, tmp_path: Path):
     file = record(tmp_path / "bag", "SQLITE3")
     file.unlink()
     os.mkfifo(file)
@@ -139,7 +138,7 @@ def test_a_pipe_in_a_bag_is_refused(r2flow, tmp_path: Path):  # noqa: F811
         assert (code, error.count("\n")) == (2, 1)
 
 
-def test_unpack_keeps_clouds_of_one_time_and_ring_numbers(r2flow, tmp_path: Path):  # noqa: F811
+def test_unpack_keeps_clouds_of_one_time_and_ring_numbers(r2flow, tmp_path: Path):
     file = record(tmp_path / "drive", "MCAP", stamps=(1, 1, 2))
     code, said, _ = r2flow("unpack", file, "--out", tmp_path / "scans")
     assert (code, said) == (0, f"3 scans in {tmp_path / 'scans'}\n")

@@ -13,7 +13,6 @@ from r2flow.errors import InputError
 from r2flow.evaluation.copies import copies_result, find_nearest
 from r2flow.evaluation.measuring import Work
 from r2flow.lidar.sensors import SENSORS
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import folder, images
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
@@ -83,7 +82,7 @@ def test_scans_without_a_return_have_no_neighbour(sets, tmp_path):
     assert (find_nearest({"g": sets["generated"]}, with_empty, Work())["g"].neighbours != 1).all()
 
 
-def test_evaluate_has_the_copies_as_lines_and_a_picture(r2flow, sets, tmp_path):  # noqa: F811
+def test_evaluate_has_the_copies_as_lines_and_a_picture(r2flow, sets, tmp_path):
     code, out, err = r2flow(
         "evaluate", tmp_path / "held", tmp_path / "generated", "--train", tmp_path / "training", "--size", "8x64",
         "--metrics", "jsd", "--workers", 0, "--json", tmp_path / "e.json", "--out", tmp_path / "page",

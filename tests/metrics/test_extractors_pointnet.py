@@ -1,5 +1,3 @@
-import sys
-
 import pytest
 import torch
 
@@ -8,6 +6,7 @@ from r2flow.metrics.extractors import pointnet
 from r2flow.metrics.extractors.pointnet import PointNet
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import untrained
+from tests.reference import load_case
 
 SMALL = SENSORS["hdl64e"].resized(8, 32)
 
@@ -19,10 +18,7 @@ def network():
 
 @torch.inference_mode()
 def test_pointnet_is_the_reference(shared, monkeypatch):
-    sys.path.insert(0, str(shared / "oracle"))
-    from reader import load_case
-
-    case = load_case(shared / "oracle" / "feat_pointnet.pt")
+    case = load_case(shared, "feat_pointnet.pt")
     network = PointNet(case["cfg"]["k"]).eval()
     network.load_state_dict(case["state_dict"], strict=True)
     torch.testing.assert_close(network(case["x"]), case["output"], rtol=1e-4, atol=1e-4)

@@ -1,5 +1,4 @@
 import math
-import sys
 
 import pytest
 import torch
@@ -9,16 +8,14 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors.rangenet import RangeNet21, RangeNet53, translate
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import untrained
+from tests.reference import load_case
 
 SMALL = SENSORS["hdl64e"].resized(16, 32)
 
 
 @pytest.fixture(scope="module")
 def case(shared):
-    sys.path.insert(0, str(shared / "oracle"))
-    from reader import load_case
-
-    return load_case(shared / "oracle" / "feat_rangenet21.pt")
+    return load_case(shared, "feat_rangenet21.pt")
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ import pytest
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.backbones import backbone_costs
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 # The paper's table II and its published models.
 PARAMETERS = {
@@ -49,7 +48,7 @@ def test_every_configuration_takes_every_sensor_s_shape(sensor):
     assert [row for row in backbone_costs(sensor, list(PARAMETERS), repeats=0) if "error" in row] == []
 
 
-def test_the_verb_measures_what_it_is_asked_for(r2flow):  # noqa: F811
+def test_the_verb_measures_what_it_is_asked_for(r2flow):
     options = ("--only", "hdit_tiny,adm_unet_large", "--size", "16x64", "--repeats", 0, "--device", "cpu")
     code, out, _ = r2flow("report", "backbones", *options)
     assert code == 0
@@ -60,7 +59,7 @@ def test_the_verb_measures_what_it_is_asked_for(r2flow):  # noqa: F811
 
 
 @pytest.mark.parametrize(("load", "busy"), [(0.0, False), (1e4, True)])
-def test_a_busy_machine_is_named(r2flow, monkeypatch, load, busy):  # noqa: F811
+def test_a_busy_machine_is_named(r2flow, monkeypatch, load, busy):
     monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
     options = ("--only", "hdit_tiny", "--size", "16x64", "--repeats", 1, "--device", "cpu")
     assert ("machine was busy" in r2flow("report", "backbones", *options)[1]) == busy

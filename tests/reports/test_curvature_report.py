@@ -18,8 +18,6 @@ from r2flow.reports.curvature import (
     summary,
 )
 from tests.fields import Field
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 SENSOR = SENSORS["hdl64e"].resized(4, 16)
 STEPS = 16
@@ -104,7 +102,7 @@ def test_a_flow_of_nan_is_said(caplog):
     assert "broken: s(t) is not finite for 2 of 2 scans" in caplog.text
 
 
-def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
+def test_the_verb_writes_the_report(r2flow, saved, tmp_path):
     path, out = saved[0], tmp_path / "reports"
     copy = path.with_name("step-00000009.ckpt")
     copy.write_bytes(path.read_bytes())

@@ -12,24 +12,17 @@ from r2flow.metrics.birds_eye import js_distance
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.reports.paper import marginals_apart, role_of, same_architecture, table_i
 from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II
-from r2flow.stages.checkpointing import AtomicCheckpointIO
-from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.conftest import write_run
 from tests.test_sampling import network
-
-
-def make_run(folder: Path, stage: dict, scale: float) -> Path:
-    flow = network()
-    weights = {f"generator.backbone.{name}": scale * value for name, value in flow.model.state_dict().items()}
-    content = {"state_dict": weights, "config": {**flow.config, "stage": stage}, "global_step": 7}
-    AtomicCheckpointIO().save_checkpoint(content, folder / "checkpoints" / "step-00000007.ckpt")
-    return folder
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("runs")
     stages = {"1-RF": {"name": "rectify"}, "2-RF": {"name": "reflow"}, "4-TD": {"name": "distill", "steps": 4}}
-    return {role: make_run(root / role, stage, 0.2 + 0.05 * i) for i, (role, stage) in enumerate(stages.items())}
+    return {
+        role: write_run(root / role, network(), stage, 0.2 + 0.05 * i) for i, (role, stage) in enumerate(stages.items())
+    }
 
 
 def test_every_run_finds_its_role(runs):
@@ -64,7 +57,7 @@ def test_marginals_are_sums_over_the_other_axis():
     assert marginals_apart(counts, other) == pytest.approx(js_distance(counts[3], other[3]) / 2)
 
 
-def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):  # noqa: F811
+def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     figures = {"speed": {"evaluations": 1.0, "seconds": 0.1}, "jsd": {"jsd": 0.25}, "mmd": {"mmd": 1e-4}}
     metrics = [{"metric": name, "figures": values, "intervals": {}} for name, values in figures.items()]
     hashes = weights_hash(load_checkpoint(runs["1-RF"])), "another model"

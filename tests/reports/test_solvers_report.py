@@ -23,8 +23,6 @@ from r2flow.reports.solvers import (
     solvers_page,
 )
 from tests.fields import Field
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 
 def test_steps_fit_the_budgets():
@@ -139,7 +137,7 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
     assert set(page.figures) == {"solvers_problems"}
 
 
-def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):  # noqa: F811
+def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):
     quick = partial(checkpoint_subject, steps=16, tolerance=1e-3)
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     out = tmp_path / "reports"

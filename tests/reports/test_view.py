@@ -15,8 +15,6 @@ from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.view import MOST, page
 from r2flow.simulator import simulate
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
-from tests.test_cli import r2flow, scan  # noqa: F401  fixtures
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
 RAYS = SENSOR.rays()
@@ -155,7 +153,7 @@ def test_what_does_not_fit_is_refused(given, said):
 
 
 class TestTheVerb:
-    def test_shows_files_and_says_how_many_of_a_folder(self, r2flow, scan, tmp_path):  # noqa: F811
+    def test_shows_files_and_says_how_many_of_a_folder(self, r2flow, scan, tmp_path):
         many = tmp_path / "many"
         many.mkdir()
         for number, image in enumerate(images(5)):
@@ -168,7 +166,7 @@ class TestTheVerb:
         e = SENSORS["hdl64e"].rays()[0].numpy()
         np.testing.assert_allclose(r[40:60], (-1.73 / np.sin(e))[40:60], atol=0.003)
 
-    def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path):  # noqa: F811
+    def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path):
         for name, image in zip("ab", images(2), strict=True):
             np.save(tmp_path / f"{name}.npy", image)
         assert r2flow("view", tmp_path, "--sequence", "--out", tmp_path / "a.html")[0] == 0
@@ -176,7 +174,7 @@ class TestTheVerb:
         assert [len(one["frames"]) for one in data["scans"]] == [2]
         assert data["frames"] == ["a.npy", "b.npy"]
 
-    def test_draws_a_model_at_several_steps_from_the_same_noise(self, r2flow, saved, tmp_path):  # noqa: F811
+    def test_draws_a_model_at_several_steps_from_the_same_noise(self, r2flow, saved, tmp_path):
         import r2flow as package
 
         assert r2flow("view", saved[0], "--num", 2, "--steps", "1,3", "--out", tmp_path / "a.html")[0] == 0
@@ -187,7 +185,7 @@ class TestTheVerb:
         for frame in range(2):
             assert np.abs(unpacked(data, 1, frame)[0] - expected[frame, 0].numpy()).max() < 0.0021
 
-    def test_goes_from_noise_to_scan(self, r2flow, saved, tmp_path):  # noqa: F811
+    def test_goes_from_noise_to_scan(self, r2flow, saved, tmp_path):
         import r2flow as package
         from r2flow.noise import Draws
 
@@ -199,7 +197,7 @@ class TestTheVerb:
         assert np.abs(unpacked(data, 0, 0)[0] - noise[0, 0].numpy()).max() < 0.0021
 
     @pytest.mark.parametrize("screen", [True, False])
-    def test_opens_a_browser_where_there_is_a_screen(self, r2flow, tmp_path, monkeypatch, screen):  # noqa: F811
+    def test_opens_a_browser_where_there_is_a_screen(self, r2flow, tmp_path, monkeypatch, screen):
         opened = []
         np.save(tmp_path / "a.npy", images(1)[0])
         monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url))
@@ -211,5 +209,5 @@ class TestTheVerb:
         assert opened == ([f"file://{said.strip()}"] if screen else [])
 
 
-def test_the_way_of_a_model_that_draws_noise_is_that_of_its_ode(r2flow, tmp_path):  # noqa: F811
+def test_the_way_of_a_model_that_draws_noise_is_that_of_its_ode(r2flow, tmp_path):
     assert r2flow("view", "street", "--num", 1, "--times", 2, "--out", tmp_path / "way.html")[0] == 0

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import torch
-from published_cases import load_case
 from torch import Tensor, nn
 
 from r2flow.callbacks import HalfLifeEMA
@@ -32,6 +31,7 @@ from r2flow.systems.gan.layers import logistic, straight_through_mask
 from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
 from r2flow.training import compose
 from tests.conftest import ROOT
+from tests.reference import load_case
 
 NETWORKS = [
     "vanilla_g_32x64", "dusty1_g_32x64", "dusty1_g_32x64_2ch", "dusty2_g_32x64_eval", "dusty2_g_32x64_train",

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from published_cases import assert_near, assert_norms, load_case
 
 from r2flow.callbacks.ema import DECAYS
 from r2flow.errors import InputError
@@ -18,6 +17,7 @@ from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws
 from r2flow.systems.score.langevin import annealed_langevin, noise_levels, score_loss, step_sizes, toward
 from r2flow.systems.score.refinenet import InstanceNormPlus, RefineNet
+from tests.reference import assert_near, assert_norms, load_case
 
 TINY = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 16, "min_range": 0.5, "max_range": 63.0},

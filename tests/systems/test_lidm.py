@@ -12,7 +12,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 import yaml
-from published_cases import assert_near, assert_norms, load_case
 from torch import Tensor
 
 from r2flow.callbacks.ema import DECAYS
@@ -42,6 +41,7 @@ from r2flow.systems.latent.published import _autoencoder, _unet
 from r2flow.systems.latent.quantiser import Quantiser
 from r2flow.systems.latent.stage import returns
 from r2flow.systems.latent.unet import LatentUNet
+from tests.reference import assert_near, assert_norms, load_case
 
 Predict = Callable[[Tensor, Tensor], Tensor]
 SMALL_AUTOENCODER = {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16}

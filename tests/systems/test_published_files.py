@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_cli import r2flow  # noqa: F401  a fixture
-
 # Options, and the evaluations that a scan takes: steps x noise levels and one to take the last noise off.
 FILES = {
     "vanilla_published.pth": ([], 1),
@@ -20,7 +18,7 @@ LARGE = ("lidargen_published.pth", "lidm_published.ckpt")  # of 64 x 1024
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in LARGE else ()) for n in FILES])
-def test_a_published_file_is_sampled_and_evaluated(r2flow, shared, tmp_path: Path, name: str):  # noqa: F811
+def test_a_published_file_is_sampled_and_evaluated(r2flow, shared, tmp_path: Path, name: str):
     path = shared / "oracle_baselines" / name
     if not path.exists():
         pytest.skip("the reference checkpoint is not here")

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from published_cases import assert_near, assert_norms, load_case
 from torch import Tensor
 
 from r2flow.backbones import Backbone, build_backbone
@@ -33,6 +32,7 @@ from r2flow.systems.diffusion.log_snr import SCHEDULES, Cosine, alpha_sigma, log
 from r2flow.systems.diffusion.objectives import ERRORS, PREDICTIONS, mean_errors, weighted_mean
 from r2flow.systems.diffusion.sampling import forward_step, noised, repaint, step, walk
 from r2flow.training import compose
+from tests.reference import assert_near, assert_norms, load_case
 
 CONFIG: dict[str, Any] = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},

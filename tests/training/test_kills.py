@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from r2flow.model.checkpoint import checkpoints_of
-from tests.data.conftest import write_scan
+from tests.conftest import write_scan
 from tests.killing import wait_until
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.training.conftest import COMMAND, TINY, let_go, tiny
 from tests.training.test_chain import CHAIN, HELD, assert_alike
 from tests.training.test_train import assert_bit_equal
@@ -96,7 +95,7 @@ def test_prepare(tmp_path: Path):
     assert files(tmp_path / "ended") == files(tmp_path / "one")
 
 
-def test_pairs(saved, tmp_path: Path):  # noqa: F811
+def test_pairs(saved, tmp_path: Path):
     command = [*VERB, "pairs", saved[0], "--num", 200, "--sampler", "midpoint", "--steps", 8, "--batch-size", 4,
                "--shard-mib", 0.05, "--device", "cpu", "--out"]  # fmt: skip
     seconds = finish(tmp_path, [*command, "one"])

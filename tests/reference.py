@@ -1,4 +1,4 @@
-"""Reference cases of other systems, computed once with their published code: reading and comparing."""
+"""Reference cases, tensors computed once with the published code of a system: reading and comparing."""
 
 import zlib
 from pathlib import Path
@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-SCALES = {"half": 0.5, "bias": 0.1, "std01": 0.1, "codebook": 0.3, "unit": 1.0, "unit100": 100.0}
+SCALES = {"half": 0.5, "bias": 0.1, "std01": 0.1, "codebook": 0.3, "unit100": 100.0, "ape": 0.5, "bn_mean": 0.2}
 
 
 def load_case(shared: Path, name: str) -> dict[str, Any]:
     """A case, its weights drawn again from their seed where the file holds only their names."""
-    path = shared / "oracle_baselines" / name
-    if not path.exists():
-        pytest.skip(f"the reference case {path.name} is not here")
+    path = next(shared.glob(f"oracle*/{name}"), None)
+    if path is None:
+        pytest.skip(f"the reference case {name} is not here")
     case: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     if "sd_spec" in case:
         case["state_dict"] = {
@@ -28,11 +28,18 @@ def load_case(shared: Path, name: str) -> dict[str, Any]:
 def _draw(name: str, shape: tuple[int, ...], kind: str, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed((zlib.crc32(name.encode()) ^ (seed * 0x9E3779B1)) & 0x7FFFFFFF)
     z = torch.randn(tuple(shape), generator=generator)
-    if kind == "gain":
-        return 1 + 0.2 * z
     if kind in ("matrix", "half_matrix"):
         return z * (0.5 if kind == "half_matrix" else 1) / max(1, z[0].numel()) ** 0.5
-    return SCALES[kind] * z
+    if kind in ("gain", "bn_var"):
+        return 1 + 0.2 * z if kind == "gain" else (1 + 0.2 * z).abs() + 0.1
+    if kind == "logit_scale":
+        return 2.302585092994046 + 1.2 * z
+    return SCALES.get(kind, 1.0) * z
+
+
+def relative(found: Tensor, expected: Tensor) -> float:
+    """|found - expected| / |expected|, in the Euclidean norm of all elements."""
+    return ((found - expected).norm() / expected.norm()).item()
 
 
 def assert_near(found: Any, expected: Any, tolerance: float) -> None:
@@ -49,8 +56,15 @@ def assert_norms(model: nn.Module, expected: dict[str, float], tolerance: float 
     """
     least = 1e-6 * max(expected.values())
     for name, parameter in model.named_parameters():
-        norm = 0.0 if parameter.grad is None else parameter.grad.norm().item()
-        assert abs(norm - expected.get(prefix + name, 0.0)) <= tolerance * expected.get(prefix + name, 0.0) + least, (
-            name
-        )
+        norm, known = 0.0 if parameter.grad is None else parameter.grad.norm().item(), expected.get(prefix + name, 0.0)
+        assert abs(norm - known) <= tolerance * known + least, name
     assert set(expected) <= {prefix + name for name, _ in model.named_parameters()}
+
+
+def assert_gradients(model: nn.Module, x: Tensor, output: Tensor, case: dict[str, Any]) -> None:
+    """The gradients of sum(output * grad_w) are the reference's to 1e-3: by x in full, by parameters in norm."""
+    (output * case["grad_w"]).sum().backward()
+    assert relative(x.grad, case["grad_x"]) < 1e-3
+    for name, parameter in model.named_parameters():
+        expected = case["grad_param_norms"][name]
+        assert abs(parameter.grad.norm().item() - expected) <= 1e-3 * expected + 1e-6, name
