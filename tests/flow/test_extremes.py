@@ -2,15 +2,19 @@
 
 import logging
 import math
+import weakref
+from itertools import product
 
 import pytest
 import torch
+from torch import Tensor
 
 from benchmarks.solvers import Mixed
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
-from r2flow.flow.problems import Gaussian, PointMass, Rotating, StiffLinear, Straight
+from r2flow.flow.problems import PROBLEMS, Gaussian, GaussianMixture, PointMass, Rotating, StiffLinear, Straight
 from r2flow.flow.solvers import LEAST_TOLERANCE, SOLVERS, solve
+from r2flow.noise import Draws
 
 METHODS = [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"]
 X_0 = torch.randn(4, 16, generator=torch.Generator().manual_seed(3))
@@ -64,17 +68,6 @@ def test_the_last_finite_state_is_kept():
     stuck = solve(velocity, torch.zeros(1, 2), method="dopri5")
     assert stuck.x[0, 0].item() == pytest.approx(0.5, abs=1e-5)
     assert not stuck.converged.any()
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_a_velocity_a_thousand_times_too_large_is_solved_or_flagged(method):
-    # Blown up or solved, each scene says which; the state stays finite.
-    problem = Rotating(turns=0.5 * 1e3)
-    solution = solve(problem, X_0, method=method, steps=32, tolerance=1e-3, max_evaluations=1000)
-    assert solution.x.isfinite().all()
-    if method == "dopri5":
-        error = (solution.x.double() - problem.solution(X_0, 1.0)).square().mean(1).sqrt()
-        assert ((error < 1) | ~solution.converged).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -171,12 +164,6 @@ def test_the_type_of_the_weights_sets_the_precision(method, caplog):
     torch.testing.assert_close(floored.x, math.exp(0.5) * X_0, rtol=2e-2, atol=2e-2)
 
 
-def test_a_velocity_of_0_takes_one_step():
-    solution = solve(lambda t, x: 0 * x, X_0, method="dopri5", tolerance=1e-3)
-    assert solution.accepted.tolist() == [1] * 4
-    assert torch.equal(solution.x, X_0)
-
-
 @pytest.mark.parametrize("method", [method for method in METHODS if method != "exprb43"])  # it gives no gradient
 def test_a_network_that_is_being_trained_can_be_solved(method):
     # x' = W x: the end is exp(W) x_0, its sum's gradient is not zero
@@ -217,12 +204,119 @@ def test_an_empty_batch_is_solved(method):
     assert solve(Gaussian(), torch.zeros(0, 4), method=method).x.shape == (0, 4)
 
 
-def test_an_exception_in_the_network_is_raised():
-    def broken(t, x):
-        raise RuntimeError("out of memory")
+def most_alive(method: str, steps: int, tolerance: float) -> tuple[int, int]:
+    """(states alive at once, evaluations) of a solution, counted when the velocity is called."""
+    seen: list[weakref.ref] = []
+    most = 0
 
-    for method in METHODS:
-        with pytest.raises(RuntimeError, match="out of memory"):
-            solve(broken, X_0, method=method)
-    with pytest.raises(ValueError, match="must have the state's shape"):
-        solve(lambda t, x: x[:, :1], X_0)
+    def velocity(t, x):
+        nonlocal most
+        most = max(most, sum(ref() is not None for ref in seen))
+        v = torch.cos(20 * t).reshape(-1, 1, 1, 1) * x
+        seen.extend([weakref.ref(x), weakref.ref(v)])
+        return v
+
+    solution = solve(velocity, torch.randn(2, 2, 4, 8), method=method, steps=steps, tolerance=tolerance)
+    return most, int(solution.evaluations.max())
+
+
+@pytest.mark.parametrize("method", [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"])
+def test_memory_does_not_grow_with_the_number_of_steps(method: str):
+    few, short = most_alive(method, 8, 1e-3)
+    many, long = most_alive(method, 64, 1e-6)
+    assert long >= 2 * short
+    assert many <= few + 2
+
+
+X = torch.randn(1, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("method", sorted(SOLVERS))
+def test_a_velocity_may_write_each_output_into_the_same_buffer(method: str):
+    def pure(t: Tensor, x: Tensor) -> Tensor:
+        return torch.cos(9 * t).reshape(-1, 1) - 3 * x
+
+    buffer = torch.empty_like(X)
+    shared = solve(lambda t, x: buffer.copy_(pure(t, x)), X, method=method, tolerance=1e-6)
+    assert torch.equal(shared.x, solve(pure, X, method=method, tolerance=1e-6).x)
+
+
+@pytest.mark.parametrize("place", [0.31, 0.4567, 0.5, 0.6180339, 0.777])
+@pytest.mark.parametrize(("power", "tolerance"), [(1, 1e-2), (1, 1e-3), (1, 1e-4), (2, 1e-2), (2, 1e-4)])
+def test_no_solution_crosses_a_pole(place: float, power: int, tolerance: float):
+    solution = solve(
+        lambda t, x: ((t - place) ** -power).reshape(-1, 1) + 0 * x, X, method="dopri5", tolerance=tolerance
+    )
+    assert not solution.converged.item()
+
+
+def test_noise_in_a_velocity_is_no_jacobian():
+    noise = torch.Generator().manual_seed(1)
+    solution = solve(
+        lambda t, x: 0.1 * torch.randn(x.shape, generator=noise, dtype=x.dtype) - x, X, method="exprb43", tolerance=1e-4
+    )
+    assert not solution.converged.item()
+    assert solution.x.abs().max() < 10
+
+
+def test_auto_hands_damped_oscillations_over():
+    damped = torch.tensor([[-200.0, 2000.0], [-2000.0, -200.0]], dtype=torch.float64)
+    start = torch.ones(1, 2, dtype=torch.float64)
+    # x' = A x + b cos t with b = (1, 1) ends on Re(c e^it), (i - A) c = b; the transient e^-200 is gone.
+    system = 1j * torch.eye(2, dtype=torch.complex128) - damped
+    exact = (torch.linalg.solve(system, torch.ones(2, dtype=torch.complex128)) * complex(math.cos(1), math.sin(1))).real
+
+    found = {
+        method: solve(lambda t, x: x @ damped.T + torch.cos(t).reshape(-1, 1), start, method=method, tolerance=1e-5)
+        for method in ("auto", "dopri5")
+    }
+    assert found["auto"].converged.item()
+    assert (found["auto"].x - exact).abs().max() < 1e-5
+    assert found["auto"].evaluations.item() < found["dopri5"].evaluations.item() / 2
+
+
+@pytest.mark.parametrize("x_0", [-12.0, -9.0, -8.2, 8.2, 9.0, 12.0])
+def test_exact_ends_of_a_mixture_in_the_far_tail(x_0: float):
+    """A mixture of two equal Gaussians is one Gaussian, whose flow is x_1 = mean + std x_0."""
+    mixture = GaussianMixture((0.5, 0.5), (0.3, 0.3), (0.05, 0.05))
+    end = mixture.solution(torch.tensor([[x_0]], dtype=torch.float64), 1.0)
+    assert end.item() == pytest.approx(0.3 + 0.05 * x_0, abs=1e-9)
+
+
+JET = "narrow_jet"  # the known exception: nothing evaluated on either side of it shows it
+# The type of the state, and of the network where it differs.
+PRECISIONS = [(torch.float64, None)] + [(torch.float32, network) for network in (None, torch.bfloat16, torch.float16)]
+
+
+def rounded(velocity, dtype):
+    """A velocity as a network in half precision gives it; t stays in float32."""
+    return velocity if dtype is None else lambda t, x: velocity(t, x.to(dtype).to(x.dtype)).to(dtype)
+
+
+def verdict(name: str, method: str, tolerance: float, state=torch.float64, network=None) -> str:
+    """'silent': more than ten tolerances off, not flagged, and an estimate more than a factor of five off."""
+    problem, x_0 = PROBLEMS[name](), Draws(0, range(4)).start((32,)).to(state)
+    found = solve(
+        rounded(problem, network), x_0, method=method, tolerance=tolerance, global_error=True, max_evaluations=1000
+    )
+    difference = (found.x.double() - problem.solution(x_0, 1.0).double()).flatten(1)
+    largest = difference.abs().amax(1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
+    errors = largest[:, 0] * (difference / largest).square().mean(1).sqrt()  # squares of stiff problems' overflow
+    failed, estimate = errors > 10 * tolerance, found.global_error
+    flagged = found.stiff | ~found.converged | ~estimate.isfinite()
+    honest = (estimate >= errors / 5) & (estimate <= errors * 5)
+    if (failed & ~flagged & ~honest).any():
+        return "silent"
+    return "failed" if failed.any() else "flagged" if flagged.any() else "solved"
+
+
+@pytest.mark.slow  # every problem by every solver takes minutes on a busy machine
+def test_only_failures_on_the_jet_are_silent():
+    methods = [name for name in SOLVERS if SOLVERS[name].adapts and name not in ("auto", "exprb43")]
+    cells = list(product(PROBLEMS, methods, (1e-3, 1e-5), PRECISIONS))
+    found = {cell: verdict(*cell[:3], *cell[3]) for cell in cells}
+    assert {name for (name, *_), seen in found.items() if seen == "silent"} == {JET}
+    assert sum(seen in ("failed", "silent") for seen in found.values()) > 30  # so that there is something to judge
+    smooth = [seen for (name, *_), seen in found.items() if name in ("straight", "gaussian", "two_modes", "rotating")]
+    assert "flagged" not in smooth
+    assert verdict("stiff_1e4", "auto", 1e-3) == verdict("gaussian", "auto", 1e-3) == "solved"

@@ -256,17 +256,6 @@ def test_every_flow_completes_a_scan(family, method):
             flow(x_0, condition, sampler=build_sampler(plain, steps=2))
 
 
-@pytest.mark.parametrize("text", ["repaint:repeats=0", "repaint:length=1", "mmps:products=x", "mmps:finish=0.1"])
-def test_numbers_that_a_sampler_does_not_have_are_refused(text):
-    with pytest.raises(InputError, match=text.split(":")[1].split("=")[0]):
-        build_sampler(text)
-
-
-def test_times_beyond_the_flow_are_refused():
-    with pytest.raises(InputError, match="time grid"):
-        build_sampler("mmps", grid=(0.0, 2.0))
-
-
 @pytest.mark.parametrize("method", ALL)
 def test_inference_mode_gives_the_same_answers(method):
     draw = torch.Generator().manual_seed(0)

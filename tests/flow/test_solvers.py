@@ -180,15 +180,6 @@ def test_a_scene_does_not_depend_on_its_neighbours(method):
         assert together.evaluations[0] < together.evaluations[3]
 
 
-def test_unknown_methods_are_refused():
-    with pytest.raises(InputError, match=r"Did you mean 'euler'\?"):
-        solve(logistic, X_0, method="eulr")
-    with pytest.raises(InputError, match="dopri55"):
-        solve(logistic, X_0, method="torchdiffeq:dopri55")
-    with pytest.raises(InputError, match="explicit_adams"):
-        solve(logistic, X_0, method="torchdiffeq:explicit_adams")
-
-
 @pytest.mark.parametrize("method", ["euler", "adams3"])
 def test_knots_are_states_of_the_path(method):
     """dx/dt = x: (1 + h)^n after n Euler steps, e^t else."""

@@ -92,14 +92,6 @@ def test_the_most_curved_pixels_are_found_and_followed():
     assert found.curvature.per_pixel.flatten()[found.pixels].diff().max() <= 0
 
 
-def test_evaluations_are_one_a_step_and_pass():
-    calls = []
-    straightness(gaussian, X_0, steps=7, progress=lambda: calls.append(1))
-    assert len(calls) == 14
-    curvature(gaussian, X_0, steps=7, progress=lambda: calls.append(1))
-    assert len(calls) == 21
-
-
 def test_a_path_that_is_not_finite_is_not_the_most_curved():
     def velocity(t, x):
         spoiled = torch.tensor([False, True, False]).view(-1, 1, 1, 1)
