@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,11 @@ def write_scan(path: Path, number: int, reflectance: float = 0.5) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     r = 5.0 + number
     write_points(path, np.array([[r, 0.01, -0.05 * r]], np.float32), np.array([reflectance], np.float32))
+
+
+def numbers(source: Sequence[np.ndarray]) -> list[int]:
+    """The number that each scan of `write_scan` carries in its range."""
+    return [round(float(source[i][0].max())) - 5 for i in range(len(source))]
 
 
 @pytest.fixture

@@ -16,14 +16,12 @@ KINDS = {"flip": True, "roll": True, "beam_dropout": 0.25, "ray_dropout": 0.25}
 
 
 class Slope(ScanSource):
+    """Every pixel has a range of its own, so that it can be found again."""
+
     names = ("slope",)
 
     def subset(self, indices):
         raise NotImplementedError
-
-    """Every pixel has a range of its own, so that it can be found again."""
-
-    names = ("slope",)
 
     def __len__(self) -> int:
         return 1

@@ -29,6 +29,7 @@ from r2flow.noise import standard_normal
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
 from r2flow.store import Store
+from tests.conftest import numbers as of_source
 from tests.conftest import prepare_folder, write_scan
 from tests.fields import Field
 
@@ -47,7 +48,7 @@ def write_image(path: Path, number: int, channels: int = 2, size: tuple[int, int
 
 
 def numbers(scans) -> list[int]:
-    return [round(float(scans.source[i][0].max())) - 5 for i in range(len(scans))]
+    return of_source(scans.source)
 
 
 class TestNames:
@@ -66,32 +67,11 @@ class TestNames:
         assert scans.source.names == ["scene 0", "scene 1"]
         assert scans.source[1][0].any()
 
-    def test_prepared_shards_say_their_sensor(self, numbered: Path, tmp_path: Path):
-        prepare_folder(numbered, tmp_path / "shards", SENSOR)
-        scans = open_scans(tmp_path / "shards")
-        assert scans.sensor == SENSOR
-        assert numbers(scans) == list(range(12))
-
     def test_one_file_of_each_scan_is_taken(self, tmp_path: Path):
         write_scan(tmp_path / "a.bin", 1)
         write_image(tmp_path / "a.npy", 2)
         write_scan(tmp_path / "b.bin", 3)
         assert open_scans(tmp_path, READING).source.names == ["a.npy", "b.bin"]
-
-    @pytest.mark.parametrize(
-        ("name", "said"),
-        [
-            ("nowhere", "nowhere does not exist. Give a scan file, a folder of scans"),
-            ("kitti_630:x", "no data set named 'kitti_630'.*Did you mean 'kitti_360'"),
-            ("simulated:x", "named by their seed"),
-            ("folder:nowhere", "nowhere is not a folder"),
-        ],
-    )
-    def test_what_is_not_there_is_one_line(self, name: str, said: str, tmp_path: Path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        with pytest.raises(InputError, match=said) as error:
-            open_scans(name, READING)
-        assert "\n" not in str(error.value)
 
     def test_a_usual_sensor_is_the_data_set_s(self):
         assert reading_for(["nuscenes:x"]) == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)

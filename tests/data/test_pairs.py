@@ -1,15 +1,16 @@
 """Pairs, their store and their makers. The flow is dx/dt = x, which carries x_0 to e x_0."""
 
-import json
 import math
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 import traceback
+from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -23,9 +24,13 @@ from r2flow.data.pairs import (
     pair_noise,
 )
 from r2flow.errors import InputError
+from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.noise import standard_normal
+from r2flow.reports.pairs import place
+from r2flow.runs.lineage import pairs_of
 from r2flow.samplers import build_sampler
 from r2flow.store import Store
+from tests.conftest import ROOT
 from tests.fields import Field
 
 SHAPE = (2, 4, 8)
@@ -74,13 +79,6 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
         torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)
         assert x_1.dtype == torch.float32
     assert x_1.abs().max() > 1  # nothing is clamped
-
-
-def test_shards_of_three_batches_and_nothing_else_stay(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow)
-    # 50 pairs are 13 whole batches of 4, these 5 shards of 3.
-    assert list(files(tmp_path)) == ["manifest.json", *(f"pairs-{i:06d}.safetensors" for i in range(5))]
-    assert json.loads((tmp_path / "manifest.json").read_text())["recipe"]["parent"] == "abc"
 
 
 @pytest.mark.parametrize("ranks", [2, 3])
@@ -268,13 +266,6 @@ def test_the_folder_is_in_the_run_s():
     assert default_folder(Path("models/flow.pth")) == Path("models/flow-pairs")
 
 
-def test_a_pair_takes_two_bytes_an_element(tmp_path: Path):
-    store = store_in(tmp_path, shard_mib=1, num=400)
-    make_pairs(store, grow)
-    size = sum(len(data) for data in files(tmp_path).values())
-    assert size < 400 * (2 * np.prod(SHAPE) + 4) * 1.1
-
-
 def test_pairs_are_not_kept_among_scans_or_in_another_store(tmp_path: Path):
     (tmp_path / "000000.bin").touch()
     with pytest.raises(InputError, match=r"holds scans \(000000.bin\)"):
@@ -302,3 +293,88 @@ def test_who_waits_says_for_whom_and_who_does_not_leaves_the_rest(tmp_path: Path
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     assert caplog.text.count("waiting for ") == 1
     assert not store.missing(store.shards)
+
+
+QUICK = ("--sampler", "euler", "--steps", 2, "--batch-size", 4, "--num", 10)
+
+
+def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
+    path, _ = saved
+    code, said, _ = r2flow("pairs", path, *QUICK)
+    assert code == 0
+    folder = path.parent.parent / "pairs"
+    for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
+        assert words in said
+    flow = load_checkpoint(path)
+    options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
+    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
+    assert len(PairSource(PairStore(folder, recipe, 10))) == 10
+    code, said, _ = r2flow("pairs", path, *QUICK)
+    assert code == 0
+    assert "pairs/s" not in said  # nothing was left to make
+
+
+@pytest.mark.slow
+def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(saved, tmp_path: Path):
+    path, _ = saved
+
+    def make(out: Path, **environment: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", "r2flow.cli", "pairs", path, *QUICK, "--out", out, "--shard-mib", "0.01"]
+        full = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
+        return subprocess.Popen([str(one) for one in command], env=full, stdout=subprocess.PIPE, text=True)
+
+    jobs = [make(tmp_path / "one")]
+    jobs += [make(tmp_path / "torchrun", RANK=str(i), WORLD_SIZE="3", LOCAL_RANK=str(i)) for i in (2, 0, 1)]
+    array = {"SLURM_ARRAY_TASK_COUNT": "2", "SLURM_ARRAY_TASK_MIN": "5"}
+    jobs += [make(tmp_path / "array", SLURM_ARRAY_TASK_ID=str(i), **array) for i in (5, 6)]
+    for job in jobs:
+        said, _ = job.communicate(timeout=200)
+        assert job.returncode == 0, said
+    found = [{p.name: p.read_bytes() for p in (tmp_path / kind).iterdir()} for kind in ("one", "torchrun", "array")]
+    assert len(found[0]) >= 3
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        ({}, (0, 1, 0)),
+        ({"RANK": "5", "WORLD_SIZE": "16", "LOCAL_RANK": "1"}, (5, 16, 1)),
+        ({"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "8", "SLURM_ARRAY_TASK_MIN": "0"}, (3, 8, 0)),
+        ({"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "8", "SLURM_ARRAY_TASK_MIN": "1"}, (2, 8, 0)),
+        ({"SLURM_PROCID": "3", "SLURM_STEP_NUM_TASKS": "8", "SLURM_LOCALID": "3"}, (3, 8, 3)),
+        # A batch script asked for 8 tasks, but this process was not started by srun: it is alone.
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_STEP_NUM_TASKS": "1"}, (0, 1, 0)),
+        # An array of 4 jobs of 2 processes each.
+        (
+            {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "4", "SLURM_ARRAY_TASK_MIN": "0",
+             "SLURM_PROCID": "1", "SLURM_STEP_NUM_TASKS": "2", "SLURM_LOCALID": "1"},
+            (5, 8, 1),
+        ),
+        # torchrun with 2 processes in each job of an array of 3.
+        (
+            {"SLURM_ARRAY_TASK_ID": "1", "SLURM_ARRAY_TASK_COUNT": "3", "SLURM_ARRAY_TASK_MIN": "0",
+             "RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"},
+            (3, 6, 1),
+        ),
+        # --array=0-6:2
+        ({"SLURM_ARRAY_TASK_ID": "4", "SLURM_ARRAY_TASK_COUNT": "4", "SLURM_ARRAY_TASK_STEP": "2"}, (2, 4, 0)),
+    ],
+)  # fmt: skip
+def test_where_a_process_stands(environment: dict[str, str], expected: tuple[int, int, int]):
+    assert place(environment) == expected
+
+
+def test_the_defaults_are_those_of_the_config():
+    import inspect
+
+    import yaml
+
+    from r2flow.cli.train import pairs
+
+    written = yaml.safe_load((ROOT / "conf/data/base.yaml").read_text())["pairs"]
+    asked = {name: one.default for name, one in inspect.signature(pairs).parameters.items() if one.default is not None}
+    assert "solver" not in asked
+    defaults = asdict(PairOptions()) | asked
+    written["sampler"] = {key: value for key, value in written["sampler"].items() if value is not None}
+    assert written == {key: defaults[key] for key in written}

@@ -6,6 +6,7 @@ import os
 import pickle
 import random
 import resource
+import shutil
 import signal
 import time
 from dataclasses import replace
@@ -14,20 +15,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
-from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive
-from r2flow.data.opening import find_drives, open_prepared
+from r2flow.data.opening import SOURCES, find_drives, open_prepared
 from r2flow.data.prepared import Plan, plan_files, prepare, read_prepared
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.reading import Reading
+from r2flow.data.reading import Reading, read_scan
 from r2flow.data.sources import ScanFiles
 from r2flow.errors import InputError
-from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST, Damaged, read_manifest
+from tests.conftest import ROOT
 from tests.killing import MOMENTS, die_at, wait_until, was_killed
+from tests.training.conftest import TINY, in_process
 
 SMALL = SENSORS["hdl64e"].resized(4, 16)
 MILLIMETRE = 1e-3
@@ -90,20 +92,6 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
     assert error.max() <= max(MILLIMETRE, (far - 65) / 31_000 / 2 * 1.01)
     assert decoded.min() >= np.float32(near)
     assert decoded.max() <= np.float32(far)
-
-
-def test_code_0_is_no_return_and_nothing_else_is(sensor: Sensor):
-    codes = RangeCodes(sensor.min_range, sensor.max_range)
-    assert codes.values[0] == 0
-    assert codes.values[1:].min() == np.float32(sensor.min_range)
-    assert codes.encode(np.array([0, sensor.min_range, sensor.max_range], np.float32)).tolist() == [0, 1, 65535]
-    assert (np.diff(codes.values[1:]) > 0).all()
-
-
-@pytest.mark.parametrize("wrong", [1.0, 81.0, -2.0, np.nan, np.inf])
-def test_what_is_no_range_of_the_sensor_is_refused(wrong: float):
-    with pytest.raises(ValueError, match=r"ranges must be 0 or lie in \[1.45, 80\] m"):
-        RangeCodes(1.45, 80.0).encode(np.array([5.0, wrong], np.float32))
 
 
 @pytest.mark.parametrize("levels", [256, 100, 255])
@@ -191,26 +179,6 @@ def test_real_scans_keep_their_reflectance_to_the_bit(
         assert np.abs(image[0] - other[0]).max() <= MILLIMETRE
 
 
-def test_training_from_shards_is_training_from_the_files(clouds: Path, tmp_path: Path):
-    make(tmp_path, plan_of(clouds))
-    encoding = Encoding(SMALL)
-    raw = ScanDataModule(SMALL, encoding, 0, name="folder", root=str(clouds))
-    prepared = ScanDataModule(SMALL, encoding, 0, name="prepared", root=str(tmp_path))
-    for module in (raw, prepared):
-        module.setup()
-    assert prepared.fingerprint() == raw.fingerprint()
-    for name in ("training_source", "validation_source"):
-        one, other = (module._dataset(getattr(module, name), "training") for module in (raw, prepared))
-        assert len(one) == len(other) > 0
-        for index in range(len(one)):
-            item, same = one[(7 + index, index)], other[(7 + index, index)]
-            assert set(item) == set(same)
-            for key in ("x_0", "u", "k"):
-                assert torch.equal(item[key], same[key])
-            # Model space is steepest at 1.45 m: 2 / (ln 81 (1 + 1.45)) = 0.186 a metre.
-            assert (item["x_1"] - same["x_1"]).abs().max() <= 0.186 * MILLIMETRE
-
-
 # What is stored
 
 
@@ -227,8 +195,6 @@ def test_a_shard_is_three_bytes_a_pixel_and_readable_by_anybody(clouds: Path, tm
 
 
 def test_nothing_tells_where_the_files_lie(clouds: Path, tmp_path: Path):
-    import shutil
-
     moved = tmp_path / "elsewhere"
     shutil.copytree(clouds, moved)
     one, other = make(tmp_path / "one", plan_of(clouds)), make(tmp_path / "other", plan_of(moved))
@@ -311,8 +277,6 @@ def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch
 
 
 def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tmp_path: Path, caplog):
-    import shutil
-
     root = tmp_path / "scans"
     shutil.copytree(clouds, root)
     for name in ("drive0/000001.bin", "drive0/000003.bin", "drive0/000004.bin", "drive0/000005.bin"):
@@ -360,7 +324,7 @@ class Slow:
         return self.source[index]
 
 
-def in_process(folder: Path, plan: Plan, seconds: float = 0.0, dies: tuple[int, bool] | None = None, **options) -> int:
+def in_child(folder: Path, plan: Plan, seconds: float = 0.0, dies: tuple[int, bool] | None = None, **options) -> int:
     """`make` in a child of its own, with scans that take their time and perhaps a moment to die: its process id."""
     child = os.fork()
     if child == 0:
@@ -386,7 +350,7 @@ def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_pa
     one = files(make(tmp_path / "one", plan))
     folder, kept = tmp_path / "killed", []
     for dies in MOMENTS:
-        assert was_killed(in_process(folder, plan, dies=dies))
+        assert was_killed(in_child(folder, plan, dies=dies))
         kept.append(len(list(folder.glob("scans-*"))))
     assert kept == sorted(kept)  # what was whole stays
     assert files(make(folder, plan)) == one
@@ -396,7 +360,7 @@ def test_several_at_once_share_the_work(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds, shard_scans=1)
     one = files(make(tmp_path / "one", plan))
     start = time.monotonic()
-    children = [in_process(tmp_path / "many", plan, seconds=0.05) for _ in range(4)]
+    children = [in_child(tmp_path / "many", plan, seconds=0.05) for _ in range(4)]
     statuses = [os.waitpid(child, 0)[1] for child in children]
     assert statuses == [0, 0, 0, 0]
     assert files(tmp_path / "many") == one
@@ -406,9 +370,9 @@ def test_several_at_once_share_the_work(clouds: Path, tmp_path: Path):
 def test_who_waits_takes_over_from_who_is_killed(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds, shard_scans=10)
     one = files(make(tmp_path / "one", plan))
-    slow = in_process(tmp_path / "two", plan, seconds=30)
+    slow = in_child(tmp_path / "two", plan, seconds=30)
     wait_until((tmp_path / "two" / ".scans-000000.lock").exists)
-    other = in_process(tmp_path / "two", plan)
+    other = in_child(tmp_path / "two", plan)
     time.sleep(0.05)
     os.kill(slow, signal.SIGKILL)
     os.waitpid(slow, 0)
@@ -433,33 +397,7 @@ def test_a_file_that_cannot_grow_leaves_no_part_of_itself(clouds: Path, tmp_path
 # Damage
 
 
-def _cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def _huge(path: Path) -> None:
-    os.truncate(path, 1 << 40)
-
-
-def _text(path: Path) -> None:
-    path.write_text("no shard\n" * 300)
-
-
-def _missing(path: Path) -> None:
-    path.unlink()
-
-
-def _dangling(path: Path) -> None:
-    path.unlink()
-    path.symlink_to(path.with_name("nowhere"))
-
-
-def _folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def _wrong_type(path: Path) -> None:
+def wrong_type(path: Path) -> None:
     from safetensors import safe_open
     from safetensors.numpy import load_file, save_file
 
@@ -468,17 +406,26 @@ def _wrong_type(path: Path) -> None:
     save_file({**(tensors := load_file(path)), "range": tensors["range"].astype(np.int16)}, path, notes)
 
 
-def _swapped(path: Path) -> None:
+def swapped(path: Path) -> None:
     other = path.with_name("scans-000002.safetensors")
     data = other.read_bytes()
     other.write_bytes(path.read_bytes())
     path.write_bytes(data)
 
 
-DAMAGES = [
-    _cut, _huge, _text, _missing, _dangling, _folder, _wrong_type, _swapped,
-]  # fmt: skip
-GONE = (_missing, _dangling, _folder)
+GONE = {
+    "missing": Path.unlink,
+    "dangling": lambda path: (path.unlink(), path.symlink_to(path.with_name("nowhere"))),
+    "folder": lambda path: (path.unlink(), path.mkdir()),
+}
+DAMAGES = {
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-100]),
+    "huge": lambda path: os.truncate(path, 1 << 40),
+    "text": lambda path: path.write_text("no shard\n" * 300),
+    "wrong type": wrong_type,
+    "swapped": swapped,
+    **GONE,
+}
 
 
 def damaged(folder: Path) -> list[Path]:
@@ -498,16 +445,16 @@ def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_pat
     plan = plan_of(clouds)
     make(tmp_path, plan)
     whole, path = files(tmp_path), tmp_path / "scans-000001.safetensors"
-    damage(path)
+    DAMAGES[damage](path)
     assert path in damaged(tmp_path)
-    if damage is not _wrong_type:  # of which the head says nothing
+    if damage != "wrong type":  # of which the head says nothing
         with pytest.raises(InputError, match="is not finished" if damage in GONE else "scans-000001.safetensors is da"):
             prepared_in(tmp_path)
-    if damage is _folder:
+    if damage == "folder":
         path.rmdir()
     made = []
     prepare(tmp_path, plan, made=made.append)
-    assert made == ([1, 2] if damage is _swapped else [1])  # these alone
+    assert made == ([1, 2] if damage == "swapped" else [1])  # these alone
     assert files(tmp_path) == whole
     assert damaged(tmp_path) == []
 
@@ -545,3 +492,81 @@ def test_no_flipped_bit_of_the_manifest_goes_unnoticed(clouds: Path, tmp_path: P
     path.unlink()
     with pytest.raises(InputError, match="holds no prepared scans"):
         prepared_in(tmp_path)
+
+
+def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
+    out = tmp_path / "out"
+    typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 4)
+    code, said, _ = r2flow(*typed, "--workers", 1)
+    assert code == 0
+    assert f"{out}: 6 scans in 2 shards, 0.0 MiB; range within" in said
+    assert "reflectance as n/256, exactly" in said
+    source = open_prepared(out, Reading(SMALL, reflectance=True))
+    assert len(source) == 6
+    raw = read_scan(kitti_360 / source.names[5], SMALL)
+    assert np.abs(source[5] - raw).max() <= 1e-3
+
+
+def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):
+    config = yaml.safe_load((ROOT / "conf" / "data" / "nuscenes.yaml").read_text())
+    r, e = np.full(3, 10.0), np.deg2rad([10.0, 0.0, -30.0])  # the first and the last out of an HDL-64E's view
+    points = np.stack([r * np.cos(e), np.zeros(3), r * np.sin(e), [0, 100, 255], [31, 23, 0]], 1)
+    path = tmp_path / "scans" / "n015-2018-07-24-11-22-45+0800__LIDAR_TOP__1532402927647951.pcd.bin"
+    path.parent.mkdir()
+    path.write_bytes(points.astype("<f4").tobytes())
+    code, _, error = r2flow("prepare", f"nuscenes:{path.parent}", "--out", tmp_path / "out", "--workers", 1)
+    assert (code, error.split("error")[1:]) == (0, [])
+    recipe = read_manifest(tmp_path / "out")["recipe"]["reading"]
+    assert {"override /sensor@_global_.sensor": recipe["sensor"]["name"]} in config["defaults"]
+    assert recipe["reflectance_scale"] == SOURCES["nuscenes"].reflectance_scale
+    image = open_prepared(tmp_path / "out", Reading(SENSORS["hdl32e"], reflectance=True))[0]
+    assert np.count_nonzero(image[0]) == 3
+    assert np.array_equal(np.unique(image[1]), np.array([0, 100 / 255, 1], np.float32))
+
+
+def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):
+    """Rows of time, z, y, x, reflectance and ring: every verb and run that reads them is told by one option."""
+    wide = tmp_path / "wide"
+    wide.mkdir()
+    for path in sorted(numbered.iterdir()):
+        x, y, z, reflectance = np.fromfile(path, np.float32).reshape(-1, 4).T
+        np.column_stack([x * 0 + 7, z, y, x, reflectance, x * 0]).astype(np.float32).tofile(wide / path.name)
+    columns, small = ("--columns", "time,z,y,x,intensity,_"), ("--size", "4x16", "--workers", 1)
+    for out, given in (("one", (numbered,)), ("two", (wide, *columns))):
+        code, _, error = r2flow("prepare", *given, *small, "--out", tmp_path / out)
+        assert (code, error) == (0, "")
+    for one, two in zip(
+        open_prepared(tmp_path / "one", Reading(SMALL, reflectance=True)),
+        open_prepared(tmp_path / "two", Reading(SMALL, reflectance=True)),
+        strict=False,
+    ):
+        assert np.array_equal(one, two)
+    assert read_manifest(tmp_path / "one")["recipe"]["reading"]["columns"] is None
+    code, _, error = r2flow("prepare", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two")
+    assert code == 2
+    assert "reading.columns=" in error
+    scan = wide / "000000.bin"
+    assert r2flow("show", scan, *columns, "--size", "4x16", "--format", "npy", "-o", tmp_path / "image")[0] == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "image" / "000000.npy"), read_scan(numbered / "000000.bin", SMALL))
+    for verb in (
+        ("show", scan, "--out", tmp_path / "v"),
+        ("evaluate", wide, scan, "--size", "4x16", "--metrics", "jsd"),
+    ):
+        assert r2flow(*verb, *columns)[0] == 0
+    for wrong in ("x,y", "x,y,z,x", "x,y,z,intensity,i"):
+        code, _, error = r2flow("show", scan, "--columns", wrong, "--out", tmp_path / "v")
+        assert (code, error.count("\n")) == (2, 1)
+        assert "columns must name x, y and z" in error
+
+
+def test_a_run_is_told_the_columns_too(numbered, tmp_path):
+    wide = tmp_path / "wide"
+    wide.mkdir()
+    for path in sorted(numbered.iterdir()):
+        x, y, z, reflectance = np.fromfile(path, np.float32).reshape(-1, 4).T
+        np.save(wide / f"{path.stem}.npy", np.column_stack([z, y, x, reflectance, x * 0]))
+    given = [*TINY, f"data.root={wide}", "trainer.max_steps=1", "trainer.fast_dev_run=true"]
+    in_process(tmp_path, [*given, "data.reading.columns=[z,y,x,intensity,_]"])
+    done = in_process(tmp_path, given, check=False)
+    assert done.returncode == 2
+    assert "5 columns without names" in done.stderr.splitlines()[-1]

@@ -9,14 +9,9 @@ from r2flow.data.sources import InMemory, ScanFiles, holdout_block, spread
 from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from tests.conftest import write_scan
+from tests.conftest import numbers, write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
-
-
-def ranges(source) -> list[int]:
-    """The number that each scan carries in its range."""
-    return [round(float(source[i][0].max())) - 5 for i in range(len(source))]
 
 
 def files(folder: Path, **options) -> ScanFiles:
@@ -35,11 +30,11 @@ def test_skipping_takes_the_next_good_scan_of_the_same_block(numbered: Path, cap
         (numbered / f"{bad:06d}.bin").write_bytes(b"\0" * 30)
     with caplog.at_level(logging.WARNING):
         source = files(numbered, on_bad_scan="skip")
-        assert ranges(source) == [0, 1, 2, 5, 5, 5, 6, 7, 8, 9, 10, 0]
-        assert ranges(source) == [0, 1, 2, 5, 5, 5, 6, 7, 8, 9, 10, 0]
+        assert numbers(source) == [0, 1, 2, 5, 5, 5, 6, 7, 8, 9, 10, 0]
+        assert numbers(source) == [0, 1, 2, 5, 5, 5, 6, 7, 8, 9, 10, 0]
     assert len([r for r in caplog.records if "left out" in r.message]) == 3  # each is said once
     # A block never reaches into its neighbour: scan 11 is not replaced by scan 0 of the training block.
-    assert ranges(source.subset(range(9, 12))) == [9, 10, 9]
+    assert numbers(source.subset(range(9, 12))) == [9, 10, 9]
 
 
 def test_memory_holds_what_the_files_give(numbered: Path):
@@ -47,8 +42,8 @@ def test_memory_holds_what_the_files_give(numbered: Path):
     (numbered / "000003.bin").write_bytes(b"")
     source = files(numbered, on_bad_scan="skip")
     kept = InMemory(source.batch(range(12)).numpy(), source.names)
-    assert ranges(kept) == ranges(source) == [0, 1, 2, 4, 4, 5, 6, 7, 8, 9, 10, 11]
-    assert ranges(kept.subset([2, 3])) == [2, 4]
+    assert numbers(kept) == numbers(source) == [0, 1, 2, 4, 4, 5, 6, 7, 8, 9, 10, 11]
+    assert numbers(kept.subset([2, 3])) == [2, 4]
 
 
 def test_when_all_are_bad_it_ends(numbered: Path):
@@ -68,7 +63,7 @@ def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, ca
     assert (image[0] > 0).sum() == 2
 
 
-def test_a_scan_out_of_range_says_its_ranges(tmp_path: Path):
+def test_a_scan_out_of_range_says_its_numbers(tmp_path: Path):
     write_scan(tmp_path / "far.bin", 200)
     with pytest.raises(InputError, match=r"far.bin: none of its 1 points lies within 1.45-80 m .* 205-205 m"):
         read_scan(tmp_path / "far.bin", SENSOR)
@@ -108,25 +103,6 @@ def test_whole_drives_are_held_out_where_they_come_within_half_of_the_share():
     assert held(0.1, [0, 98]) == 10
     assert held(0.0, [0, 99]) == 0
     assert held(0.9, [0, 10]) == 90
-
-
-def test_names_are_told_below_the_root(numbered: Path):
-    source = ScanFiles([str(path) for path in sorted(numbered.glob("*.bin"))], Reading(SENSOR), numbered.parent)
-    assert source.names[:2] == ["scans/000000.bin", "scans/000001.bin"]
-    assert source.subset([3]).names == ["scans/000003.bin"]
-
-
-def test_a_coordinate_that_no_lidar_measures_costs_its_point_and_is_said(tmp_path: Path, caplog):
-    rows = np.array([[10, 0, -1, 0.5]] + [[11, 2, -1, 0.5]] * 30, np.float32)
-    rows[0, 1] = np.frombuffer((np.float32(3.5).view(np.uint32) ^ (1 << 30)).tobytes(), np.float32)[0]  # a flipped bit
-    assert 0 < rows[0, 1] < 1e-30  # the exponent's highest bit, which was set, is gone: nothing to see in that
-    rows[1, 1] = np.frombuffer((np.float32(0.5).view(np.uint32) ^ (1 << 30)).tobytes(), np.float32)[0]
-    assert rows[1, 1] > 1e30
-    rows.tofile(tmp_path / "scan.bin")
-    with caplog.at_level(logging.WARNING):
-        read_scan(tmp_path / "scan.bin", SENSOR)
-        tell_odd()
-    assert "are dropped; 1 file, most in scan.bin (1)" in caplog.text
 
 
 def test_few_of_many_are_spread_evenly():
