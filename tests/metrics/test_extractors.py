@@ -1,12 +1,21 @@
-"""What holds for the features of every network of the table."""
+"""Features of the networks of the table: what holds for all of them, then network by network."""
+
+import math
 
 import pytest
 import torch
 
+from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.extractors import EXTRACTORS
+from r2flow.metrics.extractors import EXTRACTORS, pointnet
+from r2flow.metrics.extractors.minkowski import MinkowskiNet
+from r2flow.metrics.extractors.pointnet import PointNet
+from r2flow.metrics.extractors.rangenet import RangeNet21, RangeNet53, translate
+from r2flow.metrics.extractors.spvcnn import SPVCNN
+from r2flow.metrics.extractors.voxels import mean_by_distance, voxelise
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import untrained
+from tests.reference import load_case
 
 SMALL = SENSORS["hdl64e"].resized(16, 32)
 
@@ -31,3 +40,194 @@ def test_features_are_of_each_scan_alone(name):
         assert (network.features(Scans(darker, SMALL))[0] != features[0]).any()
     else:
         torch.testing.assert_close(network.features(Scans(images[:, :1], SMALL)), features, equal_nan=True)
+
+
+@pytest.fixture(scope="module")
+def pointnet_of_small():
+    return untrained(PointNet)
+
+
+@torch.inference_mode()
+def test_pointnet_is_the_reference(shared, monkeypatch):
+    case = load_case(shared, "feat_pointnet.pt")
+    pointnet_of_small = PointNet(case["cfg"]["k"]).eval()
+    pointnet_of_small.load_state_dict(case["state_dict"], strict=True)
+    torch.testing.assert_close(pointnet_of_small(case["x"]), case["output"], rtol=1e-4, atol=1e-4)
+    monkeypatch.setattr(pointnet, "CHUNK", 2 * 300)  # points in parts: 300 of each scan, and a rest
+    torch.testing.assert_close(pointnet_of_small(case["x"]), case["output"], rtol=1e-4, atol=1e-4)
+
+
+def test_a_dropped_ray_is_the_origin_in_units_of_80_m(pointnet_of_small):
+    images = torch.rand(1, 1, *SMALL.shape) * 50 + 1
+    images[0, 0, :, ::3] = 0
+    batch = Scans(images, SMALL)
+    points = torch.cat([batch.points[0], torch.zeros(1, 3)]).T[None] / 80
+    order = torch.randperm(points.shape[2])
+    torch.testing.assert_close(
+        pointnet_of_small.features(batch), pointnet_of_small(points[:, :, order]), rtol=1e-5, atol=1e-5
+    )
+
+
+@pytest.fixture(scope="module")
+def case(shared):
+    return load_case(shared, "feat_rangenet21.pt")
+
+
+@pytest.fixture(scope="module")
+def network():
+    return untrained(RangeNet21)
+
+
+def scans(num: int = 3, channels: int = 2) -> Scans:
+    images = torch.rand(num, channels, *SMALL.shape)
+    images[:, 0] = images[:, 0] * 50 + 1
+    return Scans(images * (torch.rand(num, 1, *SMALL.shape) > 0.2), SMALL)
+
+
+@torch.inference_mode()
+def test_rangenet21_is_the_reference(case):
+    network = RangeNet21(
+        num_classes=case["cfg"]["num_classes"], mean=tuple(case["mean"]), std=tuple(case["std"])
+    ).eval()
+    network.load_state_dict(case["state_dict"], strict=True)
+
+    def close(found, expected):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+
+    x = network.normalise(case["img"])
+    close(x, case["pre"])
+    maps = network(x)
+    close(maps[:1], case["penultimate_b0"])
+    close(maps.mean((2, 3)), case["penultimate_mean"])
+    close(maps.mean((2, 3)), case["glob"])
+    close(network.head(maps[:1]), case["logits_b0"])
+    close(network.pool(maps), case["depth"])
+    with torch.device("meta"):
+        network = RangeNet53()
+    close(network.pool(maps), case["subsample"])
+
+
+def test_the_published_depth_is_bands_of_rows(network):
+    maps = torch.arange(64.0).view(1, 1, 64, 1).expand(1, 2, 64, 32) * torch.tensor([1.0, -1.0]).view(1, 2, 1, 1)
+    rows = torch.arange(16.0) * 4 + 1.5  # mean of rows 4 i .. 4 i + 3
+    torch.testing.assert_close(network.pool(maps), torch.cat([rows, -rows])[None])
+
+
+def release(layers: int) -> set[str]:
+    """Parameters of the original release's three files, written down from its layers."""
+    norm = [f"{{}}.{part}" for part in ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")]
+    names = ["conv1.weight", *(n.format("bn1") for n in norm), "1.weight", "1.bias"]
+
+    def residual(at: str) -> list[str]:
+        return [f"{at}.conv{i}.weight" for i in (1, 2)] + [n.format(f"{at}.bn{i}") for i in (1, 2) for n in norm]
+
+    for level, blocks in enumerate({21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}[layers], start=1):
+        names += [f"enc{level}.conv.weight", *(n.format(f"enc{level}.bn") for n in norm)]
+        for block in range(blocks):
+            names += residual(f"enc{level}.residual_{block}")
+        names += [f"dec{level}.upconv.weight", f"dec{level}.upconv.bias", *(n.format(f"dec{level}.bn") for n in norm)]
+        names += residual(f"dec{level}.residual")
+    return set(names)
+
+
+@pytest.mark.parametrize(("cls", "parts"), [(RangeNet21, 21), (RangeNet53, 53)])
+def test_names_of_the_original_release_are_ours(cls, parts):
+    with torch.device("meta"):
+        ours = set(cls(num_classes=20).state_dict())
+    theirs = release(parts)
+    assert {translate(name) for name in theirs} == ours
+    assert len(theirs) == len(ours)
+    assert {translate(name) for name in ours} == ours
+
+
+def test_names_that_are_translated_mean_the_same():
+    assert translate("conv1.weight") == "stem.0.weight"
+    assert translate("enc4.residual_7.bn2.bias") == "enc4.residual_blocks.7.residual.1.1.bias"
+    assert translate("dec3.upconv.bias") == "dec3.conv.0.bias"
+    assert translate("decoder.dec3.residual.conv1.weight") == "dec3.residual_blocks.0.residual.0.0.weight"
+    assert translate("1.bias") == "head.1.bias"
+
+
+def test_weights_bring_their_normalisation_and_their_classes(network):
+    tensors = {name: tensor for name, tensor in network.state_dict().items() if not name.startswith("head")}
+    config = {"dataset": {"sensor": {"img_means": [1, 2, 3, 4, 5], "img_stds": [2, 2, 2, 4, 5]}}}
+    loaded = RangeNet21.from_tensors(tensors, config)
+    assert loaded.head is None
+    image = torch.tensor([3.0, 4.0, 3.0, 0.0]).view(1, 4, 1, 1)
+    assert loaded.normalise(image).flatten().tolist() == [1, 1, 0, -1]
+    assert not loaded.normalise(image * 0).any()  # no return
+    with pytest.raises(InputError, match="4 finite img_means"):
+        RangeNet21.from_tensors(
+            tensors, {"dataset": {"sensor": {"img_means": [1, 2, 3, math.nan], "img_stds": [1] * 4}}}
+        )
+    with pytest.raises(InputError, match="4 finite img_means and img_stds"):
+        RangeNet21.from_tensors(tensors, {"dataset": {"sensor": {"img_means": [1], "img_stds": "x"}}})
+    with pytest.raises(InputError, match="not the weights of rangenet21.*stem.0.weight"):
+        RangeNet21.from_tensors({name: t for name, t in tensors.items() if name != "stem.0.weight"}, {})
+
+
+@pytest.mark.parametrize("size", [(16, 40), (12, 32)])
+def test_sizes_that_the_network_cannot_take_name_the_option(network, size):
+    with pytest.raises(InputError, match="--size"):
+        network.features(Scans(torch.ones(1, 1, *size), SENSORS["hdl64e"].resized(*size)))
+
+
+@pytest.fixture(scope="module")
+def voxels(shared):
+    return torch.load(shared / "oracle" / "voxel_prepost.pt", weights_only=True)
+
+
+def test_voxels_are_the_reference_s(voxels):
+    coords, features = voxelise(voxels["points"])
+    torch.testing.assert_close(coords, voxels["voxel_coords"], rtol=0, atol=0)
+    torch.testing.assert_close(features, voxels["voxel_feats"], rtol=1e-4, atol=1e-4)
+
+
+def test_pooling_is_the_reference_s(voxels):
+    features, coords = voxels["post_features_in"], voxels["voxel_coords"]
+    torch.testing.assert_close(mean_by_distance(features, coords)[None], voxels["post_depth"], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(features.mean(0)[None], voxels["post_global"], rtol=1e-4, atol=1e-4)
+
+
+def test_voxels_by_hand():
+    # In voxels of 5 cm: (20, 0, 0), a point of the same voxel, no point at all, and (-20, 10, 2).
+    points = torch.tensor([[1.0, 0.0, 0.0], [1.02, 0.01, 0.0], [0.0, 0.0, 0.0], [-1.0, 0.5, 0.1]])
+    coords, features = voxelise(points)
+    assert coords.tolist() == [[40, 0, 0], [0, 10, 2]]
+    torch.testing.assert_close(features, torch.tensor([[1.0, 0, 0, -1], [-1, 0.5, 0.1, -1]]))
+    assert voxelise(points[2:3])[0].shape == (0, 3)
+
+
+def test_sectors_by_hand():
+    # Four voxels about their centroid: two about 1 m off, two about 10 m off, of 20 voxels a metre.
+    coords = torch.tensor([[20, 3, 0], [-20, -3, 0], [-30, 200, 0], [30, -200, 0]]) + 500
+    features = torch.tensor([[1.0], [3.0], [10.0], [20.0]])
+    # Edges 0, 7.25, 10.5, ...: 4 + 52 i / 16 m, the first put to 0.
+    assert mean_by_distance(features, coords).tolist() == [2, 15] + [0] * 14
+    far = coords * 1000
+    assert mean_by_distance(features, far).tolist() == [0] * 16
+
+
+@pytest.mark.parametrize("cls", [MinkowskiNet, SPVCNN])
+def test_sizes_are_read_off_the_weights(cls):
+    saved = cls((2, 3, 4, 5, 6, 7, 8, 9, 10), num_classes=11, channels=4).state_dict()
+    loaded = cls.from_tensors({**saved, "criterion.weight": torch.ones(11)}, {})  # and what the loss left there
+    assert loaded.dim == 160
+    assert all(torch.equal(value, saved[name]) for name, value in loaded.state_dict().items())
+    assert not any(module.training for module in loaded.modules())
+    del saved["up3.1.0.net.0.kernel"]
+    with pytest.raises(InputError, match="up3.1.0.net.0.kernel"):
+        cls.from_tensors(saved, {})
+    with pytest.raises(InputError, match="not the weights of"):
+        cls.from_tensors({"stem.0.kernel": torch.zeros(2)}, {})
+
+
+def test_distance_sectors_do_not_see_azimuth():
+    # x -> y, y -> -x carries voxels onto voxels, and each onto one as far from the centroid.
+    points = torch.randint(-400, 400, (500, 3)).float() * 0.05
+    coords, _ = voxelise(points)
+    turned, _ = voxelise(points @ torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
+    assert torch.equal(turned[:, 0], coords[:, 1].max() - coords[:, 1])
+    features = torch.randn(len(coords), 2)
+    found = mean_by_distance(features, turned)
+    torch.testing.assert_close(found, mean_by_distance(features, coords), rtol=1e-5, atol=1e-5)
