@@ -125,10 +125,10 @@ def test_a_config_that_contains_itself_is_refused(saved, tmp_path: Path):
         load_checkpoint(path)
 
 
-def test_a_step_without_end_in_notes_is_refused(saved, tmp_path: Path):
+@pytest.mark.parametrize("notes", [json.dumps({"config": CONFIG, "step": math.inf}), "[" * 100_000])
+def test_notes_without_end_are_refused(tmp_path: Path, notes: str):
     path = tmp_path / "model.safetensors"
-    notes = {"config": CONFIG, "step": math.inf}
-    safetensors.torch.save_file({"x": torch.zeros(1)}, path, metadata={"r2flow": json.dumps(notes)})
+    safetensors.torch.save_file({"x": torch.zeros(1)}, path, metadata={"r2flow": notes})
     with pytest.raises(InputError, match="damaged"):
         load_checkpoint(path)
 
@@ -183,13 +183,6 @@ def test_weights_that_are_no_plain_numbers_are_refused(saved, kind):
         load_checkpoint(path)
 
 
-def test_notes_that_are_nested_without_end_are_refused(saved, tmp_path: Path):
-    path = tmp_path / "deep.safetensors"
-    safetensors.torch.save_file({"x": torch.zeros(1)}, path, metadata={"r2flow": "[" * 100_000})
-    with pytest.raises(InputError, match="is not a readable .safetensors file .*nested too deeply"):
-        load_checkpoint(path)
-
-
 def test_weights_that_do_not_fit_name_the_first(saved):
     path, averaged = saved
     name = next(iter(averaged))
@@ -227,14 +220,6 @@ def test_published_weights_are_kept_bit_by_bit(shared, tmp_path: Path):
         save_checkpoint(published, tmp_path / "model.pth")
 
 
-def test_damaged_safetensors_say_so(saved, tmp_path: Path):
-    path = tmp_path / "model.safetensors"
-    save_checkpoint(load_checkpoint(saved[0]), path)
-    path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(InputError, match=r"model.safetensors is not a readable .safetensors file"):
-        load_checkpoint(path)
-
-
 def test_an_unfolding_checkpoint_brings_its_ring_angles(shared, tmp_path: Path):
     content = torch.load(shared / "oracle" / "published_format.pth", weights_only=True)
     content["cfg"]["data"]["projection"] = "unfolding-192"
@@ -249,6 +234,7 @@ def test_an_unfolding_checkpoint_brings_its_ring_angles(shared, tmp_path: Path):
 def test_loading_and_sampling_import_nothing_that_they_do_not_need(saved):
     code = f"""
 import sys
+import r2flow.cli.verbs
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
 

@@ -1,15 +1,19 @@
 import errno
+import hashlib
 import io
 import os
 import socket
 import stat
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from r2flow.errors import InputError, explain_mistake
 from r2flow.files import atomic_write
+from r2flow.hashing import state_hash
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -141,3 +145,14 @@ def test_a_read_only_folder_is_an_error_with_the_file_s_own_name(tmp_path, monke
     with pytest.raises(PermissionError) as raised, atomic_write(tmp_path / "out.json"):
         pass
     assert explain_mistake(raised.value) == f"{tmp_path / 'out.json'}: Permission denied"
+
+
+def test_the_hash_of_a_state_is_of_names_shapes_types_and_bytes():
+    state = {"b": torch.tensor([1.0, 2.0]).bfloat16(), "a": torch.tensor([[1, 2], [3, 4]]).T, "c": torch.tensor(0.5)}
+    named = (
+        b"a (2, 2) torch.int64" + struct.pack("<4q", 1, 3, 2, 4)
+        + b"b (2,) torch.bfloat16" + bytes.fromhex("803f0040")
+        + b"c () torch.float32" + struct.pack("<f", 0.5)
+    )  # fmt: skip
+    assert state_hash(state) == hashlib.sha256(named).hexdigest()
+    assert state_hash(dict(reversed(state.items())), b"kitti") == hashlib.sha256(b"kitti" + named).hexdigest()

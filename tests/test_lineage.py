@@ -12,24 +12,22 @@ from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
+from tests.conftest import CONFIG as BOTH
 
-CONFIG = {
-    "sensor": {"name": "hdl64e", "rows": 8, "columns": 64},
-    "encoding": {"format": "logscale", "reflectance": False},
-    "backbone": {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
-    "data": {"name": "simulated", "batch_size": 4},
-    "stage": {"name": "rectify"},
-    "seed": 0,
-}
+CONFIG = {**BOTH, "encoding": {"format": "logscale", "reflectance": False}}
+
+
+def written(path: Path, config: dict) -> Path:
+    """A checkpoint of a config, with random weights."""
+    state = {"state_dict": build_stage(config, build_generator(config)).state_dict(), "config": config}
+    AtomicCheckpointIO().save_checkpoint({**state, "global_step": 7}, path)
+    return path
 
 
 @pytest.fixture
 def parent(tmp_path: Path) -> Path:
     """A checkpoint of range alone."""
-    stage = build_stage(CONFIG, build_generator(CONFIG))
-    path = tmp_path / "parent.ckpt"
-    AtomicCheckpointIO().save_checkpoint({"state_dict": stage.state_dict(), "config": CONFIG, "global_step": 7}, path)
-    return path
+    return written(tmp_path / "parent.ckpt", CONFIG)
 
 
 def child(parent: Path, reflectance) -> dict:
@@ -83,27 +81,18 @@ def test_pairs_are_images_of_the_parents_sensor(parent: Path):
 
 def test_what_is_learned_from_pairs_reads_real_scans_as_the_flow_that_drew_them(tmp_path: Path):
     read = {"projection": "unfolding", "convention": "reference", "reflectance_scale": 255.0}
-    config = {**CONFIG, "data": {**CONFIG["data"], "reading": read}}
-    state, path = build_stage(config, build_generator(config)).state_dict(), tmp_path / "parent.ckpt"
-    AtomicCheckpointIO().save_checkpoint({"state_dict": state, "config": config, "global_step": 7}, path)
+    path = written(tmp_path / "parent.ckpt", {**CONFIG, "data": {**CONFIG["data"], "reading": read}})
     data = {"name": "pairs", "root": None, "pairs": {}, "reading": dict.fromkeys(read)}
     child = completed({**CONFIG, "data": data, "stage": {"name": "reflow", "init": str(path)}}, [])
     assert {key: child["data"]["reading"][key] for key in read} == read
 
 
 def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
-    def written(name: str, rows: int) -> Path:
-        config = sized(CONFIG, rows, 64)
-        state = {"state_dict": build_stage(config, build_generator(config)).state_dict(), "config": config}
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        AtomicCheckpointIO().save_checkpoint({**state, "global_step": 7}, tmp_path / name)
-        return tmp_path / name
-
     def on_pairs_of(flow: Path | None) -> dict:
         data = {"name": "pairs", "root": None, "pairs": {"of": flow and str(flow)}}
         return completed({**child(parent, False), "data": data, "stage": {"name": "reflow", "init": str(parent)}}, [])
 
-    other = written("other/flow.ckpt", 8)
+    other = written(tmp_path / "other" / "flow.ckpt", CONFIG)
     config = on_pairs_of(other)
     assert config["data"]["pairs"]["parent"] == weights_hash(load_checkpoint(other)) != config["parent"]["weights"]
     assert Path(config["data"]["root"]).parent == other.parent
@@ -112,7 +101,7 @@ def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
     assert own["data"]["pairs"]["parent"] == own["parent"]["weights"]
     assert drawn_by(own) == str(parent)
     with pytest.raises(InputError, match=r"data\.pairs\.of=.*taller\.ckpt has another sensor than .*parent\.ckpt"):
-        on_pairs_of(written("taller.ckpt", 16))
+        on_pairs_of(written(tmp_path / "taller.ckpt", sized(CONFIG, 16, 64)))
 
 
 @pytest.mark.parametrize("position", ["none", "polar", "spherical_harmonics"])
@@ -152,9 +141,6 @@ def test_weights_that_belong_to_a_place_do_not_move():
         ours.start_from(theirs)
 
 
-OWN = {"name": "own", "reflectance_scale": 0.012}
-
-
 def reading_in(data, root: str | None = None, of_sensor: float | None = 0.012):
     return resolve({**data, "root": root}, of_sensor)
 
@@ -182,10 +168,8 @@ def test_full_reflectance_is_what_was_given_else_the_sensors_and_one_in_what_r2f
 
 
 def test_each_set_of_scans_says_its_whole_reading():
-    part, other = (
-        {"name": "folder", "root": "a"},
-        {"name": "folder", "root": "b", "reading": {"reflectance_scale": 2.0}},
-    )
+    part = {"name": "folder", "root": "a"}
+    other = {"name": "folder", "root": "b", "reading": {"reflectance_scale": 2.0}}
     data = {"name": "mixed", "parts": [part, other], "validation": {"data": part, "scans": 4}}
     found = reading_in({**data, "reading": {"convention": "reference", "columns": None}})
     scales = [one["reading"]["reflectance_scale"] for one in (*found["parts"], found["validation"]["data"])]

@@ -1,6 +1,7 @@
 """Generators that have a name: those in the package, and those in the folder of models."""
 
 import hashlib
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import torch
 from safetensors import safe_open
 
+import r2flow
 from r2flow.config import learned
 from r2flow.data.pairs import default_folder
 from r2flow.errors import InputError
@@ -21,6 +23,7 @@ from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
 from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
 from r2flow.simulator import simulate
+from tests.conftest import ROOT
 
 PACKAGED = [name for name, model in MODELS.items() if model.page is None]
 
@@ -196,3 +199,49 @@ def test_the_files_of_the_release_are_the_models_that_they_are_named_after(tmp_p
         name = file.stem
         assert MODELS[name].page == f"release/{file.name} in the source of r2flow"
         assert add_model(name, file) == find_model(name)
+
+
+def test_torch_hub_gives_the_model_of_the_package():
+    flow = torch.hub.load(str(ROOT), "street", source="local")
+    assert torch.equal(flow.sample(1, steps=1), r2flow.load("street").sample(1, steps=1))
+
+
+def test_a_folder_for_the_hub_holds_the_flow_and_nothing_else(tmp_path):
+    pytest.importorskip("huggingface_hub")
+    from r2flow.model.hub import HubFlow
+
+    HubFlow("street").save_pretrained(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"README.md", "model.safetensors"}
+    assert str(tmp_path) not in (tmp_path / "README.md").read_text()
+    back = HubFlow.from_pretrained(str(tmp_path))
+    assert torch.equal(back.sample(1, steps=1), r2flow.load("street").sample(1, steps=1))
+
+
+class Trap:
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('a file from the hub was run')",))
+
+
+def test_nothing_in_such_a_folder_is_unpickled(tmp_path):
+    pytest.importorskip("huggingface_hub")
+    from r2flow.model.hub import FILE, HubFlow
+
+    for name in ("pytorch_model.bin", "model.pt", "step-00000001.ckpt"):
+        (tmp_path / name).write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(InputError, match="no checkpoint at"):
+        HubFlow.from_pretrained(str(tmp_path))
+    (tmp_path / FILE).write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(InputError, match="not a readable .safetensors file"):
+        HubFlow.from_pretrained(str(tmp_path))
+
+
+def test_what_from_pretrained_does_not_know_is_refused(tmp_path):
+    pytest.importorskip("huggingface_hub")
+    from r2flow.model.hub import HubFlow
+
+    HubFlow("street").save_pretrained(tmp_path)
+    with pytest.raises(InputError, match="does not know stepps; it takes device, revision"):
+        HubFlow.from_pretrained(str(tmp_path), stepps=3)
+    with pytest.raises(InputError, match="device must be auto, cpu"):
+        HubFlow.from_pretrained(str(tmp_path), device="gpu")
+    assert HubFlow.from_pretrained(str(tmp_path), device="auto").checkpoint.generator.space.sensor.name

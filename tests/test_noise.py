@@ -30,6 +30,7 @@ def test_another_process_draws_the_same():
 def test_no_two_purposes_seeds_or_indices_share_a_draw(purpose):
     here = standard_normal((64,), 1, purpose, 1)
     others = [(1, purpose, 2), (2, purpose, 1), (1 + 2**32, purpose, 1), (1, purpose, 1 + 2**32)]
+    others += [(1, purpose, 1, 1), (1, purpose, 1, 2)]
     others += [(1, other, 1) for other in PURPOSES if other != purpose]
     assert not any(torch.equal(standard_normal((64,), *key), here) for key in others)
 
@@ -60,12 +61,6 @@ def test_the_start_is_the_standard_normal_of_each_number():
     expected = [standard_normal((2, 4, 8), 7, "pairs", number) for number in (4, 0, 2**40)]
     assert noise.shape == (3, 2, 4, 8)
     assert torch.equal(noise, torch.stack(expected))
-
-
-def test_scans_steps_purposes_and_seeds_share_no_noise():
-    keys = [(s, p, i, j) for s in (1, 2) for p in PURPOSES for i in (0, 1, 2) for j in (0, 1, 2)]
-    drawn = {tuple(standard_normal((8,), s, p, i, j).tolist()) for s, p, i, j in keys}
-    assert len(drawn) == len(keys)
 
 
 def test_noise_of_steps_is_standard_normal_and_uncorrelated_with_its_neighbours():

@@ -1,6 +1,7 @@
 """What reaches a terminal or a pipe, and how a program ends whose reader, locale or peer is gone."""
 
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 import r2flow.training
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
+from r2flow.progress import Bar, track
 from tests.training.conftest import scans, tiny  # noqa: F401  a fixture
 
 R2FLOW = [sys.executable, "-m", "r2flow.cli"]
@@ -69,11 +71,6 @@ def test_weights_that_are_not_finite_are_named(r2flow, saved, tmp_path: Path):
     assert "not finite" not in r2flow("info", saved[0])[1]
 
 
-def test_a_comparison_without_a_run_leaves_no_folder(r2flow, tmp_path: Path):
-    assert r2flow("compare", tmp_path / "nowhere", "--out", tmp_path / "o")[0] == 2
-    assert not (tmp_path / "o").exists()
-
-
 def test_a_config_file_that_contains_itself_is_one_line(tmp_path: Path):
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "loop.yaml").write_text("stage: &stage\n  time: *stage\n")
@@ -104,3 +101,90 @@ def test_a_lost_device_is_one_line(monkeypatch, tmp_path: Path, message: str):
     trainer.world_size = 1
     with pytest.raises(RuntimeError, match="peer|NCCL"):
         r2flow.training._fit_in_folder(run)
+
+
+def test_a_bar_goes_to_standard_error_with_count_unit_and_note(capsys, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
+    monkeypatch.setenv("COLUMNS", "120")
+    with Bar("sampling", 4, "scans", shown=True) as bar:
+        bar(2)
+        bar()
+        bar.set(note="12 evaluations")
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    for words in ("sampling", "3/4", "scans", "12 evaluations"):
+        assert words in shown.err
+
+
+@pytest.mark.parametrize("items", [[3, 1, 2], range(5), (n for n in (1, 2))])
+def test_track_gives_every_item_once_and_shows_nothing_without_a_terminal(items, capsys):
+    expected = [1, 2] if not hasattr(items, "__len__") else list(items)
+    assert list(track(items, "reading", total=len(expected))) == expected
+    assert capsys.readouterr() == ("", "")
+
+
+def test_without_a_terminal_there_is_a_line_every_half_minute(capsys, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)
+    with Bar("completing", 300, "scans") as bar:
+        bar.set(100)  # of an earlier run
+        for _ in range(8):
+            now += 10.0
+            bar(5)
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    # 15 scans in 30 s leave 185 for 6 min 10 s; 30 in 60 s leave 170 for 5 min 40 s
+    assert shown.err.splitlines() == [
+        "completing 115/300 scans  0.50/s  6:10 left",
+        "completing 130/300 scans  0.50/s  5:40 left",
+    ]
+
+
+def test_several_processes_write_lines_on_a_terminal_too(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    now = 100.0
+    monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)
+    with Bar("process 2 of 8: drawing", 64, "pairs", lines=True) as bar:
+        for done in (16, 32):
+            now += 40.0
+            bar.set(done)
+    assert capsys.readouterr() == ("", "process 2 of 8: drawing 32/64 pairs  0.40/s  1:20 left\n")
+
+
+def test_work_goes_on_where_standard_error_was_closed(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    assert list(track([1, 2], "reading")) == [1, 2]
+
+
+BLOCK, TIMES = 64 << 20, 8
+PROGRAM = f"""
+import ctypes, resource
+from r2flow.memory import prepare_process
+
+prepare_process()
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+libc.memset.argtypes, libc.free.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t], [ctypes.c_void_p]
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range({TIMES}):
+    block = libc.malloc({BLOCK})
+    libc.memset(block, 1, {BLOCK})
+    libc.free(block)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def new_pages(**settings: str) -> int:
+    """Pages that the kernel had to give for a block that is taken and freed again and again."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")} | settings
+    return int(
+        subprocess.run([sys.executable, "-c", PROGRAM], env=own, capture_output=True, check=True, text=True).stdout
+    )
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+def test_a_freed_block_is_used_again_without_new_pages():
+    once = BLOCK // os.sysconf("SC_PAGE_SIZE")
+    if new_pages(MALLOC_MMAP_THRESHOLD_="131072") < TIMES * once:
+        pytest.skip("the kernel gives larger pages than it says")
+    assert new_pages() < 1.1 * once

@@ -1,3 +1,5 @@
+"""k-RF and k-TD on a Gaussian, whose flow is known: it carries x_0 to M + S x_0."""
+
 import math
 
 import pytest
@@ -7,9 +9,11 @@ from torch import nn
 from r2flow.errors import InputError
 from r2flow.flow.solvers import solve
 from r2flow.noise import standard_normal
-from r2flow.stages import STAGES
+from r2flow.samplers import build_sampler
+from r2flow.stages import STAGES, build_stage
 from r2flow.stages.base import learning_rate_factor
 from r2flow.stages.rectify import Rectify
+from r2flow.stages.reflow import Distill, Reflow
 from tests.fields import Field
 
 
@@ -98,3 +102,104 @@ def test_an_untrained_stage_has_the_loss_of_predicting_nothing():
     x_1 = M + S * torch.stack([standard_normal((1, 32, 32), 0, "evaluation", k) for k in range(64)])
     loss = stage.training_step({"x_0": x_0, "x_1": x_1, "u": torch.rand(64)}, 0)
     assert loss.item() == pytest.approx(M**2 + S**2 + 1, abs=5 / math.sqrt(x_0.numel()))
+
+
+def pairs(step: int, count: int = 256) -> dict[str, torch.Tensor]:
+    draw = torch.Generator().manual_seed(step)
+    x_0 = torch.randn(count, 1, 2, 2, generator=draw)
+    return {"x_0": x_0, "x_1": M + S * x_0, "u": torch.rand(count, generator=draw)}
+
+
+def fitted(stage: Reflow, steps: int = 1200) -> Reflow:
+    stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
+    optimizer = torch.optim.Adam(stage.parameters(), lr=3e-2)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    for step in range(steps):
+        optimizer.zero_grad()
+        stage.training_step(pairs(step), step).backward()
+        optimizer.step()
+        schedule.step()
+    return stage
+
+
+X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
+
+
+@pytest.mark.parametrize("loss", ["pseudo_huber", "pseudo_huber_elementwise", "mse"])
+def test_a_reflowed_gaussian_takes_one_step(loss: str):
+    end = solve(fitted(Reflow(affine(), loss)).generator.velocity, X_0, steps=1).x.detach()
+    torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_a_distilled_flow_is_right_at_its_own_number_of_steps(k: int):
+    end = solve(fitted(Distill(affine(), steps=k)).generator.velocity, X_0, steps=k).x.detach()
+    torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize(("k", "grid"), [(1, "uniform"), (2, "uniform"), (4, "uniform"), (4, "power:2")])
+def test_distillation_trains_at_the_times_of_its_steps_alone(k: int, grid: str):
+    seen = set()
+
+    class Spy(Affine):
+        def forward(self, t, x):
+            seen.update(t.tolist())
+            return super().forward(t, x)
+
+    stage = Distill(affine(Spy()), steps=k, grid=grid)
+    stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
+    stage.training_step(pairs(0), 0)
+    assert seen == ({i / k for i in range(k)} if grid == "uniform" else {0, 7 / 16, 12 / 16, 15 / 16})
+    assert stage.generator.sampler == build_sampler("euler", steps=k, grid=grid)
+    assert stage.generator.fixed
+
+
+def test_the_paper_s_loss_and_times_are_the_defaults():
+    stage = Reflow(affine())
+    # Most of the U-shaped density lies at the ends: e^(4t) + e^(4(1 - t)) puts 2 e^2 sinh(1) / (e^4 - 1) = 0.324 inside
+    # (1/4, 3/4), where a uniform one has 0.5.
+    u = torch.linspace(0, 1, 20001)[:-1]
+    t = stage.time(u)
+    assert ((t > 0.25) & (t < 0.75)).float().mean().item() == pytest.approx(0.324, abs=2e-3)
+    r = torch.full((256, 1, 2, 2), 0.3)
+    c = 0.00054 * 4**0.5
+    paper = ((0.3**2 * 4 + c**2) ** 0.5 - c) / 4**0.5
+    assert stage.loss(r, torch.zeros_like(r)).mean().item() == pytest.approx(paper, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"name": "distill", "steps": 0}, "steps must be a whole number of at least 1"),
+        ({"name": "distill", "steps": 2, "time": {"name": "uniform"}}, "leave stage.time out"),
+        ({"name": "reflow", "loss": "huber"}, "no loss named 'huber'"),
+    ],
+)
+def test_what_cannot_be_is_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        STAGES.build(options, affine())
+
+
+@pytest.mark.parametrize(("stage", "data"), [("reflow", "simulated"), ("distill", "folder"), ("rectify", "pairs")])
+def test_stage_and_data_belong_together(stage: str, data: str):
+    config = {"stage": {"name": stage}, "data": {"name": data, "batch_size": 4}, "seed": 0}
+    with pytest.raises(InputError, match=f"stage={stage} learns from"):
+        build_stage(config, affine())
+
+
+def test_a_straightened_generator_is_drawn_without_fresh_noise():
+    """Its pairs of noise and scan belong together; SDE and DDPM would part them."""
+    flow = affine()
+    flow.sampler = build_sampler("sde", steps=32)
+    assert Reflow(flow).generator.sampler.paired
+    own = affine()
+    own.sampler = build_sampler("heun2", steps=5)
+    assert Reflow(own).generator.sampler == build_sampler("heun2", steps=5)
+
+
+def test_a_distilled_flow_keeps_the_steps_that_it_learns():
+    config = {"stage": {"name": "distill", "steps": 2}, "data": {"batch_size": 4, "name": "pairs"}, "seed": 0}
+    assert build_stage({**config, "sampler": {"steps": 2}}, affine()).generator.sampler.steps == 2
+    for other in ({"steps": 8}, {"name": "adams3"}):
+        with pytest.raises(InputError, match=r"this stage trains for one sampler alone"):
+            build_stage({**config, "sampler": other}, affine())
