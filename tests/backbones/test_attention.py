@@ -68,16 +68,9 @@ def test_a_mask_made_while_sampling_serves_training():
     assert q.grad is not None
 
 
-@pytest.mark.parametrize(
-    ("backend", "message"),
-    [
-        ("tile", "no attention backend named 'tile'.*Did you mean 'tiles'"),
-        ("flex", "'flex' has kernels for CUDA only.*cpu"),
-    ],
-)
-def test_a_backend_that_cannot_be_had_says_why(backend, message):
-    with pytest.raises(InputError, match=message):
-        neighbourhood_attention(*qkv(4, 8), (3, 9), backend=backend)
+def test_a_backend_that_cannot_be_had_says_why():
+    with pytest.raises(InputError, match="'flex' has kernels for CUDA only.*cpu"):
+        neighbourhood_attention(*qkv(4, 8), (3, 9), backend="flex")
 
 
 @pytest.mark.parametrize("wrap", [True, False])
@@ -100,8 +93,3 @@ def test_the_mask_for_flex_shows_what_tiles_see(rows, columns, window, wrap):
 def test_backends_are_the_definition_on_a_gpu(backend):
     inputs = [x.float().cuda().requires_grad_() for x in qkv(16, 64, channels=32)]
     assert_defined(inputs, (3, 9), True, backend, 2e-2)  # TF32 in some kernels
-
-
-def test_an_even_window_is_refused():
-    with pytest.raises(InputError, match=r"odd sizes.*\(4, 9\)"):
-        neighbourhood_attention(*qkv(4, 8), (4, 9))

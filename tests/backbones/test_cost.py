@@ -1,5 +1,7 @@
 """Parameters and multiply-accumulates: the paper's table II."""
 
+import os
+
 import pytest
 import torch
 from plain_backbone import Plain
@@ -8,7 +10,9 @@ from torch import nn
 from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.backbones.efficient_unet import EfficientUNet
-from r2flow.lidar.sensors import build_sensor
+from r2flow.errors import InputError
+from r2flow.lidar.sensors import SENSORS, build_sensor
+from r2flow.reports.backbones import backbone_costs
 
 TABLE_2 = {
     "hdit": (80_908_420, 77.79),
@@ -75,3 +79,33 @@ def test_a_transposed_convolution_by_hand():
     before = count_macs(model)
     last, model.last = model.last, nn.ConvTranspose2d(8, 3, 2, stride=2)
     assert count_macs(model) - (before - 9 * last.weight[0, :, 0, 0].numel() * 8 * 16 * 3) == 8 * 8 * 16 * 2 * 2 * 3
+
+
+def test_a_size_that_one_cannot_take_is_said_in_its_row():
+    (row,) = backbone_costs(SENSORS["hdl64e"].resized(64, 1000), ["hdit"], repeats=0)
+    assert row["latency_ms"] is None
+    assert "1000" in row["error"]
+    with pytest.raises(InputError, match="Did you mean 'hdit_tiny'"):
+        list(backbone_costs(SENSORS["hdl64e"], ["hdit_tny"]))
+
+
+def test_latency_is_measured():
+    (row,) = backbone_costs(SENSORS["hdl64e"].resized(16, 64), ["hdit_tiny"], repeats=2)
+    assert row["latency_ms"] > 0
+
+
+def test_the_verb_measures_what_it_is_asked_for(r2flow):
+    options = ("--only", "hdit_tiny,adm_unet_large", "--size", "16x64", "--repeats", 0, "--device", "cpu")
+    code, out, _ = r2flow("report", "backbones", *options)
+    assert code == 0
+    assert [line.split()[0] for line in out.splitlines()[2:4]] == ["hdit_tiny", "adm_unet_large"]
+    code, _, err = r2flow("report", "backbones", "--only", "hditt", "--repeats", 0)
+    assert code != 0
+    assert "'hdit'" in err
+
+
+@pytest.mark.parametrize(("load", "busy"), [(0.0, False), (1e4, True)])
+def test_a_busy_machine_is_named(r2flow, monkeypatch, load, busy):
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
+    options = ("--only", "hdit_tiny", "--size", "16x64", "--repeats", 1, "--device", "cpu")
+    assert ("machine was busy" in r2flow("report", "backbones", *options)[1]) == busy

@@ -1,13 +1,21 @@
-"""Scan i of every system is a function of its number, whatever the batch, and its evaluations are counted."""
+"""Every system: scan i is a function of its number alone, and published files are taken by the verbs as they are."""
 
+import json
+import os
+import signal
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from r2flow.generators import build_generator
+from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
+from tests.training.conftest import hold_at, in_process, let_go, start, wait_for
 
 SENSOR = {"name": "hdl64e", "rows": 8, "columns": 32}
 GAN = {"latent": 8, "base_channels": 4, "doublings": 2}
@@ -46,3 +54,100 @@ def test_a_scan_is_a_function_of_its_number_alone(name: str):
     assert many.x.abs().max() <= 1 or name == "latent_diffusion"  # whose decoder has no bound
     assert many.evaluations.tolist() == [evaluations] * 3
     assert sampler.evaluations(generator) == evaluations
+
+
+# Options, and the evaluations that a scan takes: steps x noise levels and one to take the last noise off.
+FILES = {
+    "vanilla_published.pth": ([], 1),
+    "dusty1_published.pth": ([], 1),
+    "dusty2_published.pth": ([], 1),
+    "r2dm_published.pth": (["--steps", 2], 2),
+    "lidargen_published.pth": (["--steps", 1], 10 + 1),
+    "lidm_published.ckpt": (["--steps", 1], 1),
+}
+LARGE = ("lidargen_published.pth", "lidm_published.ckpt")  # of 64 x 1024
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in LARGE else ()) for n in FILES])
+def test_a_published_file_is_sampled_and_evaluated(r2flow, shared, tmp_path: Path, name: str):
+    path = shared / "oracle_baselines" / name
+    if not path.exists():
+        pytest.skip("the reference checkpoint is not here")
+    options, evaluations = FILES[name]
+    out = tmp_path / "scans"
+    code, said, error = r2flow("sample", path, *options, "--num", 2, "--pictures", 0, "--device", "cpu", "--out", out)
+    assert code == 0, error
+    assert (out / "000001.npy").is_file()
+    alone = ["--num", 2, "--metrics", "jsd", "--no-reference", "--no-baselines", "--workers", 0, "--device", "cpu"]
+    code, _, error = r2flow("evaluate", out, path, *options, *alone, "--json", tmp_path / "e.json")
+    assert code == 0, error
+    (found,) = json.loads((tmp_path / "e.json").read_text())["comparisons"]
+    assert found["generated"]["num"] == 2
+    # The same sampler and seed, but the noise of evaluation, which no sample has.
+    assert 0 <= found["metrics"][0]["figures"]["jsd"] <= 0.8326
+    speed = next(metric for metric in found["metrics"] if metric["metric"] == "speed")
+    assert speed["figures"]["evaluations"] == evaluations
+
+
+TINY = [
+    "sensor.rows=16", "sensor.columns=64", "data.scenes=8", "data.batch_size=2", "trainer.accelerator=cpu",
+    "trainer.max_steps=6", "trainer.val_check_interval=3", "trainer.log_every_n_steps=1", "callbacks.pictures=null",
+    "samples.num=0", "loggers=[csv]",
+]  # fmt: skip
+FLOW = [*TINY, "callbacks.checkpoint.every=2", "stage.warmup_images=4"]
+FAMILIES = {
+    "diffusion": ["experiment=r2dm", "size=small", *FLOW, "backbone.base_channels=8"],
+    "score": ["experiment=lidargen", "size=small", *FLOW, "generator.width=4", "generator.levels=4"],
+    "autoencoder": [
+        "experiment=lidm_autoencoder", "size=small", *TINY, "callbacks.checkpoint.every=2",
+        "generator.autoencoder.codes=16", "stage.adversarial_start=2",
+    ],
+    "latent": ["experiment=lidm", "size=small", *FLOW, "generator.autoencoder.codes=16", "stage.init=first"],
+    "gan": [
+        "experiment=dusty2", "size=small", *TINY, "callbacks.checkpoint.every=2", "generator.base_channels=4",
+        "stage.discriminator.base_channels=4", "stage.warmup.images=4", "stage.augment.initial=0.5",
+        "stage.augment.kimg=0.1", "stage.augment.every=2", "stage.r1_every=2",
+    ],
+}  # fmt: skip
+FIRST = ["experiment=lidm_autoencoder", "size=small", *TINY, "trainer.max_steps=3", "generator.autoencoder.codes=16"]
+
+
+def assert_equal(a: Any, b: Any) -> None:
+    """Bit-equal, whatever is nested in what."""
+    if isinstance(a, Tensor):
+        assert torch.equal(a, b)
+    elif isinstance(a, Mapping):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_equal(a[key], b[key])
+    elif isinstance(a, list | tuple):
+        for one, other in zip(a, b, strict=True):
+            assert_equal(one, other)
+    else:
+        assert a == b
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_killed_system_ends_as_the_one_left_alone(tmp_path: Path, family: str):
+    if family == "latent":
+        in_process(tmp_path, [*FIRST, "run_dir=first"])
+    options, held = FAMILIES[family], tmp_path / "held"
+    in_process(tmp_path, [*options, "run_dir=alone"])
+    killed = [*options, "run_dir=killed", *hold_at(5, held)]
+    process = start(tmp_path, killed)
+    wait_for(held, process)
+    os.killpg(process.pid, signal.SIGKILL)
+    said, _ = process.communicate(timeout=100)
+    assert process.returncode == -signal.SIGKILL, said
+    assert checkpoints_of(tmp_path / "killed")[0].name == "step-00000004.ckpt"
+    let_go(held)
+    done = in_process(tmp_path, killed)
+    assert "resuming from" in done.stdout
+    one, other = (read_checkpoint(checkpoints_of(tmp_path / name)[0]) for name in ("alone", "killed"))
+    assert one["global_step"] == other["global_step"]
+    for part in {"state_dict", "current_model_state", "optimizer_states"} & one.keys():  # not all runs have an average
+        assert_equal(one[part], other[part])
+    if family == "latent":  # its autoencoder stays as it is
+        first = load_checkpoint(tmp_path / "first").generator.first_stage_model
+        assert_equal(first.state_dict(), load_checkpoint(tmp_path / "alone").generator.first_stage_model.state_dict())

@@ -23,7 +23,6 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.completion import completing
 from r2flow.noise import Draws
-from r2flow.reports.outputs import write_samples
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.base import learning_rate_factor
@@ -307,14 +306,6 @@ def test_a_published_checkpoint_predicts_what_its_authors_did(shared, averaged):
     assert diffusion.sampler == build_sampler("ddpm", steps=256)
 
 
-def test_a_sampler_is_refused_before_anything_is_said(shared, tmp_path, caplog):
-    loaded = load_checkpoint(shared / "oracle_baselines" / "r2dm_published.pth")
-    with pytest.raises(InputError, match="langevin"):
-        write_samples(loaded, tmp_path / "out", 1, 0, build_sampler("langevin", steps=2))
-    assert not caplog.records
-    assert not (tmp_path / "out").exists()
-
-
 def damaged(path: Path, tmp_path: Path, change) -> Path:
     content = torch.load(path, weights_only=True)
     change(content["cfg"])
@@ -458,18 +449,6 @@ def test_ancestral_scans_have_the_spread_that_their_steps_leave(exact):
 
 
 @torch.no_grad()
-def test_evaluations_are_counted_and_scans_do_not_depend_on_their_batch(exact):
-    calls = []
-    sampler = build_sampler("ddim", eta=0.5, steps=5)
-    noise = Draws(0, [0, 1]).start(exact.noise_shape)
-    two = exact(noise, sampler=sampler, draws=Draws(0, [0, 1]), progress=lambda: calls.append(1))
-    one = exact(noise[1:], sampler=sampler, draws=Draws(0, [1]))
-    torch.testing.assert_close(one.x, two.x[1:], rtol=0, atol=1e-6)
-    assert len(calls) == sampler.evaluations(exact) == int(two.evaluations[0]) == 5
-    assert build_sampler("heun2", steps=5).evaluations(exact) == 10
-
-
-@torch.no_grad()
 @pytest.mark.parametrize("method", ["ddpm", "euler"])
 def test_a_part_of_the_image_has_the_noise_of_the_whole(exact, method):
     """The expected noise of a pixel is a function of that pixel here, and so is the scan."""
@@ -478,14 +457,6 @@ def test_a_part_of_the_image_has_the_noise_of_the_whole(exact, method):
     whole = exact(noise, sampler=sampler, draws=draws)
     part = exact.part(region)(region.crop(noise), sampler=sampler, draws=draws)
     torch.testing.assert_close(part.x, region.crop(whole.x), rtol=0, atol=1e-6)
-
-
-def test_a_sampler_that_a_diffusion_does_not_have_is_refused(exact):
-    for wrong in ("ddim:eta=1.5", "ddpm:finish=0.1"):
-        with pytest.raises(InputError, match=wrong.split(":")[1].split("=")[0]):
-            build_sampler(wrong)
-    with pytest.raises(InputError, match="map"):
-        exact.choose("jump")
 
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
