@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.cli import main
 from r2flow.errors import InputError
 from r2flow.generators import Generated, build_generator
 from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
@@ -83,20 +82,14 @@ def test_a_task_that_is_none_is_one_line(checkpoint, task):
     assert "\n" not in str(caught.value)
 
 
-def report(monkeypatch, *arguments: object) -> None:
-    monkeypatch.setattr("sys.argv", ["r2flow", "report", "completion", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert not ended.value.code
-
-
-def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, monkeypatch):
+def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: Path):
     checkpoint.save(tmp_path / "model.safetensors")
     out = tmp_path / "out"
-    report(
-        monkeypatch, "simulated:3", tmp_path / "model.safetensors", "--num", "2", "--answers", "2",
-        "--samplers", "euler,jump", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", out,
+    code, _, error = r2flow(
+        "report", "completion", "simulated:3", tmp_path / "model.safetensors", "--num", 2, "--answers", 2,
+        "--samplers", "euler,jump", "--steps", 1, "--tasks", "rows:4 rows:2", "--out", out,
     )  # fmt: skip
+    assert code == 0, error
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
     ways = "model, euler, 1 step", "model, jump, 1 step"
@@ -105,16 +98,17 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
 
 
 @pytest.mark.parametrize("given", [(), ("--sensor", "vlp16", "--size", "8x96")])  # the folder's manifest, or options
-def test_a_densifier_is_measured_on_the_sensor_of_the_scans(checkpoint, tmp_path: Path, monkeypatch, given):
+def test_a_densifier_is_measured_on_the_sensor_of_the_scans(r2flow, checkpoint, tmp_path: Path, given):
     checkpoint.save(tmp_path / "model.safetensors")
     sensor = SENSORS["vlp16"].resized(8, 96)
     truth = simulate(sensor, 3, 500 if given else 0).image  # the middle of 1000 scenes
     if not given:
         write_folder(SimulatedFolder(tmp_path / "scans", sensor, 3, ["npy"]), range(1), workers=1)
-    report(
-        monkeypatch, "simulated:3" if given else tmp_path / "scans", tmp_path / "model.safetensors", "--num", "1",
-        "--tasks", "rows:2", "--out", tmp_path / "out", *given,
+    code, _, error = r2flow(
+        "report", "completion", "simulated:3" if given else tmp_path / "scans", tmp_path / "model.safetensors",
+        "--num", 1, "--tasks", "rows:2", "--out", tmp_path / "out", *given,
     )  # fmt: skip
+    assert code == 0, error
     *_, row = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
     at = Way("", checkpoint.through(sensor), checkpoint.generator.sampler)
     *_, (expected, _) = completion_rows([truth], sensor, [at], ["rows:2"], 1)

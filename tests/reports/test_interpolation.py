@@ -16,26 +16,6 @@ from r2flow.samplers import build_sampler
 from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
 
 
-def frames(count: int, channels: int = 2) -> np.ndarray:
-    images = scans(2)[:, :channels]
-    return torch.stack([images[i % 2] for i in range(count)]).numpy()
-
-
-@pytest.mark.parametrize(("count", "channels"), [(2, 2), (5, 1), (20, 2)])
-def test_the_figure_has_a_column_for_each_frame_between_the_real_scans(count, channels):
-    weights = np.linspace(0, 1, count).tolist()
-    figure = interpolation_figure(frames(2, channels), frames(count, channels), weights, SENSOR.rays(), ["a", "b"])
-    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
-    assert titles[0] == "real: a"
-    assert titles[-1] == "real: b"
-    assert titles[1] == titles[-2] == "round trip"
-    assert len(titles) == min(count, 8) + 2
-    assert len(figure.axes) == len(titles) * (2 + channels)
-    between = [float(title.removeprefix("w = ")) for title in titles[2:-2]]
-    assert between == sorted(between)
-    assert figure_pixels(figure, dpi=40).max() > 150
-
-
 def test_extreme_scans_are_drawn_too():
     empty = np.zeros((2, 2, 8, 64), np.float32)
     figure_pixels(interpolation_figure(empty, empty, [0.0, 1.0], SENSOR.rays(), ["a", "b"]), dpi=40)

@@ -18,21 +18,10 @@ from r2flow.reports.solvers import (
     configurations,
     measure,
     problem_subjects,
-    problems_table,
     reached,
     solvers_page,
 )
 from tests.fields import Field
-
-
-def test_steps_fit_the_budgets():
-    chosen = configurations(["euler", "rk4", "dopri5", "torchdiffeq:dopri5"], [3, 4, 9], [1e-2, 1e-4])
-    assert [(c.method, c.fields.get("steps"), c.fields.get("tolerance")) for c in chosen] == [
-        ("euler", 3, None), ("euler", 4, None), ("euler", 9, None), ("rk4", 1, None), ("rk4", 2, None),
-        ("dopri5", None, 1e-2), ("dopri5", None, 1e-4),
-        ("torchdiffeq:dopri5", None, 1e-2), ("torchdiffeq:dopri5", None, 1e-4),
-    ]  # fmt: skip
-    assert [c.label for c in chosen][2:6] == ["euler, 9 steps", "rk4, 1 step", "rk4, 2 steps", "dopri5, 1e-02"]
 
 
 def test_a_row_is_what_the_solver_did():
@@ -100,13 +89,6 @@ def row(method: str, evaluations: float, error: float, metres: float = 1.0, floo
         "problem": "p", "method": method, "label": method, "evaluations": evaluations, "seconds": 1.0, "error": error,
         "range_rms_m": metres, "scans": 2, "converged": 2, "floor": floor, "length": 10.0, **more,
     }  # fmt: skip
-
-
-def test_the_table_names_the_best_within_each_budget():
-    rows = [row("a", 4, 0.1), row("b", 4, 0.2), row("a", 8, 0.05), row("b", 8, 0.01), row("lost", 2, math.inf)]
-    lines = problems_table({"p": rows}, [8, 4, 2]).splitlines()
-    assert lines[0] == "| problem | within 2 | within 4 | within 8 |"
-    assert lines[2] == "| p | none | a 0.1 | b 0.01 |"
 
 
 def test_an_error_below_what_can_be_measured_does_not_win():

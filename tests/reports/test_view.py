@@ -140,16 +140,10 @@ def test_the_page_allows_its_own_script_alone_and_loads_nothing():
     assert "https://" not in text
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        (lambda: page([], RAYS), "found 0 images"),
-        (lambda: page([np.broadcast_to(np.float32(0), (MOST // 256 + 1, 1, 8, 32))], RAYS), "found 65537 images"),
-    ],
-)
-def test_what_does_not_fit_is_refused(given, said):
-    with pytest.raises(InputError, match=said.replace("(", r"\(").replace(")", r"\)")):
-        given()
+def test_what_does_not_fit_is_refused():
+    for images in ([], [np.broadcast_to(np.float32(0), (MOST // 256 + 1, 1, 8, 32))]):
+        with pytest.raises(InputError, match="found (0|65537) images"):
+            page(images, RAYS)
 
 
 class TestTheVerb:
