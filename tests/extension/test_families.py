@@ -2,16 +2,18 @@
 
 import ast
 import json
-import os
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint
+from r2flow.model.export import tableau
+from r2flow.noise import Draws
+from r2flow.samplers import build_sampler
 from r2flow.training import compose
 from tests.extension.conftest import (
     BACKBONE,
@@ -26,7 +28,6 @@ from tests.extension.conftest import (
     run_of,
     train,
 )  # fmt: skip
-from tests.training.conftest import hold_at, let_go, start, wait_for
 from tests.training.test_train import assert_bit_equal
 
 EVALUATE = ["--metrics", "jsd", "--num", 2, "--real-num", 2, "--workers", 0, "--no-cache"]
@@ -47,20 +48,6 @@ def test_a_run_goes_on_from_its_checkpoint_bit_by_bit(trained: tuple[Family, Pat
     checkpoints_of(stopped)[0].unlink()  # as if killed between steps 4 and 6
     assert "resuming from" in train(stopped, family).stdout
     assert_bit_equal(run, stopped)
-
-
-@pytest.mark.slow
-def test_a_killed_gan_ends_as_the_one_left_alone(gan: Path, tmp_path: Path):
-    run, held = tmp_path / "run", tmp_path / "held"
-    options = hold_at(3, held)
-    process = start(tmp_path, [GAN.plugin, *TINY, *GAN.choices, f"run_dir={run}", *options])
-    wait_for(held, process, 60)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate(timeout=60)
-    let_go(held)
-    assert [path.name for path in checkpoints_of(run)] == ["step-00000002.ckpt"]
-    train(run, GAN, *options)
-    assert_bit_equal(gan, run)
 
 
 def test_info_names_the_family(trained: tuple[Family, Path]):
@@ -192,3 +179,47 @@ def test_a_notebook_composes_what_plugins_add():
         config = compose(["stage=toy_gan", "backbone=toy_backbone", "stage.width=8", "backbone.base_channels=4"])
     assert (config["stage"]["name"], config["stage"]["width"]) == ("toy_gan", 8)
     assert (config["backbone"]["name"], config["backbone"]["base_channels"]) == ("toy_backbone", 4)
+
+
+SHRUNKEN = Family("sampler", "toy_sampler", ("sampler={name: shrunken, steps: 3, share: 0.25}",))
+
+
+@pytest.fixture(scope="module")
+def shrunken_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    shrunken_run = tmp_path_factory.mktemp("sampler") / "run"
+    given = ["sampler.name=shrunken", "sampler.steps=3", "+sampler.share=0.25", "trainer.max_steps=2"]
+    done = r2flow(
+        "train", "data=simulated", "backbone=hdit_tiny", *TINY, *given, SHRUNKEN.plugin, f"run_dir={shrunken_run}"
+    )
+    assert done.returncode == 0, done.stderr
+    return shrunken_run
+
+
+def test_a_checkpoint_notes_it_and_needs_the_plugin(shrunken_run: Path, tmp_path: Path):
+    with loaded(SHRUNKEN):
+        generator = load_checkpoint(shrunken_run).generator
+        assert generator.sampler == build_sampler("shrunken", steps=3, share=0.25)
+        noise = Draws(0, [0]).start(generator.noise_shape)
+        euler = generator(noise, sampler=build_sampler("euler", steps=1)).x
+        made = generator(noise, sampler=build_sampler("shrunken", steps=1, share=0.25))
+        torch.testing.assert_close(made.x, noise + 0.25 * (euler - noise))
+        assert made.evaluations.tolist() == [1]
+        found = tableau(generator, build_sampler("shrunken", steps=2, share=0.5))
+        torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.25, 0], [1, 0.25, 0.25]]).double())
+        with pytest.raises(InputError, match="share"):
+            build_sampler("shrunken", share="x")
+    done = r2flow("sample", shrunken_run, "-o", tmp_path / "out")
+    assert done.returncode == 2
+    assert "--plugin" in done.stderr
+
+
+def test_verbs_take_it(shrunken_run: Path, tmp_path: Path):
+    given = (SHRUNKEN.plugin, shrunken_run, "--sampler", "shrunken:share=0.75", "--steps", 2)
+    done = r2flow("sample", *given, "--num", 1, "--format", "npy", "--pictures", 0, "-o", tmp_path / "scans")
+    assert done.returncode == 0, done.stderr
+    assert np.isfinite(np.load(tmp_path / "scans" / "000000.npy")).all()
+    note = json.loads((tmp_path / "scans" / "manifest.json").read_text())["recipe"]["sampler"]
+    assert note == {"name": "shrunken", "steps": 2, "grid": "uniform", "share": 0.75}
+    done = r2flow("pairs", *given, "--num", 2, "--batch-size", 2, "-o", tmp_path / "pairs")
+    assert done.returncode == 0, done.stderr
+    assert "shrunken" in r2flow("info", shrunken_run, SHRUNKEN.plugin).stdout

@@ -1,6 +1,8 @@
 """Values of the wrong kind or out of their range, key by key: one line, exit code 2, nothing written."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ from r2flow.runs.composing import compose
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from r2flow.training import build, check
-from tests.training.conftest import in_process
+from tests.training.conftest import Run, in_process
 
 REFUSED = {
     "stage.learning_rate=nan": "learning_rate must be a finite number of at least 0, found nan",
@@ -173,3 +175,57 @@ def test_a_lost_config_is_that_of_the_newest_checkpoint(tmp_path: Path):
         open_run(tmp_path, {**config, "seed": 2})
     assert open_run(tmp_path, config) == tmp_path / "checkpoints" / "step-00000004.ckpt"
     assert yaml.safe_load((tmp_path / CONFIG).read_text()) == config
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["bakcbone.base_channels=8"], ["no key 'bakcbone.base_channels'", "Did you mean 'backbone.base_channels'?"]),
+        (["backbone=hditt"], ["no backbone config named 'hditt'", "Did you mean 'hdit'?"]),
+        (["+backbone.widht=8"], ["no option 'widht'"]),
+        (["sensor.columns=100"], ["100", "nearest"]),
+        (["data.root=/nowhere/at/all"], ["/nowhere/at/all is not a folder", "data.root=FOLDER"]),
+        (["data.batch_size=3", "trainer.accumulate_grad_batches=2"], ["batch_size=3", "multiple of 2"]),
+        (["trainer.precision=16-mixed"], ["16-mixed", "bf16-mixed"]),
+        (["encoding.format=log"], ["no range format named 'log'", "Did you mean 'logscale'?"]),
+        (["sensor.rays=foo"], ["'centre' or 'reference'", "'foo'"]),
+        (["stage.time.name=discrete"], ["needs the option 'k'"]),
+        (["+data.validation.data={name: folder, root: x, splt: test}"], ["no option 'splt'", "Did you mean 'split'?"]),
+        (["data.augment.roll=true"], ["data.augment.roll", "backbone.position=learnable", "backbone.position=none"]),
+        (["data.augment.ray_dropout=1.5"], ["data.augment: ray_dropout must be a finite number in [0, 1)", "1.5"]),
+        (["data.validation.data={name: mixed}"], ["needs the name of a data set"]),
+    ],
+)
+def test_wrong_config(train: Run, tmp_path: Path, overrides: list[str], words: list[str]):
+    done = train("name=bad", *overrides, check=False)
+    assert done.returncode == 2
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    for word in words:
+        assert word in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_bad_scan_stops_the_run_or_is_left_out(train: Run, scans: Path, tmp_path: Path):
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    for path in scans.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    (folder / "000004.bin").write_bytes(b"\0" * 33)
+    done = train(f"data.root={folder}", "name=strict", check=False)
+    assert done.returncode == 2
+    for words in ("000004.bin", "data.reading.on_bad_scan=skip"):
+        assert words in done.stderr.strip().splitlines()[-1]
+    done = train(f"data.root={folder}", "name=lenient", "data.reading.on_bad_scan=skip", "trainer.max_steps=2")
+    assert "left out" in done.stdout + done.stderr
+    assert (tmp_path / "runs" / "lenient" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("mistake", ["bakcbone.base_channels=8", "backbone=hditt", "chain=[", "+experiment=reflo"])
+def test_a_misspelt_config_is_answered_without_loading_torch(tmp_path: Path, mistake: str):
+    script = f"import sys; from r2flow.runs.launch import main; print(main([{mistake!r}], []), 'torch' in sys.modules)"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    assert done.stdout == "2 False\n", done.stderr
+    assert len(done.stderr.splitlines()) == 1
