@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +10,14 @@ import torch
 
 from r2flow import load
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import read_points
+from r2flow.inversion import invert
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
-from tests.conftest import write_scan
+from r2flow.samplers import build_sampler
+from tests.conftest import write_run, write_scan
+from tests.test_sampling import network, scans
 
 
 def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path):
@@ -81,8 +83,6 @@ def test_info_says_what_is_in_a_checkpoint(r2flow, saved):
     for words in ("hdit", "2 x 8 x 64", "hdl64e", "logscale", "backbone.base_channels"):
         assert words in said
     code, said, _ = r2flow("info", saved[0], "--json")
-    import json
-
     assert json.loads(said)["step"] == 7
 
 
@@ -113,43 +113,6 @@ def test_every_verb_has_help_with_an_example(r2flow, verb):
     code, said, _ = r2flow(*verb.split(), "--help")
     assert code == 0
     assert f" {verb} " in " ".join(said.split()).partition("Example: ")[2]
-
-
-class TestBadInput:
-    """One clear line, exit code 2, nothing written."""
-
-    def check(self, result, out: Path, *words: str) -> None:
-        code, _, err = result
-        assert code == 2
-        lines = [line for line in err.splitlines() if not line.startswith("WARNING")]
-        assert len(lines) == 1, err
-        assert lines[0].startswith("error: ")
-        for word in words:
-            assert word in lines[0]
-        assert not out.exists()
-
-    @pytest.mark.parametrize(
-        ("content", "words"),
-        [
-            (b"\0" * 30, ("bad.bin", "14 bytes")),
-            (b"", ("bad.bin", "empty")),
-            (np.full((9, 4), np.nan, np.float32).tobytes(), ("bad.bin",)),
-            (np.full((9, 4), [500, 0, 0, 0.5], np.float32).tobytes(), ("bad.bin", "none of its 9 points", "500")),
-        ],
-    )
-    def test_scans(self, r2flow, tmp_path, content, words):
-        (tmp_path / "bad.bin").write_bytes(content)
-        self.check(r2flow("show", tmp_path / "bad.bin", "--out", tmp_path / "views"), tmp_path / "views", *words)
-
-    def test_a_place_that_cannot_be_written(self, r2flow, scan, tmp_path):
-        (tmp_path / "file").write_text("in the way")
-        out = tmp_path / "file" / "views"
-        self.check(r2flow("show", scan, "--out", out), out, str(tmp_path / "file"), "is a file, not a folder")
-
-    def test_a_scan_that_does_not_unfold(self, r2flow, tmp_path):
-        write_scan(tmp_path / "one.bin", 3)
-        result = r2flow("show", tmp_path / "one.bin", "--projection", "unfolding", "-o", tmp_path / "o")
-        self.check(result, tmp_path / "o", "unfolds into 1 rings")
 
 
 @pytest.mark.parametrize(
@@ -199,13 +162,6 @@ def test_a_model_has_a_name(name):
         load(name)
 
 
-def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
-    code = "import r2flow, r2flow.cli.verbs, r2flow.lidar.projection, r2flow.flow.solvers, r2flow.backbones, sys; "
-    code += "print([m for m in ('lightning', 'matplotlib', 'tensorboard', 'torchdiffeq') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, shared, tmp_path):
     published, out = shared / "oracle" / "published_format.pth", tmp_path / "out"
     drawn = ("--num", 1, "--steps", 1, "--pictures", 0, "--out", out)
@@ -224,3 +180,82 @@ def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_b
     np.testing.assert_allclose(np.linalg.norm(xyz, axis=1), found, rtol=1e-5)
     assert "bin centres" not in r2flow("sample", published, *drawn, "--format", "npy")[2]
     assert "bin centres" not in r2flow("sample", saved[0], *drawn, "--format", "ply")[2]
+
+
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return write_run(tmp_path / "run", network(), {"name": "rectify"}, 0.3)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[Path]:
+    """Two scans, as .bin and .ply."""
+    paths = [tmp_path / "scans" / "one.bin", tmp_path / "scans" / "two.ply"]
+    for path, image in zip(paths, scans(2).numpy(), strict=True):
+        write_points(path, *image_to_points(image, SENSOR.rays()))
+    return paths
+
+
+def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):
+    out = tmp_path / "between"
+    code, said, _ = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8)
+    assert code == 0
+    assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [f"{i:03d}.ply" for i in range(4)]
+    for index in range(4):
+        image = np.load(out / "frames" / f"{index:03d}.npy")
+        assert len(read_points(out / "frames" / f"{index:03d}.ply").xyz) == (image[0] > 0).sum()
+    rows = json.loads((out / "interpolation.json").read_text())["rows"]
+    assert [row["weight"] for row in rows] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert [row["evaluations"] for row in rows] == [64, 32, 32, 64]  # the ends go there and back
+    assert "4 scans" in said
+
+
+def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):
+    part = tmp_path / "part"
+    code, said, _ = r2flow("sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", part)
+    assert code == 0
+    # 11.25 degrees are 2 columns, and the network's unit is 8.
+    assert "generating rows 0-3, columns 16-47, for rows 0-2, columns 24-39: 25% of the image" in said
+    image = np.load(part / "000000.npy")
+    assert image.shape == (2, 8, 64)
+    for judged in (("evaluate", part, "simulated:0"), ("evaluate", "simulated:0", part)):
+        code, _, complaint = r2flow(*judged)
+        assert code == 2
+        assert f"{part} holds a part of each scan alone" in complaint
+    inside = np.zeros((8, 64), bool)
+    inside[:3, 24:40] = True
+    assert (image[0][inside] > 0).any()
+    assert (image[:, ~inside] == 0).all()
+    xyz = read_points(part / "000000.ply").xyz
+    assert (np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 4).all()
+
+
+def test_one_channel_is_written_alone(r2flow, run, tmp_path):
+    for channels in ("both", "range", "reflectance"):
+        out = tmp_path / channels
+        assert r2flow("sample", run, "--num", 1, "--steps", 2, "--channels", channels, "-o", out)[0] == 0
+    both = np.load(tmp_path / "both" / "000000.npy")
+    np.testing.assert_array_equal(np.load(tmp_path / "range" / "000000.npy"), both[:1])
+    np.testing.assert_array_equal(np.load(tmp_path / "reflectance" / "000000.reflectance.npy"), both[1:])
+    assert read_points(tmp_path / "range" / "000000.ply").reflectance is None
+    assert not list((tmp_path / "range").glob("*.bin"))
+    assert {path.suffix for path in (tmp_path / "reflectance").iterdir()} == {".npy", ".png", ".json"}
+
+
+def test_named_grids_are_sampled_on(r2flow, run, tmp_path):
+    images = {}
+    for grid in ("uniform", "power:2", "power-start:1.5"):
+        out = tmp_path / grid.replace(":", "-")
+        assert r2flow("sample", run, "--num", 1, "--steps", 3, "--grid", grid, "-o", out)[0] == 0
+        images[grid] = np.load(out / "000000.npy").tobytes()
+    assert len(set(images.values())) == 3
+
+
+@pytest.mark.parametrize("method", ["jump", "chord"])
+def test_a_map_is_not_inverted_by_its_jumps(method):
+    street = load_checkpoint("street")
+    with pytest.raises(InputError, match="does not follow the flow's paths"):
+        invert(street, torch.zeros(1, 2, 32, 256), build_sampler(method, steps=2))

@@ -21,17 +21,37 @@ from r2flow.noise import generator
 from r2flow.reports.completed import hidden_errors
 from r2flow.simulator import simulate
 from tests.conftest import prepare_folder, write_run
-from tests.test_completion import network, scans
+from tests.test_completion import network
+from tests.test_sampling import scans
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 VLP16 = SENSORS["vlp16"]
-COMPLETE = "complete", "--pictures", "0"
 TRANSFER = {"name": "transfer"}
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(tmp_path_factory.mktemp("complete") / "run", network(), TRANSFER)
+
+
+@pytest.fixture
+def complete(r2flow, run, tmp_path):
+    """`r2flow complete`, by the run and into the folder `out` if not told otherwise."""
+
+    def typed(*arguments: object, model: Path | None = run, out: Path = tmp_path / "out") -> tuple[int, str, str]:
+        by = () if model is None else ("-c", model)
+        return r2flow("complete", "--pictures", 0, *arguments, *by, "--out", out)
+
+    return typed
+
+
+def assert_refused(answer: tuple[int, str, str], message: str, out: Path) -> None:
+    """In one line, with nothing written."""
+    code, _, error = answer
+    assert code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not out.exists()
 
 
 def full_scan(path: Path, number: int = 0) -> np.ndarray:
@@ -80,9 +100,9 @@ def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, end
     assert "what is known" in (tmp_path / "out" / "one.html").read_text()
 
 
-def test_a_sparser_sensor_is_found_and_its_points_come_back(r2flow, run, tmp_path):
+def test_a_sparser_sensor_is_found_and_its_points_come_back(complete, tmp_path):
     xyz = sparse_scan(tmp_path / "in" / "room.pcd")
-    code, said, _ = r2flow(*COMPLETE, tmp_path / "in", "-c", run, "--num", 2, "--out", tmp_path / "out")
+    code, said, _ = complete(tmp_path / "in", "--num", 2)
     assert code == 0
     assert (
         "vlp16 with 16 beams from +15.1 to -14.9 degrees; 6 of the 8 rows of hdl64e are measured, 7 beams look past"
@@ -97,29 +117,23 @@ def test_a_sparser_sensor_is_found_and_its_points_come_back(r2flow, run, tmp_pat
     with np.load(tmp_path / "out" / "room.spread.npz") as spread:
         assert spread["deviation"].shape == spread["returned"].shape == (8, 64)
         assert ((spread["deviation"] == 0) & (spread["returned"] == 1)).sum() >= 6 * 64
-    named = r2flow(*COMPLETE, tmp_path / "in", "-c", run, "--from", "vlp16", "--num", 2, "--out", tmp_path / "named")
-    assert "vlp16 with 16 beams" in named[1]
+    assert len(open_scans(tmp_path / "out")) == 2  # the answers alone, not their spread
+    assert "vlp16 with 16 beams" in complete(tmp_path / "in", "--from", "vlp16", out=tmp_path / "named")[1]
 
 
-def test_answers_are_read_as_samples_are(r2flow, run, tmp_path):
-    full_scan(tmp_path / "one.npy")
-    r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--num", 2, "--out", tmp_path / "out")
-    assert len(open_scans(tmp_path / "out")) == 2  # neither pictures nor spread
-
-
-def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow, run, tmp_path):
+def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(complete, tmp_path):
     for number, name in enumerate(("one.npy", "two.npy")):
         full_scan(tmp_path / "in" / name, number)
-    asked = [*COMPLETE, tmp_path / "in", "-c", run, "--mask", "points:0.3", "--seed", 3, "--out", tmp_path / "out"]
-    assert "2 scans written" in r2flow(*asked)[1]
+    asked = [tmp_path / "in", "--mask", "points:0.3", "--seed", 3]
+    assert "2 scans written" in complete(*asked)[1]
     first = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")}
     (tmp_path / "out" / "two.npy").unlink()
     stamp = (tmp_path / "out" / "one.npy").stat().st_mtime_ns
-    assert "1 scans written" in (said := r2flow(*asked)[1])
+    assert "1 scans written" in (said := complete(*asked)[1])
     assert "1 were there already" in said
     assert (tmp_path / "out" / "one.npy").stat().st_mtime_ns == stamp
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")} == first
-    code, _, error = r2flow(*asked[:-1], tmp_path / "out", "--num", 3)
+    code, _, error = complete(*asked, "--num", 3)
     assert code == 2
     assert "holds other answers: " in error
     kept = parse_mask("points:0.3")((8, 64), generator(3, "condition", 1))
@@ -127,53 +141,43 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow,
     assert np.array_equal(image[:, kept], answer[:, kept])
 
 
-def test_a_scan_of_which_everything_is_known_comes_back_and_says_so(r2flow, run, tmp_path):
-    image = full_scan(tmp_path / "one.npy")
-    code, said, _ = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out")
-    assert code == 0
-    assert np.array_equal(np.load(tmp_path / "out" / "one.npy"), image)
-    assert "one: everything is known, so nothing was completed" in said
-
-
-def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(r2flow, run, tmp_path):
+def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(complete, tmp_path):
     """Returns come back to the bit and some gaps return; without the option all gaps are rays without a return."""
     image = full_scan(tmp_path / "one.npy")
     image[:, ::2, ::3] = 0
     np.save(tmp_path / "one.npy", image)
-    asked = [*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out"]
-    assert r2flow(*asked, "--fill-gaps")[0] == 0
+    asked = [tmp_path / "one.npy"]
+    assert complete(*asked, "--fill-gaps")[0] == 0
     filled = np.load(tmp_path / "out" / "one.npy")
     there = image[0] > 0
     assert np.array_equal(filled[:, there], image[:, there])
     assert (filled[0][~there] > 0).any()
-    code, _, error = r2flow(*asked)
+    code, _, error = complete(*asked)
     assert code == 2
     assert "fill_gaps" in error
 
 
-def test_simulated_scans_are_seen_through_another_sensor(r2flow, run, tmp_path):
-    code, said, _ = r2flow(
-        *COMPLETE, "simulated:3", "-c", run, "--from", "vlp16", "--scans", 1, "--steps", 1, "--out", tmp_path / "out"
-    )
+def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):
+    code, said, _ = complete("simulated:3", "--from", "vlp16", "--scans", 1, "--steps", 1)
     assert code == 0
     assert "simulated:3: vlp16 with 16 beams" in said
     assert np.load(tmp_path / "out" / "simulated-3-000000.npy").shape == (2, 8, 64)
 
 
-def test_a_model_of_range_alone_leaves_reflectance_out(r2flow, tmp_path):
+def test_a_model_of_range_alone_leaves_reflectance_out(complete, tmp_path):
     path = write_run(tmp_path / "run", network(reflectance=False), TRANSFER)
     full_scan(tmp_path / "one.bin")
-    code, said, _ = r2flow(*COMPLETE, tmp_path / "one.bin", "-c", path, "--mask", "rows:2", "--out", tmp_path / "out")
+    code, said, _ = complete(tmp_path / "one.bin", "--mask", "rows:2", model=path)
     assert code == 0
     assert "the model is of range alone: answers have no reflectance" in said
     assert read_points(tmp_path / "out" / "one.ply").reflectance is None
 
 
-def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):
+def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
     path = write_run(tmp_path / "run", network("diffusion"), TRANSFER)
     image = full_scan(tmp_path / "one.npy")
-    asked = *COMPLETE, tmp_path / "one.npy", "-c", path, "--mask", "rows:2", "--out", tmp_path / "out"
-    code, _, error = r2flow(*asked, "--sampler", "repaint", "--steps", 2)
+    asked = tmp_path / "one.npy", "--mask", "rows:2"
+    code, _, error = complete(*asked, "--sampler", "repaint", "--steps", 2, model=path)
     assert (code, error) == (0, "")
     assert np.array_equal(np.load(tmp_path / "out" / "one.npy")[:, ::2], image[:, ::2])
     note = json.loads((tmp_path / "out" / "manifest.json").read_text())["recipe"]["sampler"]
@@ -189,103 +193,72 @@ def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):
         (["--from", "vlp16"], "is a range image of 8x64, those of the model are 8x64: --from vlp16 has 16 rows"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message):
+def test_what_cannot_be_done_is_one_line(complete, tmp_path, options, message):
     full_scan(tmp_path / "one.npy")
     np.save(tmp_path / "mask.npy", np.ones((4, 4), bool))
     given = [option.format(folder=tmp_path) for option in options]
-    out = [] if "--out" in given else ["--out", tmp_path / "out"]
-    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, *out, *given)
-    assert code == 2
-    assert message in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+    assert_refused(complete(tmp_path / "one.npy", *given), message, tmp_path / "out")
 
 
 @pytest.mark.parametrize(
-    ("made", "message"),
+    ("image", "message"),
     [
-        (lambda path: np.save(path, np.full((2, 8, 64), np.nan, np.float32)), "give 0 for NaN"),
-        (lambda path: np.save(path, -scans()[0].numpy()), "must hold ranges in metres, of 0 or more"),
-        (
-            lambda path: np.save(path, np.full((2, 8, 64), 3, np.float32)),
-            "reflectances of [0, 1]. Divide",
-        ),
-        (
-            lambda path: np.save(path, scans()[0].numpy() * np.float32([[[1000]], [[1]]])),
-            "none of its ranges lies within 1.45-80 m",
-        ),
+        (np.full((2, 8, 64), np.nan, np.float32), "give 0 for NaN"),
+        (-scans()[0].numpy(), "must hold ranges in metres, of 0 or more"),
+        (np.full((2, 8, 64), 3, np.float32), "reflectances of [0, 1]. Divide"),
+        (scans()[0].numpy() * np.float32([[[1000]], [[1]]]), "none of its ranges lies within 1.45-80 m"),
     ],
 )
-def test_scans_that_cannot_be_completed_are_one_line(r2flow, run, tmp_path, made, message):
-    made(tmp_path / "one.npy")
-    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out")
-    assert code == 2
-    assert message in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+def test_scans_that_cannot_be_completed_are_one_line(complete, tmp_path, image, message):
+    np.save(tmp_path / "one.npy", image)
+    assert_refused(complete(tmp_path / "one.npy"), message, tmp_path / "out")
 
 
 @pytest.mark.parametrize("sensor", [[], ["--from", "vlp32c"]])
-def test_points_of_which_none_is_in_view_are_one_line(r2flow, run, tmp_path, sensor):
+def test_points_of_which_none_is_in_view_are_one_line(complete, tmp_path, sensor):
     xyz, reflectance = image_to_points(scans()[0].numpy(), SENSOR.rays())
     write_points(tmp_path / "far.bin", 500 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True), reflectance)
-    code, _, error = r2flow(*COMPLETE, tmp_path / "far.bin", "-c", run, *sensor, "--out", tmp_path / "out")
-    assert code == 2
-    assert "lies within 1.45-80 m" in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+    assert_refused(complete(tmp_path / "far.bin", *sensor), "lies within 1.45-80 m", tmp_path / "out")
 
 
-def test_no_error_is_told_where_no_ray_returns_in_both(r2flow, run, tmp_path):
+def test_no_error_is_told_where_no_ray_returns_in_both(complete, tmp_path):
     np.save(tmp_path / "one.npy", np.zeros((2, 8, 64), np.float32))
-    code, said, error = r2flow(
-        *COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
-    )
+    code, said, error = complete(tmp_path / "one.npy", "--mask", "rows:2")
     assert (code, error) == (0, "")
     assert "nan" not in said
     assert "no ray returns in all" in said
     assert "wrong in ray-drop" in said
 
 
-def test_the_folder_of_the_scans_is_not_written_into(r2flow, run, tmp_path):
+def test_the_folder_of_the_scans_is_not_written_into(complete, tmp_path):
     """There the note on the answers would be taken for one on the scans."""
     sparse_scan(tmp_path / "in" / "room.pcd")
     for what in (tmp_path / "in" / "room.pcd", tmp_path / "in", tmp_path):
         out = tmp_path if what == tmp_path else tmp_path / "in"
-        code, _, error = r2flow(*COMPLETE, what, "-c", run, "--num", 2, "--out", out)
+        code, _, error = complete(what, "--num", 2, out=out)
         assert code == 2
         assert f"{out} is the folder of the scans" in error
     assert [path.name for path in (tmp_path / "in").iterdir()] == ["room.pcd"]
 
 
-def test_a_file_of_an_answer_s_name_is_no_answer(r2flow, run, tmp_path):
-    full_scan(tmp_path / "one.npy")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "one.npy").write_text("mine")
-    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out")
-    assert code == 2
-    assert "one.npy" in error
-    assert (tmp_path / "out" / "one.npy").read_text() == "mine"
-
-
 @pytest.mark.parametrize("ending", [".npy", ".bin"])
-def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path, ending):
+def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, ending):
     for number, drive in enumerate("ab"):
         full_scan(tmp_path / drive / f"one{ending}", number)
-    asked = "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
+    asked = "--mask", "rows:2"
     full_scan(tmp_path / "out" / f"one{ending}", 1)
-    assert r2flow(*COMPLETE, tmp_path / "a", *asked)[0] == 2
+    assert complete(tmp_path / "a", *asked)[0] == 2
     (tmp_path / "out" / f"one{ending}").unlink()
-    assert r2flow(*COMPLETE, tmp_path / "a", *asked)[0] == 0
+    assert complete(tmp_path / "a", *asked)[0] == 0
     before = (tmp_path / "out" / f"one{ending}").read_bytes()
-    code, _, error = r2flow(*COMPLETE, tmp_path / "b", *asked)
+    code, _, error = complete(tmp_path / "b", *asked)
     assert code == 2
     assert "another scan of the name one" in error
     assert (tmp_path / "out" / f"one{ending}").read_bytes() == before
     full_scan(tmp_path / "b" / f"two{ending}", 0)
     (tmp_path / "b" / f"one{ending}").unlink()
-    assert "1 scans written" in r2flow(*COMPLETE, tmp_path / "b", *asked)[1]
-    assert r2flow(*COMPLETE, tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
+    assert "1 scans written" in complete(tmp_path / "b", *asked)[1]
+    assert complete(tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
 
 
 def prepared(folder: Path, numbers: list[int]) -> Path:
@@ -296,51 +269,51 @@ def prepared(folder: Path, numbers: list[int]) -> Path:
     return folder / "prep"
 
 
-def test_prepared_scans_are_named_by_their_numbers_in_the_set(r2flow, run, tmp_path):
+def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path):
     given = prepared(tmp_path, [0, 1, 0, 1])
-    asked = *COMPLETE, given, "-c", run, "--mask", "rows:2", "--out", tmp_path / "out", "--scans"
+    asked = given, "--mask", "rows:2", "--scans"
     for most, numbers in ((1, [2]), (2, [1, 2, 3])):  # evenly spread
-        assert r2flow(*asked, most)[0] == 0
+        assert complete(*asked, most)[0] == 0
         assert sorted(path.stem for path in (tmp_path / "out").glob("*.npy")) == [f"prep-{n:06d}" for n in numbers]
     whole = open_scans(given).source
     for number in numbers:
         assert np.array_equal(np.load(tmp_path / "out" / f"prep-{number:06d}.npy")[:, ::2], whole[number][:, ::2])
-    assert "1 scans written" in (said := r2flow(*asked, 4)[1])
+    assert "1 scans written" in (said := complete(*asked, 4)[1])
     assert "3 were there already" in said
 
 
-def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_path):
+def test_a_bad_scan_may_be_mended_and_the_command_given_again(complete, tmp_path):
     full_scan(tmp_path / "in" / "a.npy", 0)
     image = full_scan(tmp_path / "in" / "b.npy", 1)
     np.save(tmp_path / "in" / "b.npy", np.where(image == image.max(), np.nan, image))
-    asked = *COMPLETE, tmp_path / "in", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
-    assert r2flow(*asked)[0] == 2
+    asked = tmp_path / "in", "--mask", "rows:2"
+    assert complete(*asked)[0] == 2
     np.save(tmp_path / "in" / "b.npy", image)
-    code, said, _ = r2flow(*asked)
+    code, said, _ = complete(*asked)
     assert code == 0
     assert "1 scans written" in said
     full_scan(tmp_path / "in" / "b.npy", 0)
-    assert "another scan of the name b" in r2flow(*asked)[2]
+    assert "another scan of the name b" in complete(*asked)[2]
 
 
-def test_an_unusual_scale_that_is_estimated_is_told(r2flow, run, tmp_path):
+def test_an_unusual_scale_that_is_estimated_is_told(complete, tmp_path):
     xyz = sparse_scan(tmp_path / "one.ply")
     write_points(tmp_path / "one.ply", xyz, np.linspace(0, 0.01, len(xyz), dtype=np.float32))
-    asked = *COMPLETE, tmp_path / "one.ply", "-c", run, "--from", "vlp16"
-    assert "reflectance is divided by 0.01, its largest" in r2flow(*asked, "--out", tmp_path / "a")[2]
-    assert r2flow(*asked, "--reflectance-scale", "0.01", "--out", tmp_path / "b")[2] == ""
+    asked = tmp_path / "one.ply", "--from", "vlp16"
+    assert "reflectance is divided by 0.01, its largest" in complete(*asked)[2]
+    assert complete(*asked, "--reflectance-scale", "0.01", out=tmp_path / "b")[2] == ""
 
 
-def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path):
+def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):
     full_scan(tmp_path / "one.bin")
     mask = np.arange(8)[:, None] % 2 == np.zeros(64)
     np.save(tmp_path / "mask.npy", mask)
-    asked = *COMPLETE, tmp_path / "one.bin", "-c", run, "--mask", tmp_path / "mask.npy", "--out", tmp_path / "out"
-    assert r2flow(*asked)[0] == 0
-    assert "1 were there already" in r2flow(*asked)[1]
-    assert "reflectance_scale=None there, 2.0 here" in r2flow(*asked, "--reflectance-scale", 2)[2]
+    asked = tmp_path / "one.bin", "--mask", tmp_path / "mask.npy"
+    assert complete(*asked)[0] == 0
+    assert "1 were there already" in complete(*asked)[1]
+    assert "reflectance_scale=None there, 2.0 here" in complete(*asked, "--reflectance-scale", 2)[2]
     np.save(tmp_path / "mask.npy", ~mask)
-    code, _, error = r2flow(*asked)
+    code, _, error = complete(*asked)
     assert code == 2
     assert "mask=" in error
 
@@ -355,8 +328,8 @@ def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path):
         ("rellis_vlp32c/vel000104.bin", "32 beams"),
     ],
 )
-def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path, scan, beams):
-    code, said, _ = r2flow(*COMPLETE, shared / "real" / "other_sensors" / scan, "-c", run, "--out", tmp_path / "out")
+def test_real_scans_of_other_sensors_are_completed(complete, shared, tmp_path, scan, beams):
+    code, said, _ = complete(shared / "real" / "other_sensors" / scan)
     assert code == 0
     assert beams in said
     assert "1 scans written" in said
@@ -420,27 +393,24 @@ def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(
         ("rows:4", ("--sampler", "replace", "--steps", 1), "street", "32x256"),
     ],
 )
-def test_the_model_is_chosen_by_what_is_missing(r2flow, tmp_path, mask, more, model, size):
+def test_the_model_is_chosen_by_what_is_missing(complete, tmp_path, mask, more, model, size):
     image = simulate(SENSORS["hdl64e"].resized(64, 512), 5, 0).image
     write_points(tmp_path / "one.ply", *image_to_points(image, SENSORS["hdl64e"].resized(64, 512).rays()))
-    asked = (tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, "--out", tmp_path / "out")
-    code, said, _ = r2flow(*COMPLETE, *asked)
+    code, said, _ = complete(tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, model=None)
     assert code == 0
     assert f"the model {model}: " in said
     assert f"of the image, {size}" in said
     assert len(read_points(tmp_path / "out" / "one.ply").xyz) > 1000
 
 
-def test_scans_for_two_models_are_refused_together(r2flow, tmp_path):
+def test_scans_for_two_models_are_refused_together(complete, tmp_path):
     sensor = SENSORS["hdl64e"].resized(64, 512)
     image = simulate(sensor, 5, 0).image
     for name, kept in (("cut", np.s_[:, :, 300:]), ("thin", np.s_[:, ::4])):
         part = np.zeros_like(image)
         part[kept] = image[kept]
         write_points(tmp_path / "in" / f"{name}.ply", *image_to_points(part, sensor.rays()))
-    asked = tmp_path / "in", "--from", "hdl64e", "--fill-gaps", "--out", tmp_path / "out"
-    code, _, error = r2flow(*COMPLETE, *asked)
-    assert code == 2
-    assert "cut lacks whole sectors (--checkpoint street) and thin does not (--checkpoint densify)" in error
-    assert not (tmp_path / "out").exists()
-    assert r2flow(*COMPLETE, tmp_path / "in" / "cut.ply", *asked[1:])[0] == 0
+    asked = "--from", "hdl64e", "--fill-gaps"
+    said = "cut lacks whole sectors (--checkpoint street) and thin does not (--checkpoint densify)"
+    assert_refused(complete(tmp_path / "in", *asked, model=None), said, tmp_path / "out")
+    assert complete(tmp_path / "in" / "cut.ply", *asked, "--steps", 1, model=None)[0] == 0

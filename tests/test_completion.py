@@ -13,6 +13,7 @@ from r2flow.model.completion import Completed, complete, completing
 from r2flow.noise import generator
 from r2flow.samplers import build_sampler
 from tests.conftest import CONFIG
+from tests.test_sampling import scans
 
 SHAPE = 8, 64
 
@@ -32,14 +33,6 @@ def network(name: str = "transfer_flow", reflectance: bool = True, **backbone) -
         parameter.copy_(0.2 * torch.randn_like(parameter))
     made.sampler = build_sampler("euler", steps=3)
     return Checkpoint(made, config)
-
-
-def scans(count: int = 2) -> torch.Tensor:
-    """Walls with holes, (B, 2, 8, 64)."""
-    draws = torch.Generator().manual_seed(7)
-    r = 3 + 60 * torch.rand(count, 1, *SHAPE, generator=draws)
-    r = r * (torch.rand(r.shape, generator=draws) > 0.2)
-    return torch.cat([r, torch.rand(r.shape, generator=draws) * (r > 0)], 1)
 
 
 def halved(images: torch.Tensor) -> torch.Tensor:

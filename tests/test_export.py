@@ -40,34 +40,26 @@ def flow(name: str, generator: str = "rectified_flow") -> Checkpoint:
 @pytest.mark.parametrize(
     ("sampler", "times", "states"),
     [
-        (build_sampler("euler", steps=2), [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]),
+        ("euler:steps=2", [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]),
+        ("euler:steps=2:finish=0.25", [0, 0.75], [[1, 0, 0], [1, 0.75, 0], [1, 0.75, 0.25]]),
+        ("euler:grid=[0,0.8,1]", [0, 0.8], [[1, 0, 0], [1, 0.8, 0], [1, 0.8, 0.2]]),
+        ("midpoint:steps=1", [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0, 1]]),
         (
-            build_sampler("euler", steps=2, finish=0.25),
-            [0, 0.75],
-            [[1, 0, 0], [1, 0.75, 0], [1, 0.75, 0.25]],
-        ),
-        (
-            build_sampler("euler", steps=2, grid=(0.0, 0.8, 1.0)),
-            [0, 0.8],
-            [[1, 0, 0], [1, 0.8, 0], [1, 0.8, 0.2]],
-        ),
-        (build_sampler("midpoint", steps=1), [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0, 1]]),
-        (
-            build_sampler("midpoint", steps=2, finish=0.25),
+            "midpoint:steps=2:finish=0.25",
             [0, 0.375, 0.75],
             [[1, 0, 0, 0], [1, 0.375, 0, 0], [1, 0, 0.75, 0], [1, 0, 0.75, 0.25]],
         ),
         # Adams and Bashforth: after Euler's first step h (3/2 v_1 - 1/2 v_0)
-        (build_sampler("ab2", steps=2), [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0.25, 0.75]]),
+        ("ab2:steps=2", [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0.25, 0.75]]),
         (
-            build_sampler("rk4", steps=1),
+            "rk4:steps=1",
             [0, 0.5, 0.5, 1],
             [[1, 0, 0, 0, 0], [1, 0.5, 0, 0, 0], [1, 0, 0.5, 0, 0], [1, 0, 0, 1, 0], [1, 1 / 6, 1 / 3, 1 / 3, 1 / 6]],
         ),
     ],
 )
 def test_a_sampler_is_its_butcher_tableau(sampler, times, states):
-    found = tableau(flow("efficient_unet").generator, sampler)
+    found = tableau(flow("efficient_unet").generator, build_sampler(sampler))
     assert found.times == pytest.approx(times)
     assert found.second is None
     torch.testing.assert_close(found.states, torch.tensor(states, dtype=torch.float64))

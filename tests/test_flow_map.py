@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import FlowDataset
@@ -150,20 +149,6 @@ def test_it_can_also_be_solved_as_the_flow_that_it_is(grown):
     x_0 = Draws(0, range(2)).start(grown.noise_shape)
     how = build_sampler("adams3", steps=4)
     assert torch.equal(grown(x_0, sampler=how).x, parent()(x_0, sampler=how).x)
-
-
-def test_a_scan_that_leaves_the_numbers_is_flagged_and_keeps_its_last_state(exact):
-    x_0 = Draws(0, range(2)).start(exact.noise_shape)
-    x_0[1, 0, 0, 0] = float("inf")
-    assert exact(x_0, sampler=build_sampler("jump", steps=2)).converged.tolist() == [True, False]
-
-
-def test_samplers_that_jumps_do_not_have_are_refused():
-    for wrong in ("jump:finish=0.1", "jump:grid=[0,0.5]", "jumps", "jump:steps=0"):
-        with pytest.raises(InputError):
-            build_sampler(wrong)
-    with pytest.raises(InputError, match="map"):
-        parent().choose("jump")
 
 
 OWN = build_sampler("adams3", steps=16, grid="power:1.75")
@@ -385,12 +370,6 @@ def test_a_map_is_drawn_on_the_grid_that_it_learned():
     found = stage(jumps={"grid": "power:3"}).generator
     assert found.sampler == build_sampler("jump", steps=4, grid="power:3")
     assert found.choose(steps=2) == build_sampler("jump", steps=2, grid="power:3")
-
-
-def test_the_stage_s_options_are_those_of_its_config():
-    text = (Path(__file__).parent.parent / "conf/stage/flow_map.yaml").read_text(encoding="utf-8")
-    options = {key: value for key, value in yaml.safe_load(text).items() if key not in ("defaults", "init")}
-    assert stage(**{key: value for key, value in options.items() if key != "name"}).jumps.steps
 
 
 def test_jumps_of_half_precision_noise_are_taken_in_float32(grown):

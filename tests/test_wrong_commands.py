@@ -39,12 +39,9 @@ nope # No such command 'nope'
 sampel -c run -o out # Did you mean 'sample'?
 report nope
 report --nope
-sample # Missing
 sample run # Missing
-sample nowhere -o out
 sample empty -o out
 sample scans -o out # scans holds no checkpoint
-sample run -o file.txt
 sample run -o out --sampler torchdiffeq:nope
 sample run -o out --sampler euler --tolerance 0.1 # tolerance
 sample run -o out --sampler nope --tolerance 0.1 # no sampler named
@@ -72,7 +69,6 @@ sample run -o out --plugin plugin.py
 sample run -o out extra
 sample run -o out -o # '-o' requires an argument
 sample '' -o out # an argument is empty
-info # Missing
 info nowhere
 info scans/000000.bin
 info run run # extra argument
@@ -90,15 +86,10 @@ report backbones --only nope
 report backbones --size ²x²
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels
 report backbones extra
-complete # Missing
-complete nowhere -o out
 complete scans/000000.bin -c bad.ckpt -o out
 complete scans/000000.bin -c run -o out --mask nope # no mask
 complete scans/000000.bin -c run -o out --from nope
 complete scans/000000.bin -c run -o out --to os1_64
-complete scans/000000.bin -c run -o file.txt --mask rows:2 --sampler euler
-view # Missing
-view nowhere
 view scans -o out # ends in .html
 view scans -o file.txt/a.html
 view scans -o out.html --num 257
@@ -108,32 +99,24 @@ view run -o out.html --steps 1,a
 view run -o out.html --times 3 --steps 1,2 # one number of --steps
 view run scans -o out.html --times 3 --sequence # --sequence
 view run -o out.html --sequence # --sequence
-simulate # Missing
 simulate -o out --sensor bad.yaml
 simulate -o out --size 1x1 # found 1
 simulate -o out --seed 99999999999999999999999 --num 1 --size 8x64
 simulate -o out --format '' # an argument is empty
 simulate -o out --format npy --labels
-simulate -o file.txt --num 1 --size 8x64
 simulate -o scans --num 1 --size 8x64 # holds scans
 interpolate scans/000000.bin -c run -o out # Missing
 interpolate scans/000000.bin nowhere.bin -c run -o out
 interpolate scans/000000.bin bad.bin -c run -o out
-interpolate scans/000000.bin scans/000001.bin -c run -o file.txt
 interpolate scans scans -c run -o out # scan
-show # Missing
 show scans # Missing
-show nowhere -o out
 show file.txt -o out
-show scans -o file.txt
 show scans -o out --size ²x²
 show scans -o out --projection unfolding
 show run -o out # a run without samples
 show nope:scans -o out
 show simulated:a -o out
 show kitti_360:nowhere -o out
-sensor # Missing
-sensor nowhere
 sensor bad.bin
 sensor image.npy
 sensor scans -o out # a .yaml file
@@ -143,28 +126,20 @@ prepare empty -o out
 prepare -o out # Missing
 prepare simulated:3 -o out
 prepare scans/000000.bin -o out
-prepare scans -o file.txt
 prepare scans -o out --split train # no split named 'train'
 prepare scans -o out --drives 77
 prepare kitti_360:scans -o out
 prepare prepared:scans -o out
-pairs # Missing
-pairs nowhere
 pairs stopped
 pairs run --num 1 --seed 99999999999999999999
-pairs run --num 1 -o file.txt
 weights --add
 weights --add nope file.txt
 weights --add rangenet53
 weights --add rangenet53 file.txt
 weights nope
-compare # Missing
-compare file.txt
+compare file.txt -o out
 compare scans # is not a run
-compare run -o file.txt
-evaluate # Missing
 evaluate scans # nothing to compare with
-evaluate scans nowhere
 evaluate scans empty
 evaluate scans file.txt
 evaluate scans scans --split train # no split named 'train'
@@ -173,7 +148,6 @@ evaluate scans scans --steps 4 --sampler nope # are of a run, a checkpoint or a 
 evaluate scans --reference --steps 4 # found none
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans scans --json file.txt/a.json
-evaluate scans scans -o file.txt
 evaluate scans run --steps 2 --sampler dopri5 # steps
 evaluate scans run --steps 1,,2
 evaluate scans run --sampler euler,heun2 --tolerance 0.1 # tolerance
@@ -183,22 +157,14 @@ evaluate scans scans --sensor vlp # Did you mean 'vlp16'? Your own is a YAML fil
 evaluate image.npy # nothing to compare with
 evaluate simulated:x scans
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
-report curvature # Missing
-report curvature nowhere -o out
-report curvature run -o file.txt
-report solvers # Missing
 report solvers nowhere -o out
 report solvers -o out --samplers nope
 report solvers -o out --budgets 0
 report solvers -o out --problems nope
 report solvers -o out --budgets 1 --samplers rk4 # --budgets
 report solvers -o out --problems none # nothing to measure
-report solvers -o file.txt
-report paper # Missing
-report paper nowhere -o out
 report paper run -o out --results nowhere
 report paper run -o out --real nowhere
-report paper run -o file.txt
 """
 
 # What each verb's wrong values are tried on, and words that no option takes.
@@ -211,6 +177,16 @@ BASES = {
     "backbones": "report backbones", "paper": "report paper run -o out",
 }  # fmt: skip
 WORDS = ("device", "sensor", "sampler", "format", "projection", "convention", "precision", "metrics")
+
+
+def wrong_places() -> Iterator[str]:
+    """Of each verb: with nothing, with what is not there, and a file where its folder is to be."""
+    for verb, base in BASES.items():
+        if verb != "backbones":
+            yield f"{'report ' if base.startswith('report') else ''}{verb} # Missing"
+            yield re.sub(r"\b(run|scans)\b\S*", "nowhere", base, count=1)
+        if verb not in ("backbones", "view", "sensor"):
+            yield f"{base.removesuffix(' -o out')} -o file.txt"
 
 
 def wrong_values() -> Iterator[str]:
@@ -238,79 +214,46 @@ def wrong_values() -> Iterator[str]:
 
 TRAIN = """
 name=x callbacks.checkpoint.every=1.5
-name=x callbacks.checkpoint=5
-name=x callbacks.guard.lowest_scale=-1
-name=x callbacks.guard.skips=a
-name=x +callbacks.ema.foo=1
 name=x callbacks=other
 name=x +samples.steps=3
-name=x samples=3
 name=x sampler.name=3
-name=x sampler.grid=wave
-name=x +sampler.foo=1
 name=x backbone.base_channels=7
-name=x backbone.num_heads=[3,5,7]
 name=x backbone.patch=[3,5] # multiple of 12
-name=x backbone.dropout=nan
-name=x backbone=adm_unet backbone.channel_multipliers=[]
-name=x backbone=nope
 name=x backbone=
 name=x backbone.name=null
-name=x sensor=nope
 name=x sensor.rows=1
-name=x sensor.max_range=inf
-name=x +sensor.elevations=[1,2]
 name=x encoding.format=null
-name=x +encoding.gamma=3
 name=x data=null
-name=x data=kitti_raw
-name=x data=folder data.root=scans data.split=train
-name=x data=folder data.root=scans data.drives=[7]
 name=x data=folder data.root=scans data.reading.projection=flat
 name=x data=folder data.root=scans data.validation.data=3
 name=x data=folder data.root=scans data.pairs=3
-name=x data=folder data.root=scans data.parts=[{name:folder}]
 name=x data=prepared
-name=x data=mixed data.parts=[]
-name=x data=mixed 'data.parts=[{name: folder}]'
 name=x data=mixed 'data.parts=[{name: folder, root: empty}]'
-name=x data=mixed 'data.parts=[{name: folder, root: scans, weight: 1}, {name: folder, root: scans}]'
 name=x data=pairs
-name=x stage=reflow
-name=x stage=reflow stage.init=nowhere
 name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
 name=x stage=reflow data=pairs stage.init=run +data.pairs.foo=1
 name=x stage=reflow data=pairs stage.init=run backbone=hdit
 name=x stage.loss=null
 name=x stage.time=uniform
-name=x +stage.foo=1
 name=x stage=base
 name=x trainer=nope
 name=x trainer.max_time=foo
-name=x trainer.precision=foo
-name=x trainer.accelerator=cuda
 name=x trainer.strategy=ddp_foo
-name=x trainer.gradient_clip_algorithm=foo
 name=x trainer.profiler=foo
-name=x trainer.min_epochs=foo
 name=x trainer.barebones=true
 name=x trainer.reload_dataloaders_every_n_epochs=-1
 name=x trainer.logger=true
 name=x +plugins.a=3
 name=x --plugin nope
-name=x --plugin plugin.py
 name=x --plugin nowhere.py
 --plugin
 name=x experiment=nope
-name=x experiment=reflow
 name=x chain=[]
 name=x 'chain={a: {init: b}}'
-name=x 'chain={a: {plugins: [b]}}'
 name=x 'chain={a: {stage: 3}}'
 name=x 'chain={a/b: {seed: 3}}'
 name=x 'chain={"..": {seed: 3}}' # cannot be read
 name=x experiment=demo chain.rf1=null
-name=x run_dir=3
 name=a/../../b
 name=null # names a folder
 name=x foo
@@ -329,15 +272,11 @@ name=x --config-name nope
 name=x --multirun -x # -x; see --help
 -m seed=1,2 hydra/launcher=nope
 -m seed=1,2 hydra/sweeper=nope
--m seed=1,2 run_dir=x # hydra.sweep.dir=FOLDER
--m seed=1,2 name=x # hydra.sweep.dir=FOLDER
 name=x hydra.run.dir=file.txt
 name=x hydra=3
-name=x generator=nope
 name=x data@foo=kitti_raw
 name=x override
 name=x ~data.batch_size
-name=x ~name # every run has its name
 name=x scans=3 # no key 'scans'
 name=x +parent=3
 """
@@ -428,7 +367,7 @@ def _quiet() -> Iterator[None]:
     root.handlers[:], root.level = handlers, level
 
 
-@pytest.mark.parametrize("line", [*commands(VERBS), *wrong_values()])
+@pytest.mark.parametrize("line", [*commands(VERBS), *wrong_places(), *wrong_values()])
 def test_a_wrong_verb_or_option_is_refused(refused, line: str):
     refused(line)
 
