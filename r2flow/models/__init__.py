@@ -45,7 +45,7 @@ MODELS: Registry[Model] = Registry(
     ),
     densify=Model(
         "scans of few beams or points completed to all, in one evaluation, learned from simulated scans",
-        "caa513b8a9cbafb673576354048230ceeacdfd9ca89de856c109eebce124e075",
+        "620e21cc5ef1b7568fd80afb729e65ce47462d5596b3bee04d0838c0072422c0",
     ),
 )
 DEFAULT = "street"
