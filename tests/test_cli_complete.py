@@ -302,6 +302,12 @@ def test_an_unusual_scale_that_is_estimated_is_told(complete, tmp_path):
     asked = tmp_path / "one.ply", "--from", "vlp16"
     assert "reflectance is divided by 0.01, its largest" in complete(*asked)[2]
     assert complete(*asked, "--reflectance-scale", "0.01", out=tmp_path / "b")[2] == ""
+    # So is that of a scan of the model's sensor: unscaled values would stand next to answers in [0, 1].
+    full_scan(tmp_path / "two.bin")
+    points = read_points(tmp_path / "two.bin")
+    write_points(tmp_path / "two.bin", points.xyz, points.reflectance / points.reflectance.max() * np.float32(0.01))
+    assert "divided by 0.01" in complete(tmp_path / "two.bin", "--mask", "rows:2", out=tmp_path / "c")[2]
+    assert read_points(tmp_path / "c" / "two.bin").reflectance.max() == pytest.approx(1)
 
 
 def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):

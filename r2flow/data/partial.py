@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, usual_scale
-from r2flow.data.options import PREPARED, SIMULATED
+from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread
 from r2flow.errors import InputError, naming
@@ -120,15 +120,19 @@ def _files(
             fired = sensor_of(scans, source or (target if same else None))
         except InputError as error:
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
+        estimated = full_reflectance(scans) or 0.0
         if same and fired.columns >= FEWER * target.columns:
-            full = scale or (1.0 if stored else max(usual_scale(spec, source or target), full_reflectance(scans) or 0))
-            by_points = partial(_read_points, reading=reading, fired=None, scale=full, strict=True)
+            known = parse(spec)[0].name != FOLDER or (source or target).reflectance_scale
+            usual = usual_scale(spec, source or target) if known else 0.0
+            full = scale or (1.0 if stored else max(usual, estimated)) or 1.0
+            strict = scale is not None or full in FULL_REFLECTANCE
+            by_points = partial(_read_points, reading=reading, fired=None, scale=full, strict=strict)
         else:
-            full = scale or (1.0 if stored else source and source.reflectance_scale) or full_reflectance(scans) or 1.0
+            full = scale or (1.0 if stored else source and source.reflectance_scale) or estimated or 1.0
             by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines.append(_described(spec, replace(fired, name=name), target, turns=True))
-        if scale is None and full == full_reflectance(scans) and full not in FULL_REFLECTANCE:
+        if scale is None and full == estimated and full not in FULL_REFLECTANCE:
             log.warning("%s: reflectance is divided by %g, its largest; --reflectance-scale names another", spec, full)
     elif source and not _same_image(source, target):
         lines.append(_described(spec, source, target))
