@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
 from r2flow.data.sets import ScanSet
-from r2flow.errors import InputError
 from r2flow.files import atomic_write, cache_folder
 from r2flow.metrics.base import ScanMetric
+from r2flow.model.checkpoint import read_tensors
 
 log = logging.getLogger(__name__)
 
@@ -49,12 +49,8 @@ class Cache:
         if not path.is_file():
             return None
         try:
-            with safe_open(path, framework="pt") as file:
-                notes = file.metadata() or {}
-                if notes.get("key") != key:
-                    return None
-                states = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return Statistics(states, int(notes["scans"]), int(notes["empty"]))
+            states, notes = read_tensors(path)
+            return Statistics(states, int(notes["scans"]), int(notes["empty"])) if notes["key"] == key else None
         except (SafetensorError, OSError, KeyError, ValueError):
             log.warning("%s is damaged; recomputing its statistics.", path)
             return None
@@ -80,7 +76,4 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
         "format": FORMAT, "scans": scans.identity, "subset": rule, "protocol": metric.protocol.asdict(),
         "keeps": metric.keeps, "device": torch.device(metric.device).type,
     }  # fmt: skip
-    try:
-        return json.dumps(parts, sort_keys=True)
-    except TypeError as error:
-        raise InputError(f"the protocol of '{metric.name}' must have plain JSON values: {error}.") from None
+    return json.dumps(parts, sort_keys=True)

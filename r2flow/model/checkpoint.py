@@ -254,13 +254,17 @@ def as_parent(config: Mapping[str, Any], path: Path, step: int, weights: str | N
     return {"path": str(path), "weights": weights, "step": step, "stage": stage, **grown_from}
 
 
-def read_safetensors(path: Path) -> dict[str, Any]:
-    """Read weights and config of an r2flow `.safetensors`, in the layout of the other checkpoints."""
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read the tensors and the metadata of a `.safetensors`."""
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:
-        metadata = file.metadata() or {}
-        weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+
+
+def read_safetensors(path: Path) -> dict[str, Any]:
+    """Read weights and config of an r2flow `.safetensors`, in the layout of the other checkpoints."""
+    weights, metadata = read_tensors(path)
     notes = parse_json(metadata.get(NOTES, "{}"))
     if notes.pop("digest", None) != _digest(notes, weights):
         raise InputError(f"{path} is not of r2flow, or damaged: its checksum differs. Use another checkpoint.")

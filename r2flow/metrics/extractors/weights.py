@@ -7,22 +7,21 @@ safetensors in the folder of weights, from which `Extractor.trained` loads it.
 import io
 import json
 import tarfile
-import zlib
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, TypeVar
 
 import torch
 import yaml
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.files import atomic_write, cache_folder, parse_json, refuse_unreadable
+from r2flow.errors import InputError, naming
+from r2flow.files import atomic_write, cache_folder, parse_json, reading, telling
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
-from r2flow.model.checkpoint import read_torch
+from r2flow.model.checkpoint import NOTES, read_tensors, read_torch
 from r2flow.registry import Registry
 
 E = TypeVar("E", bound=Extractor)
@@ -63,7 +62,7 @@ def kept(name: str) -> str | None:
     path = kept_file(name)
     if not path.exists():
         return None
-    notes = read_safetensors(path, with_tensors=False)[1]
+    notes = _read_safetensors(path)[1]
     return f"{notes['weights']} of {notes['source']}"
 
 
@@ -72,20 +71,15 @@ def add(name: str, path: Path) -> str:
 
     Returns:
         First 12 digits of the SHA-256 of the parameters, independent of the file format.
-
-    Raises:
-        InputError: unknown network, unsafe or unreadable file, or weights of another network.
     """
     SOURCES[name]
     tensors, config = read_published(path)
-    try:
+    with naming(path):
         weights = weights_hash(EXTRACTORS[name].from_tensors(tensors, config))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     whole = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}  # tensors may share memory
     notes = json.dumps({"weights": weights, "source": path.name, "config": config}, default=str)
     with atomic_write(kept_file(name)) as file:
-        file.write(save(whole, metadata={"r2flow": notes}))
+        file.write(save(whole, metadata={NOTES: notes}))
     return weights
 
 
@@ -97,7 +91,7 @@ def read_kept(cls: type[E]) -> E:
             f"no weights of {cls.name} in {path.parent}: get {PurePosixPath(SOURCES[cls.name]).name} and give "
             f"r2flow weights --add {cls.name} FILE (r2flow weights lists sources)."
         )
-    tensors, notes = read_safetensors(path)
+    tensors, notes = _read_safetensors(path)
     extractor = cls.from_tensors(tensors, notes["config"])
     extractor.weights = weights_hash(extractor)
     if extractor.weights != notes["weights"]:
@@ -114,55 +108,41 @@ def weights_hash(extractor: Extractor) -> str:
 
 def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read tensors by name, and the config, from a file, an archive or a folder."""
-    if not path.is_dir():
-        refuse_unreadable(path, LARGEST, "file of weights")
+    if path.is_dir():
+        members = {name: (path / name).read_bytes() for name in (*PARTS, CONFIG) if (path / name).is_file()}
+        return _joined(path, members)
+    with reading(path, LARGEST, "file of weights"):
         if path.suffix == ".safetensors":
-            tensors, notes = read_safetensors(path)
+            tensors, notes = _read_safetensors(path)
             return tensors, notes["config"]
-        if not _is_tar(path):
-            with path.open("rb") as file:
-                return _read_torch(file, str(path)), {}
-    members = _read_members(path)
+        with path.open("rb") as file:
+            is_archive = file.read(2) == b"\x1f\x8b" or tarfile.is_tarfile(path)
+            return _joined(path, _unpacked(path)) if is_archive else (_read_torch(file, str(path)), {})
+
+
+def _unpacked(path: Path) -> dict[str, bytes]:
+    """The files of `PARTS` and `CONFIG` in a tar archive, by file name."""
+    members: dict[str, bytes] = {}
+    with tarfile.open(path) as tar:
+        for member in tar:
+            name = PurePosixPath(member.name).name
+            if name in (*PARTS, CONFIG) and (content := tar.extractfile(member) if member.isreg() else None):
+                if name in members or member.size > LARGEST:
+                    raise InputError(f"{path} holds several networks ('{name}' twice), or a file that is too large.")
+                members[name] = content.read()
+    return members
+
+
+def _joined(path: Path, members: Mapping[str, bytes]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors of all parts, by name, and the config."""
     parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}") for part in PARTS if part in members]
     if not parts:
         raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the published archive.")
-    try:
+    with telling(path / CONFIG):
         config = yaml.safe_load(members.get(CONFIG, b"{}"))
-    except (yaml.YAMLError, ValueError, RecursionError):
-        config = None
-    if not isinstance(config, dict):
-        raise InputError(f"{path}: {CONFIG} is not a table of settings; is the archive whole?")
+        if not isinstance(config, dict):
+            raise InputError(f"{path / CONFIG} is not a table of settings; is the archive whole?")
     return {name: tensor for part in parts for name, tensor in part.items()}, config
-
-
-def _is_tar(path: Path) -> bool:
-    """Whether a file is a tar archive; gzip files are assumed to be."""
-    with path.open("rb") as file:
-        return file.read(2) == b"\x1f\x8b" or tarfile.is_tarfile(path)
-
-
-def _read_members(path: Path) -> dict[str, bytes]:
-    """Read the files of `PARTS` and `CONFIG` in a folder or tar archive, by file name."""
-    names = (*PARTS, CONFIG)
-    if path.is_dir():
-        return {name: (path / name).read_bytes() for name in names if (path / name).is_file()}
-    members: dict[str, bytes] = {}
-    try:
-        with tarfile.open(path) as tar:
-            for member in tar:
-                name = PurePosixPath(member.name).name
-                if name not in names or not member.isreg():
-                    continue
-                if name in members or member.size > LARGEST:
-                    raise InputError(f"{path} holds several networks ('{name}' twice), or a file that is too large.")
-                content = tar.extractfile(member)
-                assert content is not None
-                members[name] = content.read()
-    except InputError:
-        raise
-    except (tarfile.TarError, zlib.error, EOFError, ValueError, OSError):
-        raise InputError(f"{path} is a damaged archive; get it again.") from None
-    return members
 
 
 def _read_torch(file: IO[bytes], name: str) -> dict[str, Tensor]:
@@ -182,12 +162,8 @@ def _is_plain(name: object, value: object) -> bool:
     return not (value.is_meta or value.is_quantized or value.is_complex())
 
 
-def read_safetensors(path: Path, with_tensors: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read the tensors of a safetensors file, and the notes of `add`."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            noted = parse_json((file.metadata() or {}).get("r2flow", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys() if with_tensors}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError):
-        raise InputError(f"{path} is not a safetensors file, or a damaged one.") from None
-    return tensors, {"config": {}, "weights": "", "source": path.name, **noted}
+    with telling(path):
+        tensors, metadata = read_tensors(path)
+        return tensors, {"config": {}, "weights": "", "source": path.name, **parse_json(metadata.get(NOTES, "{}"))}
