@@ -254,8 +254,9 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
 
     scans = open_scans(text, reading, split, num)
     refuse_parts(text)
-    if len(scans):
-        _ = scans.source[0]  # fail before the other set is read
+    if not len(scans):
+        raise InputError(f"{text} contains no scan.")
+    _ = scans.source[0]  # fail before the other set is read
     return scans
 
 

@@ -96,8 +96,6 @@ class Nearest:
 
 def find_nearest(sets: Mapping[str, ScanSet], training: ScanSet, work: Work, device: str = "cpu") -> dict[str, Nearest]:
     """Find the nearest training scan of each scan of several sets; reads training scans once, without storing them."""
-    if not len(training):
-        raise InputError(f"{training.label} contains no training scan.")
     nearest = {name: Nearest(scans, work, device) for name, scans in sets.items()}
     first = 0
     for y in described(training, work, device, "reading training scans"):

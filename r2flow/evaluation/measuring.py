@@ -67,8 +67,6 @@ def gather_real(
     metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, cache: Cache | None = None, protocol: Rules = R2FLOW
 ) -> dict[str, Statistics]:
     """Compute each metric's statistics of the real scans, or read them from the cache."""
-    if len(real) == 0:
-        raise InputError(f"{real.label} contains no scan to compare with.")
     protocol.check(real)
     chosen = {name: real_rule(metric, real, protocol) for name, metric in metrics.items()}
     points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
@@ -110,8 +108,6 @@ def measure(
         real: Statistics from `gather_real` under the same protocol.
         draws: Bootstrap resamples for 95 % intervals; 0: no intervals.
     """
-    if len(generated) == 0:
-        raise InputError(f"{generated.label} contains no scan to measure.")
     for name, metric in metrics.items():
         metric.reset()
         metric.load_real_state(real[name].states)
