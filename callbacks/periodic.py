@@ -1,12 +1,14 @@
 """Base class of periodic callbacks."""
 
+from abc import ABC, abstractmethod
+
 import lightning as L
 import torch
 
 from .ema import averaged_weights
 
 
-class Periodic(L.Callback):
+class Periodic(L.Callback, ABC):
     """Calls `act` every `every` steps and at the end, in the first process, with averaged weights in eval mode.
 
     Args:
@@ -16,9 +18,9 @@ class Periodic(L.Callback):
     def __init__(self, every: int) -> None:
         self.every, self._last = every, 0
 
+    @abstractmethod
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Action of a subclass."""
-        raise NotImplementedError
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._last = trainer.global_step  # a resumed run has already acted at this step

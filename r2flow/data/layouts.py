@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -29,7 +30,7 @@ class Drive:
     scans: tuple[str, ...]  # paths as strings: 100,000 Path objects take seconds and ten times the memory
 
 
-class SourceKind:
+class SourceKind(ABC):
     """A kind of scans, an entry of `SOURCES`: `data=NAME` in a run, `NAME:ROOT` in a command."""
 
     splits: Mapping[str, Sequence[int | str]] = {}  # standard split: names or numbers of each part's drives
@@ -37,12 +38,12 @@ class SourceKind:
     reflectance_scale = 1.0  # default value of full reflectance
     levels: int | None = None  # reflectance is n / levels
 
+    @abstractmethod
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
         """The scans in order, not yet read; `seed` and `first_scene` are for simulated scans.
 
         `reading.reflectance` is True or False.
         """
-        raise NotImplementedError
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         """Reason why the scans count as scans without reflectance; None if they have reflectance."""

@@ -28,7 +28,7 @@ from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensor_files import ENDINGS, read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
-from r2flow.registry import Registry, UnknownName, did_you_mean
+from r2flow.registry import Registry, UnknownName
 from r2flow.store import MANIFEST, read_manifest
 
 log = logging.getLogger(__name__)
@@ -89,9 +89,6 @@ def open_scans(
         split: A part of the data set's standard split.
         num: Maximum number of scans, chosen by a fixed shuffle; the number of simulated scenes.
         own_size: For pictures: take the size of the range image instead of the sensor's, and do not compare beams.
-
-    Raises:
-        InputError: the scans do not exist, or cannot become such images.
     """
     label = str(spec)
     options, file = parse(label)
@@ -136,7 +133,7 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
             raise InputError(f"simulated scans are named by their seed, as simulated:0; found {text!r}.")
         return SourceOptions(kind, rest, scenes=SCENES), None
     if colon and not path.exists() and "/" not in kind and "\\" not in kind:
-        raise InputError(f"no data set named {kind!r}; known: {', '.join(SOURCES)}.{did_you_mean(kind, [*SOURCES])}")
+        SOURCES[kind]  # not known
     if path.is_file():
         return SourceOptions(FOLDER, str(path.parent)), path
     if not path.exists():
@@ -193,13 +190,10 @@ def reading_for(
         scans: Names as for `open_scans`; None is skipped.
         model: The model that the scans are for; another sensor or size than the model's is refused.
         sensor, size, ...: Requested fields; None: not requested.
-
-    Raises:
-        InputError: unknown name, or a sensor or size that differs from the model's or from those of given samples.
     """
     specs = [str(spec) for spec in scans if spec is not None]
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
-    kind = SOURCES[parse(specs[0])[0].name] if specs else SourceKind()
+    kind = SOURCES[parse(specs[0])[0].name if specs else FOLDER]
     reading = _reading_of(model) if model else stored or Reading(SENSORS[kind.sensor])
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and (chosen.shape != model.sensor.shape or chosen.elevations != model.sensor.elevations):
@@ -316,7 +310,7 @@ def open_prepared(
     folder = Path(root).expanduser()
     recipe, stored = read_prepared(folder)
     refuse_other_images(folder, recipe, reading)
-    kind = SOURCES[recipe["layout"]] if recipe["layout"] in SOURCES else SourceKind()
+    kind = SOURCES[recipe["layout"] if recipe["layout"] in SOURCES else FOLDER]
     if split is None and drives is None:
         parts = sorted({part for drive in stored if (part := kind.split_of(drive.name))})
         if len(parts) > 1:

@@ -47,8 +47,8 @@ class RangeCodes:
     def encode(self, r: np.ndarray) -> np.ndarray:
         """The nearest codes, uint16, of ranges in metres, 0 for no return."""
         returned = r != 0
-        if not ((r >= self.near) & (r <= self.far) | ~returned).all():  # refuses NaN, too
-            raise ValueError(f"ranges must be 0 or lie in [{self.near:g}, {self.far:g}] m.")
+        inside = (r >= self.near) & (r <= self.far) | ~returned  # False for NaN, too
+        assert inside.all(), f"ranges must be 0 or lie in [{self.near:g}, {self.far:g}] m"
         r = r.astype(np.float64)
         code = 1 + (r - self.min_range) / (self.fine or 1)
         if self.coarse:

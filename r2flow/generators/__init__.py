@@ -35,11 +35,7 @@ GENERATORS: Registry[type[Generator]] = Registry(
 
 
 def build_generator(config: Mapping[str, Any]) -> Generator:
-    """Build the generator of a config: keys `sensor`, `encoding`, `backbone` and `generator` (default: rectified flow).
-
-    Raises:
-        InputError: a missing key, an unknown name or option, or incompatible sizes.
-    """
+    """Build the generator of a config: keys `sensor`, `encoding`, `backbone`, `generator` (default: rectified flow)."""
     with torch.device("cpu"):  # geometry needs real values, even if the weights are on the meta device
         space = build_space(config)
     if "backbone" not in config:

@@ -20,8 +20,6 @@ Precision = Literal["32-true", "bf16-mixed"]  # names of Lightning's Trainer
 
 IMAGE, KNOWN = "image", "known"  # keys of the condition of a partial scan
 
-WHOLE_ONLY = "a {} generates whole images only; leave the region out."
-
 
 def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
     """`image` and `known` of a condition, in x's dtype and on its device; zeros without a condition."""
@@ -95,16 +93,12 @@ class Generator(nn.Module):
             draws: Source of the noise of stochastic samplers: `draws.step(shape, j)` at step j = 1, 2, ...
             precision: `bf16-mixed` runs the network's matrix products in bfloat16; states and steps keep their type.
             progress: Called after every network evaluation.
-
-        Raises:
-            InputError: the sampler cannot run this generator, or needs draws or a condition.
         """
         how = sampler or self.sampler
         how.check(self)
         if condition is not None and not (self.told or how.completes):
             raise InputError(f"this {type(self).__name__} takes no condition; complete scans with --sampler mmps.")
-        if how.draws and draws is None:
-            raise InputError(f"sampler {how.name} is stochastic: give draws.")
+        assert draws is not None or not how.draws, f"sampler {how.name} is stochastic: give draws"
         x = wide(noise.to(self.device))
         conditions = condition and {name: value.to(self.device) for name, value in condition.items()}
         noise_of_step = None if draws is None else lambda j: self.further_noise(draws, j).to(x)
@@ -119,9 +113,6 @@ class Generator(nn.Module):
         """A sampler by name, with `options` that are not None; without a name, `sampler`, or `few` for fewer steps.
 
         Another sampler keeps the number of steps and has its own defaults otherwise.
-
-        Raises:
-            InputError: an unknown name or option, or a sampler that cannot run this generator.
         """
         given = {key: value for key, value in options.items() if value is not None}
         default, steps = self.sampler, getattr(self.sampler, "steps", None)
@@ -142,12 +133,11 @@ class Generator(nn.Module):
     @property
     def unit(self) -> tuple[int, int]:
         """Rows and columns whose multiples a region's offset and size must be."""
-        raise InputError(WHOLE_ONLY.format(type(self).__name__))
+        raise InputError(f"a {type(self).__name__} generates whole images only; leave the region out.")
 
     def part(self, region: Region) -> "Generator":
         """This generator restricted to a region of whole units; it shares the weights."""
-        if region.share < 1:
-            raise InputError(WHOLE_ONLY.format(type(self).__name__))
+        _ = self.unit if region.share < 1 else None  # refuses a region
         return self
 
     def start_from(self, parent: "Generator") -> None:

@@ -21,15 +21,14 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
         images: Range in metres and optionally reflectance, (B, 2 or 1, H, W); 0 without a return. Without the
             reflectance channel, the reflectance of returns is unknown, that of empty rays is known.
         state: `r2flow.lidar.known.Ray` of each ray, (B, H, W).
-
-    Raises:
-        InputError: images or states of the wrong shape, or a ray that contradicts its state.
     """
     _, h, w = space.shape
-    if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != (h, w):
-        raise InputError(f"the images to complete must be (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}.")
-    if state.shape != images[:, 0].shape:
-        raise InputError(f"the states of the rays must be {tuple(images[:, 0].shape)}, found {tuple(state.shape)}.")
+    sizes, states = tuple(images.shape), tuple(state.shape)
+    if len(sizes) != 4 or sizes[1] not in (1, 2) or sizes[2:] != (h, w) or states != (sizes[0], h, w):
+        raise InputError(
+            f"the images to complete must be (B, 2 or 1, {h}, {w}) and the states of the rays (B, {h}, {w}), found "
+            f"{sizes} and {states}."
+        )
     returned, measured = images[:, 0] > 0, state != Ray.UNKNOWN
     if bool((measured & (state != torch.where(returned, int(Ray.RETURN), int(Ray.EMPTY)))).any()):
         raise InputError("a ray's state must be Ray.RETURN for a range above 0, Ray.EMPTY for a measured range of 0, "

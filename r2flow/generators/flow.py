@@ -1,5 +1,6 @@
 """Flows: generators by the ODE dx/dt = v(t, x), from noise at t = 0 to data at t = 1."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
 from typing import Any, ClassVar, Self
@@ -19,7 +20,7 @@ from r2flow.samplers import MMPS, FixedSteps, ODESampler, Progress, Sampler
 USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # default of a new flow
 
 
-class Flow(Generator):
+class Flow(Generator, ABC):
     """A generator by an ODE. A subclass defines `velocity`.
 
     Attributes:
@@ -29,9 +30,9 @@ class Flow(Generator):
     plain = "euler"
     completers: ClassVar[tuple[Sampler, ...]] = (MMPS(),)
 
+    @abstractmethod
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
-        raise NotImplementedError
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
         """u(t, x, s), the mean velocity from t to s; v(t, x) unless the flow is a flow map."""
@@ -53,11 +54,7 @@ class Flow(Generator):
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
-        """Solve the ODE from x at t_0, (B, ...), to t_1; see `r2flow.flow.solvers.solve` for the options.
-
-        Raises:
-            InputError: the sampler is not an ODE solver.
-        """
+        """Solve the ODE from x at t_0, (B, ...), to t_1; see `r2flow.flow.solvers.solve` for the options."""
         how = sampler or self.sampler
         how.check(self)
         return how.solve(self, x.to(self.device), t_0, t_1, condition, progress, **options)

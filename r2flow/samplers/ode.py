@@ -1,5 +1,6 @@
 """ODE samplers: solve dx/dt = v(t, x) by a solver of `r2flow.flow.solvers`."""
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +15,9 @@ from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Progress
 class ODESampler(Sampler):
     """A sampler that solves the flow's ODE, forward or backward in time."""
 
+    @abstractmethod
     def options(self) -> dict[str, Any]:
         """Options of `r2flow.flow.solvers.solve`."""
-        raise NotImplementedError
 
     def solve(
         self,

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
 from r2flow.flow.solvers.exponential import ExponentialMethod, automatic, exprb43
@@ -88,12 +87,13 @@ def solve(
         global_error: Estimate the error at t_1 of an adaptive method by a second solution at 1/60 of the tolerance; its
             evaluations are counted.
         knots: Number of inner states to keep, at equal numbers of steps; for r2flow's fixed-step methods.
-
-    Raises:
-        InputError: an unknown method or grid, or a number out of range.
     """
     solver = method_of(method)
-    _check_numbers(t_0, t_1, steps, tolerance, max_evaluations, max_step)
+    assert math.isfinite(t_1 - t_0), f"a solution needs two times, found {t_0} and {t_1}"
+    assert steps >= 1, f"a solver needs at least 1 step, found {steps}"
+    assert 0 < tolerance < math.inf, f"a solver's tolerance must be positive and finite, found {tolerance:g}"
+    assert max_evaluations >= 1, f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}"
+    assert 0 < max_step <= 1, f"max_step is a share of the interval, above 0 and at most 1; found {max_step}"
     x = wide(x)
     if t_0 == t_1 or not len(x):
         return _at_rest(x, global_error, knots)
@@ -145,15 +145,3 @@ def _at_rest(x: Tensor, global_error: bool, knots: int) -> Solution:
         knots=torch.stack([x] * knots, 1) if knots else None,
         global_error=torch.zeros(len(x), dtype=torch.float64) if global_error else None,
     )
-
-
-def _check_numbers(t_0: float, t_1: float, steps: int, tolerance: float, max_evaluations: int, max_step: float) -> None:
-    for good, message in (
-        (math.isfinite(t_0) and math.isfinite(t_1), f"a solution needs two times, found {t_0} and {t_1}."),
-        (steps >= 1, f"a solver needs at least 1 step, found {steps}."),
-        (0 < tolerance < math.inf, f"a solver's tolerance must be positive and finite, found {tolerance:g}."),
-        (max_evaluations >= 1, f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}."),
-        (0 < max_step <= 1, f"max_step is a share of the interval, above 0 and at most 1; found {max_step}."),
-    ):
-        if not good:
-            raise InputError(message)

@@ -103,8 +103,7 @@ class Evaluations:
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         self.counts[self.scenes] += 1
         v = self._velocity(t, x)
-        if v.shape != x.shape:
-            raise ValueError(f"a velocity must have the state's shape {tuple(x.shape)}, found {tuple(v.shape)}.")
+        assert v.shape == x.shape, f"a velocity must have the state's shape {tuple(x.shape)}, found {tuple(v.shape)}"
         self.precision = self.coarsest(v, x)
         if self._progress is not None:
             self._progress()

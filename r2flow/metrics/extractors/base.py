@@ -1,5 +1,6 @@
 """Base class of feature networks."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
@@ -10,7 +11,7 @@ from r2flow.errors import InputError
 from r2flow.metrics.scans import Scans
 
 
-class Extractor(nn.Module):
+class Extractor(nn.Module, ABC):
     """A network that computes features of scans, for inference only.
 
     A subclass defines `features`, and `trained` unless its weights come from `r2flow weights --add`.
@@ -29,9 +30,9 @@ class Extractor(nn.Module):
     needs_reflectance: ClassVar[bool] = False
     weights: str = "random"
 
+    @abstractmethod
     def features(self, scans: Scans) -> Tensor:
         """Features (B, D), float32; NaN for a scan without returns."""
-        raise NotImplementedError
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:

@@ -8,6 +8,7 @@ release (`conv1.weight`, `enc1.residual_0.bn2.bias` ...) are translated.
 import math
 import random
 import re
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
@@ -117,9 +118,9 @@ class RangeNet(Extractor):
         image = torch.cat([scans.images[:, :1], scans.xyz, reflectance], 1).to(self.device)
         return nan_where_empty(self.pool(self(self.normalise(image))), scans)
 
+    @abstractmethod
     def pool(self, maps: Tensor) -> Tensor:
         """Map decoder maps (B, C, H, W) to features (B, D)."""
-        raise NotImplementedError
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
