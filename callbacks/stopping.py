@@ -50,11 +50,7 @@ class Stopping(L.Callback):
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Context that handles the signals and restores the previous handlers.
-
-        Raises:
-            Stopped: a signal was received.
-        """
+        """Context that handles the signals and restores the previous handlers."""
         with listening(self.hear, self.signals):
             try:
                 yield

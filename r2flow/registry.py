@@ -104,7 +104,7 @@ class Registry(Generic[T]):
 
     def build(self, options: Mapping[str, Any], *args: Any) -> Any:
         """Call the entry `options["name"]` with `args` and the remaining options as keywords."""
-        if not isinstance(options, Mapping) or "name" not in options:
+        if not isinstance(options, Mapping) or not isinstance(options.get("name"), str):
             names = ", ".join(sorted(self._entries))
             raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {names}.")
         chosen = dict(options)

@@ -35,9 +35,6 @@ def build_backbone(
         in_channels: Channels of the image plus those of the condition concatenated to it.
         out_channels: Channels of the output; None: `in_channels`.
         second_time: Whether the network takes a second time s.
-
-    Raises:
-        InputError: an unknown name or option, or a value that the backbone does not support.
     """
     arguments: dict[str, Any] = {"in_channels": in_channels}
     if out_channels is not None:

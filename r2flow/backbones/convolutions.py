@@ -1,6 +1,7 @@
 """Common layers of the two U-Nets: convolutions on a ring, resampling, residual and attention blocks."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Unpack
@@ -11,8 +12,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
-from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, wrapped, zero_initialised
-from r2flow.errors import InputError
+from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, shared, wrapped, zero_initialised
 from r2flow.registry import Bound, Count, Portion, Positive
 
 GROUPS = 8
@@ -77,8 +77,7 @@ class GroupNorm(nn.GroupNorm):
     """Group norm computed in float32."""
 
     def __init__(self, channels: int, groups: int = GROUPS, eps: float = EPS, affine: bool = True) -> None:
-        if channels % groups:
-            raise InputError(f"{channels} channels cannot be normed in {groups} groups: make them a multiple of it.")
+        shared(channels, groups, f"{groups} groups")
         super().__init__(groups, channels, eps=eps, affine=affine)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -158,8 +157,7 @@ class SelfAttention(nn.Module):
 
     def __init__(self, channels: int, heads: int, options: BlockOptions) -> None:
         super().__init__()
-        if channels % heads:
-            raise InputError(f"{channels} channels cannot be shared by {heads} attention heads.")
+        shared(channels, heads, f"{heads} attention heads")
         self.register_buffer("scale", torch.tensor(0.5**0.5))
         self.norm = GroupNorm(channels, options.groups, options.eps)
         self.attn = nn.MultiheadAttention(channels, heads, batch_first=True)
@@ -171,7 +169,7 @@ class SelfAttention(nn.Module):
         return (x + attended.mT.unflatten(2, x.shape[2:])) * self.scale
 
 
-class UNet(Backbone):
+class UNet(Backbone, ABC):
     """U-Net on the image concatenated with features of its rays.
 
     Parameters have the names of the published weights.
@@ -227,11 +225,11 @@ class UNet(Backbone):
             zero_initialised(self.interval_embedding[-1])
         self.follow_rays()
 
+    @abstractmethod
     def build_levels(
         self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
     ) -> None:
         """Build all layers after the first convolution, whose output has base_channels."""
-        raise NotImplementedError
 
     def follow_rays(self) -> None:
         if self.coords_encoding is not None:

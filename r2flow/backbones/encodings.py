@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.backbones.layers import ExactBuffers
-from r2flow.errors import InputError
 from r2flow.registry import Registry
 
 
@@ -138,6 +137,5 @@ PUBLISHED_NAMES = {"learnable_embedding": "learnable", "polar_coordinates": "pol
 def position_name(position: str | None, *special: str) -> str:
     """The name of a position option; accepts the names of published configs, too."""
     name = PUBLISHED_NAMES.get(str(position), str(position).lower())
-    if name not in special and name not in ENCODINGS:
-        raise InputError(f"no position named {position!r}; known: {', '.join([*special, *ENCODINGS])}.")
+    Registry("position", **dict.fromkeys(special), **dict(ENCODINGS.items()))[name]
     return name

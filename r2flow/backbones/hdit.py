@@ -22,6 +22,7 @@ from r2flow.backbones.layers import (
     at_least_float32,
     in_bands,
     mapping_network,
+    shared,
     uncast,
     unshuffle,
     zero_initialised,
@@ -276,10 +277,7 @@ class Attention(nn.Module):
     def __init__(self, options: BlockOptions) -> None:
         super().__init__()
         channels, heads = options.channels, options.heads
-        if channels % (4 * heads):
-            raise InputError(
-                f"{channels} channels cannot be shared by {heads} heads: each needs a multiple of 4 for its rotation."
-            )
+        shared(channels, 4 * heads, f"{heads} heads with their rotation")
         self.heads, self.neighbourhood = heads, options.neighbourhood
         self.scale = nn.Parameter(torch.full((heads, 1), math.log(10.0)))
         self.norm = AdaRMSNorm(channels, options.condition_channels)

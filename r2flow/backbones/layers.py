@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r2flow.errors import InputError
+
 Layer = TypeVar("Layer", bound=nn.Module)
 
 
@@ -182,3 +184,21 @@ def in_bands(f: Callable[..., tuple[Tensor, ...]], *maps: Tensor) -> tuple[Tenso
         return f(*maps)
     parts = [f(*(x[:, top : top + band] for x in maps)) for top in range(0, rows, band)]
     return tuple(torch.cat(outputs, dim=1) for outputs in zip(*parts, strict=True))
+
+
+def shared(channels: int, unit: int, what: str) -> int:
+    """channels / unit, for `what` shares them; refuses a remainder."""
+    if channels % unit:
+        raise InputError(f"{channels} channels cannot be shared by {what}: give a multiple of {unit}.")
+    return channels // unit
+
+
+def halved(what: str, shape: tuple[int, int], times: int, least: int = 1) -> tuple[int, int]:
+    """Rows and columns of an image after `times` halvings; refuses indivisible sizes and results below `least`."""
+    rows, columns = shape[0] >> times, shape[1] >> times
+    if (rows << times, columns << times) != tuple(shape) or min(rows, columns) < least:
+        raise InputError(
+            f"{what} halves images {times} times: rows and columns must be multiples of {2**times}, at least "
+            f"{least * 2**times}, found {shape[0]} x {shape[1]}."
+        )
+    return rows, columns

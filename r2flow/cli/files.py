@@ -10,7 +10,7 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.options import SamplerOptions, grouped
 from r2flow.errors import InputError
-from r2flow.registry import did_you_mean
+from r2flow.registry import Registry
 
 
 @app.command(epilog="Example: r2flow export runs/NAME --to onnx --steps 8 --out flow.onnx")
@@ -111,9 +111,7 @@ def weights(
         if name in MODELS:
             print(f"{add_model(name, path)}: the model {name}")
             return
-        if name not in SOURCES:
-            names = [*MODELS, *SOURCES]
-            raise InputError(f"no weights named {name!r}; known: {', '.join(names)}.{did_you_mean(name, names)}")
+        Registry("weights", **dict(MODELS.items()), **dict(SOURCES.items()))[name]
         print(f"{kept_file(name)}: weights {take(name, path)} of {path.name}")
         return
     models = [

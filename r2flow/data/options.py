@@ -3,20 +3,20 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from r2flow.data.pairs import PairRecipe
 from r2flow.errors import InputError
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
-from r2flow.registry import Count, Natural, NonNegative, Portion, Positive, Seed, check_options
+from r2flow.registry import Bound, Count, Natural, NonNegative, Portion, Positive, Seed, check_options
 from r2flow.samplers import build_sampler
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # names in `r2flow.data.opening.SOURCES`
 Data = dict[str, Any]  # of a config
 MIXED, PAIRS = "mixed", "pairs"  # other values of `data.name`: several sets of scans, and pairs drawn by a flow
-MOST_SCENES = 10**7  # their order takes 80 MB
+SCENES = Bound("from 1 to 10,000,000", lambda n: 1 <= n <= 10**7)  # their order takes 80 MB
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,10 @@ class SourceOptions:
     root: str | int | None = None  # folder of the data set
     split: str | None = None  # part of the data set's standard split; None takes all
     drives: list[str | int] | None = None  # names or numbers of the drives to take; None takes all
-    scenes: int = 512  # number of simulated scenes
+    scenes: Annotated[int, SCENES] = 512  # number of simulated scenes
     reading: Mapping[str, Any] | None = None  # fields of `r2flow.data.reading.Reading`: projection, convention, ...
 
     def __post_init__(self) -> None:
-        if not 1 <= self.scenes <= MOST_SCENES:
-            raise InputError(f"data.scenes must be 1 to {MOST_SCENES:,}, found {self.scenes}.")
         check_options("data.reading", ReadingOptions, self.reading or {})
         check_columns(self.columns)
 
@@ -132,12 +130,9 @@ class DataOptions(SourceOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.parts is not None and self.name != MIXED:
-            raise InputError(f"data.parts are those of data=mixed, found data={self.name}; leave them out, or give it.")
-        if self.scans is not None and self.name != PAIRS:
-            raise InputError(
-                f"data.scans needs data=pairs, found data={self.name}; leave data.scans out, or give data=pairs."
-            )
+        for key, name in (("parts", MIXED), ("scans", PAIRS)):
+            if getattr(self, key) is not None and self.name != name:
+                raise InputError(f"data.{key} needs data={name}, found data={self.name}; leave one of them out.")
 
     @property
     def validation_options(self) -> ValidationOptions:

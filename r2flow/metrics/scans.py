@@ -30,10 +30,6 @@ class Scans:
         rays: Position of a pixel's ray, and so its point, in its bin: as in `Sensor.rays`.
         xyz: Measured points of the pixels, (B, 3, H, W) in metres; `rays` is then unused.
         names: Names of the scans in messages; default: index in the batch.
-
-    Raises:
-        InputError: image size differs from the sensor's; or invalid values, with the name of the first such scan: NaN,
-            a range below 0 or in millimetres, a reflectance outside [0, 1].
     """
 
     def __init__(

@@ -10,11 +10,12 @@ from r2flow.files import atomic_write
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
+from r2flow.registry import Registry
 from r2flow.simulator import REVISION, simulate
 from r2flow.store import FileStore
 
 KIND = "simulated"
-FORMATS = ("bin", "pcd", "ply", "npy")  # npy is the range image itself
+FORMATS = Registry("format", bin=".bin", pcd=".pcd", ply=".ply", npy=".npy")  # npy is the range image itself
 
 
 class SimulatedFolder(FileStore):
@@ -33,8 +34,7 @@ class SimulatedFolder(FileStore):
         super().__init__(folder, KIND, {"simulator": REVISION, "seed": seed, "reading": reading}, endings)
         self.sensor, self.seed = sensor, seed
         for name in formats:
-            if name not in FORMATS:
-                raise InputError(f"no format named {name!r} for simulated scans; known: {', '.join(FORMATS)}.")
+            FORMATS[name]
         if labels and tuple(formats) == ("npy",):
             raise InputError(
                 "labels are those of points, and .npy is a range image without points; add another format, such as bin."

@@ -78,5 +78,5 @@ def test_encodings_have_the_channels_they_declare(name):
 def test_published_names_are_understood_and_wrong_ones_explained():
     assert position_name("polar_coordinates") == "polar"
     assert position_name(None, "none") == "none"
-    with pytest.raises(InputError, match="no position named 'fourier'; known: none, fourier_features"):
+    with pytest.raises(InputError, match="no position named 'fourier'; known: fourier_features, none"):
         position_name("fourier", "none")

@@ -69,11 +69,11 @@ def test_resampling_keeps_a_constant_ring_constant(window):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"base_channels": 12}, "12 channels cannot be normed in 8 groups"),
+        ({"base_channels": 12}, "12 channels cannot be shared by 8 groups: give a multiple of 8"),
         ({"base_channels": 8, "num_heads": 3}, "cannot be shared by 3 attention heads"),
         ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
         ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
-        ({"position": "learnable"}, "no position named 'learnable'; known: none, fourier_features"),
+        ({"position": "learnable"}, "no position named 'learnable'; known: fourier_features, none"),
     ],
 )
 def test_options_that_cannot_work_say_why(name, options, message):

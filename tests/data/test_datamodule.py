@@ -63,7 +63,7 @@ def test_what_cannot_be_is_refused(numbered: Path):
         module(name="kitti_360")
     with pytest.raises(InputError, match="no standard split"):
         module(name="folder", root=str(numbered), split="train")
-    with pytest.raises(InputError, match="data.parts are those of data=mixed"):
+    with pytest.raises(InputError, match="data.parts needs data=mixed"):
         module(name="folder", root=str(numbered), parts=[{"name": "folder", "root": str(numbered)}])
     with pytest.raises(InputError, match="on_bad_scan"):
         module(name="folder", root=str(numbered), reading={"on_bad_scan": "ignore"})
@@ -137,8 +137,11 @@ def test_the_fingerprint_does_not_know_how_the_root_was_written(numbered: Path, 
         ([{"name": "folder"}], "data.root=FOLDER"),
         ([{"name": "folder", "root": "x", "weight": 0}], "weight must be a finite number above 0 or null, found 0"),
         (["folder"], "a list, each a group of keys"),
-        ([{"name": "simulated", "scenes": 0}], "data.scenes must be 1 to 10,000,000, found 0"),
-        ([{"name": "simulated", "scenes": 2**31}], "data.scenes must be 1 to 10,000,000, found 2147483648"),
+        ([{"name": "simulated", "scenes": 0}], "scenes must be a whole number from 1 to 10,000,000, found 0"),
+        (
+            [{"name": "simulated", "scenes": 2**31}],
+            "scenes must be a whole number from 1 to 10,000,000, found 2147483648",
+        ),
     ],
 )
 def test_parts_that_cannot_be_are_refused(parts, word: str):

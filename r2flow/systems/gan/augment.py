@@ -12,10 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
 from r2flow.noise import generator
 from r2flow.processes import summed
-from r2flow.registry import Natural, NonNegative, Portion, did_you_mean
+from r2flow.registry import Natural, NonNegative, Portion, Registry
 
 # Low-pass filter of the wavelet sym6 (Daubechies 1992), for up- and downsampling.
 SYM6 = (
@@ -66,7 +65,7 @@ COLOUR: dict[str, Callable[[BatchDraws], Tensor]] = {
     "contrast": lambda source: torch.exp2(0.5 * source.normal((1,))[:, 0]),
     "luma_flip": _flip,
 }
-TRANSFORMATIONS = GEOMETRY | COLOUR
+TRANSFORMATIONS = Registry("augmentation", **GEOMETRY, **COLOUR)
 
 
 class AdaptiveAugment(nn.Module):
@@ -100,9 +99,7 @@ class AdaptiveAugment(nn.Module):
         super().__init__()
         self.target, self.images, self.highest, self.every = target, 1000 * kimg, highest, every
         for name in policy or {}:
-            if name not in TRANSFORMATIONS:
-                names, hint = ", ".join(TRANSFORMATIONS), did_you_mean(name, TRANSFORMATIONS)
-                raise InputError(f"no augmentation named {name!r}; known: {names}.{hint}")
+            TRANSFORMATIONS[name]
         self.policy = {name: float((policy or {}).get(name, 1)) for name in TRANSFORMATIONS}
         # Named as in published checkpoints.
         self.register_buffer("p", torch.tensor(float(initial)))

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 
-from r2flow.backbones.layers import at_least_float32
+from r2flow.backbones.layers import at_least_float32, halved
 from r2flow.registry import Count
 from r2flow.systems.gan.layers import (
     IMAGE,
@@ -16,7 +16,6 @@ from r2flow.systems.gan.layers import (
     LatentGenerator,
     Pad,
     RayDrop,
-    halved,
 )
 
 

@@ -9,7 +9,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, wrapped
-from r2flow.errors import InputError
 from r2flow.processes import averaged
 
 DROPPED = -1.0  # value of a dropped ray in model space
@@ -207,14 +206,3 @@ class LatentGenerator(nn.Module):
             assert uniform is not None
             made = self.measurement_model(made, uniform, self.temperature)
         return made
-
-
-def halved(what: str, shape: tuple[int, int], times: int, least: int = 1) -> tuple[int, int]:
-    """Rows and columns of an image after `times` halvings; refuses indivisible sizes and results below `least`."""
-    rows, columns = shape[0] >> times, shape[1] >> times
-    if (rows << times, columns << times) != tuple(shape) or min(rows, columns) < least:
-        raise InputError(
-            f"{what} halves images {times} times: rows and columns must be multiples of {2**times}, at least "
-            f"{least * 2**times}, found {shape[0]} x {shape[1]}."
-        )
-    return rows, columns

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.convolutions import Resample
-from r2flow.backbones.layers import ExactBuffers, at_least_float32
+from r2flow.backbones.layers import ExactBuffers, at_least_float32, halved
 from r2flow.processes import averaged
 from r2flow.registry import Count
 from r2flow.systems.gan.layers import (
@@ -23,7 +23,6 @@ from r2flow.systems.gan.layers import (
     LatentGenerator,
     Pad,
     RayDrop,
-    halved,
 )
 
 WINDOW = (1.0, 3.0, 3.0, 1.0)

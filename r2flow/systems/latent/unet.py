@@ -6,6 +6,7 @@ Parameter names are those of the published weights.
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -13,13 +14,11 @@ from torch import Tensor, nn
 
 from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm
-from r2flow.backbones.layers import ExactLinear, at_least_float32, zero_initialised
-from r2flow.errors import InputError
+from r2flow.backbones.layers import ExactLinear, at_least_float32, halved, shared, zero_initialised
 from r2flow.registry import Count
 from r2flow.systems.latent.autoencoder import CircularConv2d
 
 GROUPS, EPS = 32, 1e-5
-POSITIONS = "none", "learnable"
 
 
 def norm(channels: int) -> GroupNorm:
@@ -56,9 +55,7 @@ class Attention(nn.Module):
 
     def __init__(self, channels: int, head_channels: int) -> None:
         super().__init__()
-        if channels % head_channels:
-            raise InputError(f"{channels} channels cannot be shared by heads of {head_channels}.")
-        self.heads = channels // head_channels
+        self.heads = shared(channels, head_channels, f"heads of {head_channels}")
         self.norm = norm(channels)
         self.qkv = nn.Conv1d(channels, 3 * channels, 1)
         self.proj_out = nn.Conv1d(channels, channels, 1)
@@ -112,16 +109,12 @@ class LatentUNet(nn.Module):
         blocks: Count = 2,
         attention: Sequence[int] = (1, 2, 4),
         head_channels: Count = 32,
-        position: str = "none",
+        position: Literal["none", "learnable"] = "none",
     ) -> None:
         super().__init__()
         channels, rows, columns = shape
         widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
-        coarsest = 2 ** (len(widths) - 1)
-        if rows % coarsest or columns % coarsest:
-            raise InputError(f"latents of {rows} x {columns} cannot be halved {len(widths) - 1} times.")
-        if position not in POSITIONS:
-            raise InputError(f"no position named {position!r}; known: {', '.join(POSITIONS)}.")
+        halved("the U-Net of the latents", (rows, columns), len(widths) - 1)
         condition, self.width = 4 * width, width
         self.time_embed = nn.Sequential(ExactLinear(width, condition), nn.SiLU(), ExactLinear(condition, condition))
         self.position = nn.Parameter(torch.zeros(width, rows, columns)) if position == "learnable" else None

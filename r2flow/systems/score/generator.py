@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.backbones.layers import halved
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator, parts_of
 from r2flow.lidar.space import ModelSpace
@@ -51,8 +51,7 @@ class ScoreModel(Generator):
         self.run_by(Langevin())
         self.rate, self.pull = rate, pull
         channels, rows, columns = space.shape
-        if rows % 2 or columns % 2:
-            raise InputError(f"RefineNet halves the image: its height and width must be even, found {rows}x{columns}.")
+        halved("RefineNet", (rows, columns), 1)
         self.network = RefineNet(noise_levels(sigma_first, sigma_last, levels, spacing), channels, width)
 
 
