@@ -25,6 +25,12 @@ class InputError(ValueError):
     """
 
 
+def check(holds: object, message: str) -> None:
+    """Raise an InputError unless a condition holds; `r2flow.files.reading` adds the file's name."""
+    if not holds:
+        raise InputError(message)
+
+
 def require(what: str, extra: str, *packages: str) -> None:
     """Raise InputError with the extra to install if a package is missing."""
     for package in packages:

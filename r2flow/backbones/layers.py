@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 Layer = TypeVar("Layer", bound=nn.Module)
 
@@ -188,8 +188,7 @@ def in_bands(f: Callable[..., tuple[Tensor, ...]], *maps: Tensor) -> tuple[Tenso
 
 def shared(channels: int, unit: int, what: str) -> int:
     """channels / unit, for `what` shares them; refuses a remainder."""
-    if channels % unit:
-        raise InputError(f"{channels} channels cannot be shared by {what}: give a multiple of {unit}.")
+    check(channels % unit == 0, f"{channels} channels cannot be shared by {what}: give a multiple of {unit}.")
     return channels // unit
 
 

@@ -13,7 +13,7 @@ from r2flow.backbones.detail import Detail, DetailBlock
 from r2flow.backbones.encodings import mean_rays
 from r2flow.backbones.hdit import time_embedding
 from r2flow.backbones.layers import ExactLinear, zero_initialised
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.registry import Bound, Positive
 
 ANY_SIZE = 2, 256, 1024  # shape of rays, to build a network and read its unit
@@ -68,8 +68,7 @@ class Pyramid(Backbone):
         if common.get("data_std") is not None:
             raise InputError("a pyramid has below_std, and its inner network data_std: leave backbone.data_std out.")
         rows, columns = integers("factor", factor, 2)
-        if rows * columns == 1:
-            raise InputError("backbone.factor must be of more than one pixel, such as [2, 4]; found [1, 1].")
+        check(rows * columns > 1, "backbone.factor must be of more than one pixel, such as [2, 4]; found [1, 1].")
         channels = common.get("in_channels", 2)
         out_channels = common.get("out_channels") or channels
         whole = rays.shape[-2] % rows == 0 and rays.shape[-1] % columns == 0

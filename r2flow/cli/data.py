@@ -21,7 +21,7 @@ from r2flow.cli.options import (
     grouped,
     named_columns,
 )
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 log = logging.getLogger(__name__)
 
@@ -78,8 +78,7 @@ def prepare(
     from r2flow.progress import Bar
 
     options, file = parse(scans)
-    if file is not None:
-        raise InputError(f"{scans} is one scan; give the folder of a data set.")
+    check(file is None, f"{scans} is one scan; give the folder of a data set.")
     options = replace(options, split=split, drives=[*drives.split(",")] if drives else None)
     drives_found = SOURCES[options.name].find_drives(options)
     plan = plan_files(options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
@@ -179,6 +178,5 @@ def unpack(
         written += 1
         if written == most:
             break
-    if not written:
-        raise InputError(f"{recording} contains no usable scan.")
+    check(written, f"{recording} contains no usable scan.")
     print(f"{written} scans in {out}")

@@ -25,7 +25,7 @@ from r2flow.cli.options import (
     named_columns,
     rows_and_columns,
 )
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 if TYPE_CHECKING:
     from r2flow.lidar.region import Region
@@ -131,8 +131,7 @@ def interpolate(
     sampler = build_sampler(given if "name" in given else {"name": "dopri5", "tolerance": 1e-4, **given})
     sampler.check(as_flow(loaded.generator, "interpolation"))
     ends = real_scans(loaded, [first, last], reflectance_scale)
-    if len(ends) != 2:
-        raise InputError(f"give two scans, found {len(ends)}.")
+    check(len(ends) == 2, f"give two scans, found {len(ends)}.")
     prepare_folder(out)
     written = write_page(interpolation(loaded, ends, frames, out, sampler, command()), out)
     pages = ", ".join(map(str, [*written, out / "interpolation.html"]))

@@ -21,7 +21,7 @@ from r2flow.cli.options import (
     grouped,
     numbers,
 )
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
@@ -87,8 +87,8 @@ class EvaluateOptions:
 
     def check(self, named: Sequence[str], sampled: Sequence[str]) -> None:
         """Refuse incompatible options before reading any scan."""
-        if not (named or self.reference or self.baselines):
-            raise InputError("nothing to compare with: give GENERATED or --reference.")
+        check(named or self.reference or self.baselines, "nothing to compare with: give GENERATED or --reference.")
+        check(self.bootstrap not in (1, 2, 3), f"an interval needs --bootstrap of at least 4, found {self.bootstrap}.")
         if self.json is not None and (self.json.is_dir() or self.json.suffix.lower() != ".json"):
             raise InputError(f"--json must be a file that ends in .json, found {self.json}.")
         if not sampled and any(getattr(self, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
@@ -254,8 +254,7 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
 
     scans = open_scans(text, reading, split, num)
     refuse_parts(text)
-    if not len(scans):
-        raise InputError(f"{text} contains no scan.")
+    check(len(scans), f"{text} contains no scan.")
     _ = scans.source[0]  # fail before the other set is read
     return scans
 

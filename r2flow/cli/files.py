@@ -9,7 +9,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import SamplerOptions, grouped
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.registry import Registry
 
 
@@ -39,10 +39,8 @@ def export(
 
     if out is None:
         out = Path(f"{checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name}.{to}")
-    elif out.suffix != f".{to}":
-        raise InputError(f"--to {to} writes a .{to}, found --out {out}.")
-    if half and to != "safetensors":
-        raise InputError("--half is for --to safetensors.")
+    check(out.suffix == f".{to}", f"--to {to} writes a .{to}, found --out {out}.")
+    check(not half or to == "safetensors", "--half is for --to safetensors.")
     if (to == "safetensors" or what == "network") and how != SamplerOptions():
         raise InputError(f"--to {to} --what {what} takes no sampler: leave sampler, steps, tolerance and grid out.")
     loaded = load_checkpoint(checkpoint)

@@ -27,7 +27,7 @@ from r2flow.cli.options import (
     numbers,
     rows_and_columns,
 )
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 if TYPE_CHECKING:
     from r2flow.reports.pages import Page
@@ -195,8 +195,7 @@ def completion(
         measured_by(task, first.sensor, 0)
     scans = real_scans(first, [real], reflectance_scale or first.sensor.reflectance_scale, num)
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
-    if not truths:
-        raise InputError(f"{real}: no scan has a return, so there is nothing to hide.")
+    check(truths, f"{real}: no scan has a return, so there is nothing to hide.")
     prepare_folder(out)
     cost = sum(way.sampler.evaluations(way.checkpoint.generator) or 0 for way in ways) * len(masks)
     with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
@@ -231,8 +230,7 @@ def paper(
     for text in models:
         role, _, model = text.rpartition("=")
         checkpoint = load_checkpoint(model, where)
-        if not checkpoint.generator.draws:
-            raise InputError(f"{model} does not generate scans from noise.")
+        check(checkpoint.generator.draws, f"{model} does not generate scans from noise.")
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
     scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
     prepare_folder(out)

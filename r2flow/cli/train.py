@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import DeviceOption, PrecisionOption, SamplerOptions, choose_device, grouped
-from r2flow.errors import InputError
+from r2flow.errors import check
 from r2flow.registry import check_options
 
 
@@ -53,8 +53,7 @@ def pairs(
     from r2flow.runs.lineage import check_finished, pairs_of
 
     rank, ranks, local = place()
-    if not 0 <= rank < ranks:
-        raise InputError(f"process {rank} of {ranks}: a SLURM array must have no gaps.")
+    check(0 <= rank < ranks, f"process {rank} of {ranks}: a SLURM array must have no gaps.")
     where = choose_device(device)
     if where == "cuda" and ranks > 1:
         import torch

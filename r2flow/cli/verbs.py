@@ -10,7 +10,7 @@ import typer
 from r2flow import __version__
 from r2flow.cli import data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
 from r2flow.cli.app import app
-from r2flow.errors import InputError, PlainFormatter, explain_mistake, one_line, open_streams, tell_odd
+from r2flow.errors import InputError, PlainFormatter, check, explain_mistake, one_line, open_streams, tell_odd
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import Stopped, listening, stop_at_once
 
@@ -55,8 +55,7 @@ def _run() -> None:
     handler.setFormatter(PlainFormatter("%(levelname)s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     try:
-        if "" in sys.argv:
-            raise InputError("an argument is empty; is a variable of the shell not set?")
+        check("" not in sys.argv, "an argument is empty; is a variable of the shell not set?")
         arguments, plugins = take_plugins(sys.argv[1:])
         load_plugins(plugins)
         if arguments[:1] == ["train"]:  # it passes plug-ins to its processes

@@ -16,7 +16,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, choose_device, grouped, numbers
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 if TYPE_CHECKING:
     from r2flow.reports.view.panels import Panel, View
@@ -114,11 +114,9 @@ def view(
     if len(models) == len(what) and (sequence or how != ReadingOptions()):
         names = "--sensor, --size, --projection, --convention, --reflectance-scale and --columns"
         raise InputError(f"--sequence, {names} are of scans; found none.")
-    if sequence and times:
-        raise InputError("--sequence and --times both use the slider; give one of them.")
+    check(not (sequence and times), "--sequence and --times both use the slider; give one of them.")
     counts = numbers("steps", steps, int) if steps else []
-    if times and len(counts) > 1:
-        raise InputError(f"--times takes one number of --steps, found {steps}.")
+    check(not times or len(counts) <= 1, f"--times takes one number of --steps, found {steps}.")
     panels: list[Panel] = []
     frames: list[str] = []
     for spec in what:

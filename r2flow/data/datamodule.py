@@ -22,7 +22,7 @@ from r2flow.data.pairs import PairDataset, PairSource, PairStore
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
-from r2flow.errors import InputError, tell_odd
+from r2flow.errors import InputError, check, tell_odd
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.progress import track
@@ -70,12 +70,9 @@ class ScanDataModule(L.LightningDataModule):
     def _pair_options(self) -> PairOptions:
         options = self.options.pairs or {}
         check_options("data.pairs", PairOptions, options)
-        if self.augment:
-            raise InputError("data.augment changes scans, and an augmented pair is not a flow's pair; leave it out.")
-        if self.validation.data is not None:
-            raise InputError("data.validation.data cannot be held out from pairs; leave it out.")
-        if self.options.root is None:
-            raise InputError("data=pairs needs the flow that draws them: stage.init=RUN.")
+        check(not self.augment, "data.augment changes scans, and an augmented pair is not a flow's pair; leave it out.")
+        check(self.validation.data is None, "data.validation.data cannot be held out from pairs; leave it out.")
+        check(self.options.root is not None, "data=pairs needs the flow that draws them: stage.init=RUN.")
         return PairOptions(**options)
 
     @property
@@ -191,8 +188,7 @@ class ScanDataModule(L.LightningDataModule):
                 f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
                 f"{accumulated} accumulated batches; give a multiple of {ranks * accumulated}."
             )
-        if max_steps < 1:
-            raise InputError(f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run.")
+        check(max_steps >= 1, f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run.")
 
     def train_dataloader(self) -> RunLoader:
         """Batches from the trainer's current step to max_steps."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from r2flow import noise
 from r2flow.data.sources import ScanSource
-from r2flow.errors import InputError
+from r2flow.errors import check
 
 
 class Mixture(ScanSource):
@@ -58,8 +58,7 @@ class MixedOrder:
     """
 
     def __init__(self, sizes: Sequence[int], weights: Sequence[float], seed: int) -> None:
-        if not all(sizes):
-            raise InputError(f"data.parts: a part has no scan left to train on; the parts have {list(sizes)}.")
+        check(all(sizes), f"data.parts: a part has no scan left to train on; the parts have {list(sizes)}.")
         self.seed, self.sizes = seed, sizes
         self.edges = np.cumsum(weights) / np.sum(weights)
         self.starts = np.cumsum([0, *sizes])

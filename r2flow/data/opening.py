@@ -24,7 +24,7 @@ from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_imag
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, warn_of_other_sensor
-from r2flow.errors import InputError, tell_odd
+from r2flow.errors import InputError, check, tell_odd
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensor_files import ENDINGS, read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
@@ -318,6 +318,5 @@ def open_prepared(
     spans = dict(zip(map(id, stored), spans_of(stored), strict=True))
     numbers = [number for drive in kind.chosen(stored, split, drives) for number in spans[id(drive)]]
     scans = PreparedScans(folder, numbers, bool(reading.reflectance))
-    if not len(scans):
-        raise InputError(f"{folder} holds no usable scan of split={split!r}, drives={drives}.")
+    check(len(scans), f"{folder} holds no usable scan of split={split!r}, drives={drives}.")
     return scans

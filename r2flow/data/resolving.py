@@ -8,7 +8,7 @@ from r2flow.data.opening import SOURCES
 from r2flow.data.options import FOLDER, MIXED, PAIRS, SIMULATED, Data, DataOptions, PartOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.sources import made_here
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.lidar.sensors import build_sensor
 from r2flow.registry import check_options
 
@@ -84,7 +84,7 @@ def _check_set(
     """Refuse options that do not name a single set of scans or, with `split`, lack the split of a standard data set."""
     check_options(what, kind, options)
     name = options.get("name")
-    if name in (None, MIXED, PAIRS):
+    if name is None or name in (MIXED, PAIRS):
         raise InputError(f"{what} needs the name of a data set, found {name!r}.")
     splits = ", ".join(SOURCES[name].splits)
     if split and splits and "split" not in options:
@@ -95,8 +95,7 @@ def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
     """`encoding.reflectance` for a config's `data`: `auto` is true if all its sets of scans have reflectance."""
     if isinstance(wanted, bool):
         return wanted
-    if wanted != AUTO:
-        raise InputError(f"encoding.reflectance must be true, false or auto, found {wanted!r}.")
+    check(wanted == AUTO, f"encoding.reflectance must be true, false or auto, found {wanted!r}.")
     run = DataOptions(**resolve(data))
     for options in (*run.sets, *([run.held_out] if run.held_out else [])):
         lacking = SOURCES[options.name].lacks_reflectance(options, options.on_bad_scan)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from r2flow.data.sets import ScanSet
-from r2flow.errors import InputError
+from r2flow.errors import check
 from r2flow.evaluation.measuring import MetricResult, Work, bar
 from r2flow.lidar.encoding import Encoding
 from r2flow.metrics.base import Protocol
@@ -51,8 +51,7 @@ class Nearest:
     def __init__(self, scans: ScanSet, work: Work, device: str) -> None:
         x = torch.cat(list(described(scans, work, device, "describing")))
         usable = x.isfinite().flatten(1).all(1)
-        if not usable.any():
-            raise InputError(f"none of the {len(scans)} scans of {scans.label} has a return to compare.")
+        check(usable.any(), f"none of the {len(scans)} scans of {scans.label} has a return to compare.")
         self.scans, self.numbers, x = scans, np.flatnonzero(usable.cpu().numpy()), x[usable]
         self.width, self.elements = x.shape[2], x[0].numel()
         self.size = x.square().sum((1, 2))

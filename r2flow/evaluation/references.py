@@ -7,7 +7,7 @@ import numpy as np
 
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanSource
-from r2flow.errors import InputError
+from r2flow.errors import check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator, standard_normal
@@ -23,8 +23,7 @@ def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None
     therefore also compared with the first half, limited to the size of the second half.
     """
     count = len(real)
-    if count < 2:
-        raise InputError(f"{real.label} has {count} scan; --reference needs at least two real ones.")
+    check(count >= 2, f"{real.label} has {count} scan; --reference needs at least two real ones.")
     half, other = real.part(range(count // 2), "first half"), real.part(range(count // 2, count), "second half")
     pairs = {"real halves": (half, other)}
     for name, scans in (generated or {}).items():

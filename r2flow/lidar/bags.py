@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from r2flow.errors import InputError, naming, require
+from r2flow.errors import InputError, check, naming, require
 from r2flow.files import telling
-from r2flow.lidar.scan_files.points import Points, check, column_points
+from r2flow.lidar.scan_files.points import Points, column_points
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of a PointField's datatype

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from r2flow.errors import check
 from r2flow.files import reading
 from r2flow.lidar.scan_files import LARGEST_FILE, Points, read_points
-from r2flow.lidar.scan_files.points import check
 
 # SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue, people red, plants green,
 # buildings and fences brown; moving objects have the colour of static ones).

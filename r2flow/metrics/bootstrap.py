@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.metrics.base import SIDES, ScanMetric, Side
 from r2flow.noise import generator
 
@@ -45,8 +44,7 @@ def bootstrap(
     if not metric.resamples:
         return {}
     assert metric.keeps, "build the metric with keep=True"
-    if draws < 4:
-        raise InputError(f"an interval needs 4 draws, found {draws}.")
+    assert draws >= 4, f"an interval needs 4 draws, found {draws}"
     with metric.sync_context():
         values = {name: value for name, value in metric.figures()[0].items() if not np.isnan(value)}
         sizes = {side: len(metric.kept(side)) for side in SIDES}

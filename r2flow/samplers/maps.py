@@ -83,10 +83,10 @@ class Transport(Sampler):
         return Generated.after(x, 1)
 
 
-def late(steps: int, k: float = 32.0) -> Tensor:
-    """Time grid of one long step and short steps near t = 1: 1 - t_j is log-spaced between 2 / k and 1 / (2 k).
+def late(steps: int) -> Tensor:
+    """Time grid of one long step and short steps near t = 1: 1 - t_j is log-spaced between 1 / 16 and 1 / 64.
 
-    1 - t_j = 2^(1 - (2 j - 1) / (N - 1)) / k for j = 1 to N - 1 of N steps.
+    1 - t_j = 2^(1 - (2 j - 1) / (N - 1)) / 32 for j = 1 to N - 1 of N steps.
     """
     share = (2 * torch.arange(1, steps, dtype=torch.float64) - 1) / max(steps - 1, 1)
-    return torch.cat([torch.zeros(1), 1 - 2 ** (1 - share) / k, torch.ones(1)])
+    return torch.cat([torch.zeros(1), 1 - 2 ** (1 - share) / 32, torch.ones(1)])

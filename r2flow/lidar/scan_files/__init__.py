@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.errors import InputError, note_odd
+from r2flow.errors import InputError, check, note_odd
 from r2flow.files import atomic_write, reading
 from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
-from r2flow.lidar.scan_files.points import NoPointsError, Points, check, check_columns, column_points
+from r2flow.lidar.scan_files.points import NoPointsError, Points, check_columns, column_points
 from r2flow.lidar.scan_files.tables import (
     read_array,
     read_arrow,

@@ -11,7 +11,8 @@ from typing import IO
 
 import numpy as np
 
-from r2flow.lidar.scan_files.points import NoPointsError, check
+from r2flow.errors import check
+from r2flow.lidar.scan_files.points import NoPointsError
 
 HEADER_LIMIT = 1 << 16  # bytes; a header has a few hundred
 PCD_KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")

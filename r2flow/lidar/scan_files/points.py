@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 # No LiDAR measures 10 km or less than a millimetre. Nearly all floats read in the wrong byte order or width are beyond
 # these limits, because their exponent changes.
@@ -51,12 +51,6 @@ class Points:
             reflectance = np.zeros(len(xyz), np.float32)
             reflectance[self.kept] = self.reflectance
         return Points(xyz, reflectance)
-
-
-def check(holds: object, message: str) -> None:
-    """Raise an InputError unless a condition holds; `r2flow.files.reading` adds the file's name."""
-    if not holds:
-        raise InputError(message)
 
 
 def check_columns(columns: Sequence[str] | None) -> None:

@@ -10,9 +10,9 @@ from typing import IO
 
 import numpy as np
 
-from r2flow.errors import require
+from r2flow.errors import check, require
 from r2flow.lidar.scan_files.clouds import Table
-from r2flow.lidar.scan_files.points import MOST_COLUMNS, ROLES, check
+from r2flow.lidar.scan_files.points import MOST_COLUMNS, ROLES
 
 MOST_UNPACKED = 100  # maximum expansion of a compressed file, plus 1 MiB
 TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar", "scan", "data", "arr_0")

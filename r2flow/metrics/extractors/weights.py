@@ -16,7 +16,7 @@ import yaml
 from safetensors.torch import save
 from torch import Tensor
 
-from r2flow.errors import InputError, naming
+from r2flow.errors import InputError, check, naming
 from r2flow.files import atomic_write, cache_folder, parse_json, reading, telling
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import EXTRACTORS
@@ -136,8 +136,7 @@ def _unpacked(path: Path) -> dict[str, bytes]:
 def _joined(path: Path, members: Mapping[str, bytes]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors of all parts, by name, and the config."""
     parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}") for part in PARTS if part in members]
-    if not parts:
-        raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the published archive.")
+    check(parts, f"{path} holds none of {', '.join(PARTS)}; give the published archive.")
     with telling(path / CONFIG):
         config = yaml.safe_load(members.get(CONFIG, b"{}"))
         if not isinstance(config, dict):

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
+from r2flow.errors import check
 from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Bound, Count, check_options
@@ -140,6 +140,5 @@ class LatentDDIM(Sampler):
 
 def some_of(total: int, steps: int) -> Tensor:
     """Every (total // steps)-th number below total from 1, decreasing; more than `steps` if not divisible."""
-    if not 1 <= steps < total:
-        raise InputError(f"a diffusion of {total} steps is sampled in 1 to {total - 1}, found {steps}.")
+    check(1 <= steps < total, f"a diffusion of {total} steps is sampled in 1 to {total - 1}, found {steps}.")
     return torch.arange(1, total, total // steps).flip(0)

@@ -13,6 +13,7 @@ import yaml
 from torch import Tensor
 
 from r2flow.errors import InputError
+from r2flow.files import telling
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.published import Format, Published
@@ -121,10 +122,8 @@ def _unet(state: Mapping[str, Tensor]) -> dict[str, Any]:
 def _notes(path: Path) -> Mapping[str, Any]:
     """Read the published `config.yaml` next to a file; empty if missing."""
     file = path.with_name("config.yaml")
-    try:
+    with telling(file):
         content = yaml.safe_load(file.read_text()) if file.is_file() else {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{file}, next to {path.name}, cannot be read: {' '.join(str(error).split())}.") from None
     return content if isinstance(content, Mapping) else {}
 
 

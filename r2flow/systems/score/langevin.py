@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import check
 from r2flow.registry import Registry
 
 Score = Callable[[Tensor, Tensor], Tensor]
@@ -25,8 +25,7 @@ SPACINGS: Registry[Callable[[float, float, int], np.ndarray]] = Registry(
 
 def noise_levels(first: float, last: float, levels: int, spacing: str = "geometric") -> Tensor:
     """sigma_0 = first > ... > sigma_{L-1} = last, (levels,) float32."""
-    if last > first:
-        raise InputError(f"noise levels fall from {first:g} and cannot reach {last:g}.")
+    check(last <= first, f"noise levels fall from {first:g} and cannot reach {last:g}.")
     return torch.from_numpy(SPACINGS[spacing](first, last, levels).astype(np.float32))
 
 
