@@ -196,7 +196,7 @@ class TestReflectance:
         (numbered / "000000.bin").write_bytes(b"")
         data = {"name": "folder", "root": str(numbered)}
         assert resolve_reflectance("auto", {**data, "reading": {"on_bad_scan": "skip"}})
-        with pytest.raises(InputError, match=r"000000.bin: it is empty.* In training data.reading.on_bad_scan=skip"):
+        with pytest.raises(InputError, match=r"000000.bin: it holds no points.* data.reading.on_bad_scan=skip"):
             resolve_reflectance("auto", data)
 
     def test_what_is_said_is_not_asked(self):
