@@ -7,7 +7,6 @@ do not model data; each has a different difficulty for solvers.
 
 import functools
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -17,21 +16,16 @@ from r2flow.flow.path import expand_time
 from r2flow.registry import Registry
 
 
-class Problem(ABC):
+class Problem:
     """A velocity and its exact paths."""
 
-    @abstractmethod
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         """v(t, x) in x's type, with t of shape () or (B,) and x (B, ...)."""
-
-    @abstractmethod
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
-        """`solution` for x_0 in float64 and times that broadcast with it."""
+        raise NotImplementedError
 
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
         """x_t, (B, ...) float64, of the path that starts at x_0; t of shape () or (B,)."""
-        x_0 = x_0.double()
-        return self.path(x_0, expand_time(torch.as_tensor(t, dtype=torch.float64, device=x_0.device), x_0))
+        raise NotImplementedError
 
 
 class Gaussian(Problem):
@@ -53,7 +47,8 @@ class Gaussian(Problem):
         rate = (t * s**2 - (1 - t)) / ((1 - t) ** 2 + (t * s) ** 2)  # sigma' / sigma
         return self.mean + rate * (x - t * self.mean)
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
         return t * self.mean + ((1 - t) ** 2 + (t * self.deviation(x_0)) ** 2).sqrt() * x_0
 
 
@@ -95,8 +90,9 @@ class GaussianMixture(Problem):
             slopes.append(mean + (t * std**2 - (1 - t)) / variance * offset)
         return (torch.stack(scores).softmax(0) * torch.stack(slopes)).sum(0)
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
         """x_t by bisection, to full precision: the quantile of a mixture lies between those of its components."""
+        x_0, t = _exact(x_0, t)
         means = torch.stack([t * mean + torch.zeros_like(x_0) for mean in self.means])
         stds = torch.stack([((1 - t) ** 2 + (t * std) ** 2).sqrt() + torch.zeros_like(x_0) for std in self.stds])
         weights = torch.tensor(self.weights, dtype=torch.float64, device=x_0.device).view(-1, *(1,) * x_0.ndim)
@@ -135,7 +131,8 @@ class PointMass(Problem):
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         return (self.point - x) / (1 - expand_time(t, x))
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
         return (1 - t) * x_0 + t * self.point
 
 
@@ -149,7 +146,8 @@ class Straight(Problem):
         t = expand_time(t, x)
         return self.mean + (self.std - 1) / (1 - t + t * self.std) * (x - t * self.mean)
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
         return (1 - t) * x_0 + t * (self.mean + self.std * x_0)
 
 
@@ -163,7 +161,8 @@ class Rotating(Problem):
         first, second = _halves(x)
         return self.speed * torch.cat([-second, first], 1).view(x.shape)
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
         first, second = _halves(x_0)
         angle = self.speed * t.view(-1, 1)
         c, s = angle.cos(), angle.sin()
@@ -183,7 +182,8 @@ class StiffLinear(Problem):
         t = expand_time(t, x)
         return t.cos() - self.rate * (x - t.sin())
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
         return t.sin() + x_0 * (-self.rate * t).exp()
 
 
@@ -196,7 +196,8 @@ class Discontinuous(Problem):
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         return self.jump * (expand_time(t, x) >= self.at) - x
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
         return x_0 * (-t).exp() - self.jump * torch.expm1(-(t - self.at).clamp(min=0))
 
 
@@ -210,7 +211,8 @@ class NarrowJet(Problem):
         z = (expand_time(t, x) - self.at) / self.width
         return (-0.5 * z**2).exp() / (self.width * math.sqrt(2 * math.pi)) - x
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
         w = self.width
         passed = _normal_cdf((t - self.at) / w - w) - _normal_cdf(t.new_tensor(-self.at / w - w))
         return x_0 * (-t).exp() + (self.at - t + w**2 / 2).exp() * passed
@@ -226,8 +228,15 @@ class Pulse(Problem):
         inside = (expand_time(t, x) - self.at).abs() < self.width / 2
         return (inside / self.width).to(x.dtype) + torch.zeros_like(x)
 
-    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
         return x_0 + ((t - self.at) / self.width + 0.5).clamp(0, 1)
+
+
+def _exact(x_0: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor]:
+    """x_0 and t in float64, t broadcastable with x_0."""
+    x_0 = x_0.double()
+    return x_0, expand_time(torch.as_tensor(t, dtype=torch.float64, device=x_0.device), x_0)
 
 
 def _halves(x: Tensor) -> tuple[Tensor, Tensor]:
