@@ -184,7 +184,8 @@ def wrong_places() -> Iterator[str]:
     for verb, base in BASES.items():
         if verb != "backbones":
             yield f"{'report ' if base.startswith('report') else ''}{verb} # Missing"
-            yield re.sub(r"\b(run|scans)\b\S*", "nowhere", base, count=1)
+            missing, changed = re.subn(r"\b(run|scans)\b\S*", "nowhere", base, count=1)
+            yield from [missing] * changed
         if verb not in ("backbones", "view", "sensor"):
             yield f"{base.removesuffix(' -o out')} -o file.txt"
 

@@ -426,7 +426,7 @@ def test_a_generator_with_a_mask_needs_draws():
     generator = build_generator(tiny("dusty1")).eval()
     assert isinstance(generator, DustyV1)
     noise = Draws(0, range(2)).start(generator.noise_shape)
-    with pytest.raises(AssertionError, match="draws"):
+    with pytest.raises(InputError, match="draws"):
         generator(noise)
     made = generator(noise, draws=Draws(0, range(2)), sampler=build_sampler("direct", truncation=0.7))
     assert made.evaluations.tolist() == [1, 1]

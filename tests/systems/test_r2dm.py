@@ -461,7 +461,7 @@ def test_a_part_of_the_image_has_the_noise_of_the_whole(exact, method):
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
     noise = torch.zeros(1, *exact.noise_shape)
-    with pytest.raises(AssertionError, match="give draws"):
+    with pytest.raises(InputError, match="give draws"):
         exact(noise)
     with pytest.raises(InputError, match="paths"):
         exact.solve(noise)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.errors import check
 from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
 from r2flow.flow.solvers.exponential import ExponentialMethod, automatic, exprb43
@@ -89,11 +90,11 @@ def solve(
         knots: Number of inner states to keep, at equal numbers of steps; for r2flow's fixed-step methods.
     """
     solver = method_of(method)
-    assert math.isfinite(t_1 - t_0), f"a solution needs two times, found {t_0} and {t_1}"
-    assert steps >= 1, f"a solver needs at least 1 step, found {steps}"
-    assert 0 < tolerance < math.inf, f"a solver's tolerance must be positive and finite, found {tolerance:g}"
-    assert max_evaluations >= 1, f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}"
-    assert 0 < max_step <= 1, f"max_step is a share of the interval, above 0 and at most 1; found {max_step}"
+    check(math.isfinite(t_1 - t_0), f"a solution needs two times, found {t_0} and {t_1}.")
+    check(steps >= 1, f"a solver needs at least 1 step, found {steps}.")
+    check(0 < tolerance < math.inf, f"a solver's tolerance must be positive and finite, found {tolerance:g}.")
+    check(max_evaluations >= 1, f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}.")
+    check(0 < max_step <= 1, f"max_step is a share of the interval, above 0 and at most 1; found {max_step}.")
     x = wide(x)
     if t_0 == t_1 or not len(x):
         return _at_rest(x, global_error, knots)
