@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import wide
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
@@ -98,7 +98,8 @@ class Generator(nn.Module):
         how.check(self)
         if condition is not None and not (self.told or how.completes):
             raise InputError(f"this {type(self).__name__} takes no condition; complete scans with --sampler mmps.")
-        check(draws is not None or not how.draws, f"sampler {how.name} is stochastic: give draws.")
+        if how.draws and draws is None:
+            raise InputError(f"sampler {how.name} is stochastic: give draws.")
         x = wide(noise.to(self.device))
         conditions = condition and {name: value.to(self.device) for name, value in condition.items()}
         noise_of_step = None if draws is None else lambda j: self.further_noise(draws, j).to(x)

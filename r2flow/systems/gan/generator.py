@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
@@ -69,7 +69,8 @@ class Direct(Sampler):
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         uniform = None
         if generator.drops:
-            check(draws is not None, f"a {type(generator).__name__} draws a mask: give draws.")
+            if draws is None:
+                raise InputError(f"a {type(generator).__name__} draws a mask: give draws.")
             uniform = torch.special.ndtr(draws(1).double()).to(noise)
         x = generator.made(noise, uniform, truncation=self.truncation)["image"]
         progress()
