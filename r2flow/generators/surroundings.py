@@ -99,6 +99,11 @@ class RowFeatures(nn.Embedding):
         super().__init__(1 + len(rows), ROW)
         self.elevations = rows  # not a buffer: derived from the sensor
 
+    def known(self, elevations: Tensor) -> Tensor:
+        """Whether all rows of elevations (B, H) have a learned vector, (B,) bool."""
+        difference = (elevations[..., None] - self.elevations.to(elevations)).abs()
+        return (difference.amin(-1) < SAME).all(1)
+
     def forward(  # type: ignore[override]
         self, elevations: Tensor, steps: Tensor, known: Tensor | None = None
     ) -> Tensor:
@@ -109,9 +114,9 @@ class RowFeatures(nn.Embedding):
             steps: Angle between rows and between columns in radians, (B, 2).
             known: Whether to use the vectors learned per row, (B,) bool; None: yes.
         """
-        difference = (elevations[..., None] - self.elevations.to(elevations)).abs()
-        same = (difference.amin(-1) < SAME).all(1)
-        number = (difference.argmin(-1) + 1) * (same if known is None else same & known)[:, None]
+        same = self.known(elevations)
+        nearest = (elevations[..., None] - self.elevations.to(elevations)).abs().argmin(-1)
+        number = (nearest + 1) * (same if known is None else same & known)[:, None]
         sizes = (steps / 0.007).log()[:, None].expand(*elevations.shape, 2)
         each = torch.cat([super().forward(number), 3 * elevations[..., None], sizes], -1)
         return each.movedim(-1, 1)[..., None]

@@ -27,6 +27,7 @@ BISECTIONS = 28
 FINEST = 1e-3  # smallest Laplace scale on log r
 FREE, SHIFT = 0.3, 0.02  # log r per unit of network output: of the free candidate, of a neighbour
 NEVER = -1e4  # logit of a missing candidate
+REFLECTANCE = 0.265  # mean reflectance of returns to which scans of other sensors are scaled: of simulated scans
 WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0}  # loss weights
 
 
@@ -125,7 +126,7 @@ class TransferFlow(Flow):
         """
         part = copy(self)
         part.space, part.noise_shape, part.elevations = space, space.shape, space.rays[0, :, 0]
-        part.numbered = numbered
+        part.numbered = numbered and bool(self.rows.known(part.elevations[None]))
         return part
 
     def answers(self, t: Tensor, x: Tensor, about: Surroundings, rows: Tensor) -> Answers:
@@ -210,6 +211,10 @@ class TransferFlow(Flow):
         weight = next(self.parameters())
         condition = {name: value.to(weight) for name, value in condition.items()}
         image, known = parts_of(condition, noise.to(weight))
+        # Another sensor's intensities have another scale than those that the network has seen.
+        gain = self._gain(image, known) if self.space.encoding.reflectance and not self.numbered else None
+        if gain is not None:
+            condition[IMAGE] = _scaled(image, gain)
         elevations = self.elevations.to(weight)[None].expand(len(image), -1)
         steps = steps_of(elevations, 2 * math.pi / image.shape[3])
         about = Surroundings.of(self.space, condition, True, steps)
@@ -217,8 +222,17 @@ class TransferFlow(Flow):
         start = about.start + self.sigma * (known < 1) * noise.to(weight)
         generated = super().forward(start, {**condition, **about._asdict(), "rows": rows}, **how)
         nothing = encoded(self.space, torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1]))
-        x = torch.where(_within_reach(known[:, :1]), generated.x.to(image), nothing)
+        x = generated.x.to(image)
+        x = x if gain is None else _scaled(x, 1 / gain)
+        x = torch.where(_within_reach(known[:, :1]), x, nothing)
         return replace(generated, x=torch.where(known > 0, image, x))
+
+    def _gain(self, image: Tensor, known: Tensor) -> Tensor:
+        """Factor from each scan's mean reflectance to `REFLECTANCE`, (B, 1, 1, 1); 1 without known reflectance."""
+        metres = self.space.decode(image)
+        returned = (known[:, -1:] > 0) & (metres[:, :1] > 0)
+        total = (metres[:, 1:] * returned).sum((1, 2, 3), keepdim=True)
+        return torch.where(total > 0, REFLECTANCE * returned.sum((1, 2, 3), keepdim=True) / total, 1.0)
 
     def loss(
         self, x_1: Tensor, condition: Condition, t: Tensor, noise: Tensor, steps: Tensor, rows: Tensor
@@ -252,6 +266,11 @@ class TransferFlow(Flow):
             errors = (answers.strengths - metres[:, 1:2]).abs()
             losses["reflectance"] = _mean_over((answers.logits.detach().exp() * errors).sum(1, keepdim=True), mask)
         return losses
+
+
+def _scaled(image: Tensor, gain: Tensor) -> Tensor:
+    """An image in model space, (B, C, H, W), with its reflectance multiplied, at most 1."""
+    return torch.cat([image[:, :-1], ((image[:, -1:] + 1) * gain).clamp(max=2) - 1], 1)
 
 
 def _within_reach(known: Tensor) -> Tensor:

@@ -138,9 +138,10 @@ class Encoding:
         self.format = FORMATS[format](sensor)
 
     def through(self, sensor: Sensor) -> "Encoding":
-        """The same encoding of another sensor's ranges."""
+        """The same encoding of another sensor's ranges; the levels of its reflectance are not known."""
         other = copy(self)
         other.sensor, other.format = sensor, type(self.format)(sensor)
+        other.levels = self.levels if sensor.name == self.sensor.name else None
         return other
 
     @property
