@@ -266,7 +266,7 @@ def test_intervals_hold_their_figure(real, generated):
     assert found.protocol["interval"] == {"bootstrap draws": 30, "level": 0.95, "seed": 0}
 
 
-def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path):
+def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path, monkeypatch):
     real = open_scans(f"kitti_360:{kitti_360}", READING, "train")
     other = open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)
     found = reference_sets(real, {"generated": other})
@@ -276,6 +276,10 @@ def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path):
     assert [*halves[0], *halves[1]] == names
     assert len(halves[0]) == 4
     assert [len(one) for one in found["generated, as many"]] == [4, 5]
+    sampled = sampled_set(flow(), "flow", 8)
+    assert len(reference_sets(real, {"flow": sampled})["flow, as many"][1]) == 5
+    monkeypatch.setattr("r2flow.evaluation.references.AGAIN", 4)
+    assert "flow, as many" not in reference_sets(real, {"flow": sampled})
     assert [sorted({name.split("/")[1][17:21] for name in one.source.names}) for one in found["real drives"]] == [
         ["0003"], ["0004"]
     ]  # fmt: skip

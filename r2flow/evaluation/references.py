@@ -13,22 +13,25 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator, standard_normal
 
 LEARNED_FROM = 200  # number of evenly spaced real scans behind the mean and shuffled pixels
+AGAIN = 100  # largest half of the real scans for which a model is sampled again
+HALVES, AS_MANY = "real halves", ", as many"  # names, of a judged set as suffix
 
 
 def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None) -> dict[str, tuple[ScanSet, ScanSet]]:
     """Pairs of real sets, as lower references for a generator's distance: two halves, and two drives if any.
 
     Halves are contiguous blocks: neighbouring scans of a drive are near-duplicates, and random halves would share
-    places. The two drives are the largest. Distances decrease with the number of scans; generated scans from files are
-    therefore also compared with the first half, limited to the size of the second half.
+    places. The two drives are the largest. Distances decrease with the number of scans; generated scans are therefore
+    also compared with the first half, limited to the size of the second half. Models are sampled again for that, if the
+    half has at most `AGAIN` scans.
     """
     count = len(real)
     check(count >= 2, f"{real.label} has {count} scan; --reference needs at least two real ones.")
     half, other = real.part(range(count // 2), "first half"), real.part(range(count // 2, count), "second half")
-    pairs = {"real halves": (half, other)}
+    pairs = {HALVES: (half, other)}
     for name, scans in (generated or {}).items():
-        if not scans.source.drawn and len(scans) >= len(other):
-            pairs[f"{name}, as many"] = half, scans.limited(len(other))
+        if len(scans) >= len(other) and (len(other) <= AGAIN or not scans.source.drawn):
+            pairs[f"{name}{AS_MANY}"] = half, scans.limited(len(other))
     largest = sorted(real.drives, key=lambda drive: -len(real.drives[drive]))[:2]
     if len(largest) == 2:
         a, b = (real.part(list(real.drives[drive]), f"drive {drive}") for drive in sorted(largest))

@@ -41,5 +41,5 @@ class Results:
                 json.dump([asdict(result) for result in results], file)
 
     def _path(self, folder: Path, real: ScanSet, sampled: ScanSet) -> Path:
-        recipe = {"real": real.identity or real.label, "sampled": sampled.about, **self.recipe}
+        recipe = {"real": real.identity or [real.label, len(real)], "sampled": sampled.about, **self.recipe}
         return folder / f"{checksum(recipe)[:16]}.json"

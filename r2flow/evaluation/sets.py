@@ -74,6 +74,7 @@ class SampledScans(ScanSource):
     def subset(self, indices: Sequence[int]) -> "SampledScans":
         part = copy.copy(self)
         part.numbers = [self.numbers[i] for i in indices]
+        part.evaluations, part.seconds = [], []
         return part
 
     def batch(self, indices: Sequence[int]) -> Tensor:
