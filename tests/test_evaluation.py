@@ -299,27 +299,46 @@ def test_another_revision_of_the_simulator_draws_other_scans(monkeypatch):
     assert open_scans("simulated:0", READING, num=3).identity != before
 
 
+FEW = "the halves of your 24 real scans have 12 or more and the set has 18"
+
+
 @pytest.mark.parametrize(
-    ("metric", "scans", "value", "words"),
+    ("metric", "real", "scans", "value", "equal", "words"),
     [
-        ("kid_x", 200, 9.0, "not distinguishable"),
-        ("kid_x", 200, 11.0, "farther from the real scans than these are"),
-        ("kid_x", 200, 50.0, "no nearer to the real scans than a baseline"),
-        ("kid_x", 20, 9.0, "20 scans are too few"),
-        ("panel", 200, 9.0, "undecided"),  # the halves' distance is larger since they are fewer
-        ("panel", 200, 11.0, "farther from the real scans than these are"),
+        ("kid_x", 200, 200, 9.0, 99.0, "not distinguishable"),
+        ("kid_x", 200, 200, 11.0, 1.0, "farther from the real scans than these are"),
+        ("kid_x", 200, 200, 50.0, 1.0, "no nearer to the real scans than a baseline"),
+        ("kid_x", 200, 20, 9.0, None, "not above the reference, below the baselines: an indication"),
+        (
+            "panel",
+            24,
+            18,
+            9.0,
+            11.0,
+            f"above the reference, below the baselines: an indication, as {FEW}: give 200",
+        ),
+        ("panel", 24, 18, 9.0, 9.5, f"not above the reference, below the baselines: an indication, as {FEW}: give 200"),
+        ("panel", 24, 18, 9.0, None, f"as {FEW}, and the reference is of other numbers of scans"),
+        ("panel", 200, 200, 9.0, None, "undecided"),  # the halves' distance is larger since they are fewer
+        ("panel", 200, 200, 9.0, 9.5, "not distinguishable"),
+        ("panel", 200, 200, 9.0, 11.0, "farther from the real scans than these are"),
+        ("panel", 200, 200, 11.0, None, "farther from the real scans than these are"),
     ],
 )
-def test_the_verdict_follows_from_reference_and_baselines(metric, scans, value, words):
-    cases = ("b", value + 1, 200, "judged"), ("a", value, scans, "judged"), ("real halves", 10.0, 100, "reference")
+def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, value, equal, words):
+    half = real // 2
+    cases = [
+        ("b", value + 1, (real, scans), "judged"), ("a", value, (real, scans), "judged"),
+        ("real halves", 10.0, (half, half), "reference"), ("noise", 50.0, (real, scans), "baseline"),
+    ]  # fmt: skip
+    if equal is not None:
+        cases.append(("a, as many", equal, (half, half), "reference"))
     comparisons = [
-        Comparison(name, range(count), range(count), [MetricResult(metric, {metric: number}, {})], 0.0, kind)
-        for name, number, count, kind in (
-            *cases,
-            ("a, as many", 99.0, 100, "reference"),
-            ("noise", 50.0, 200, "baseline"),
-        )
+        Comparison(name, *map(range, sizes), [MetricResult(metric, {metric: number}, {})], 0.0, kind)
+        for name, number, sizes, kind in cases
     ]
     first, _ = verdict(comparisons)
-    assert first.startswith(f"a: nearest, {metric} {value:.3g} (reference: real halves 10, baseline: noise 50): ")
+    same = f"in as many scans as the halves {equal:g}, " if metric == "panel" and equal is not None else ""
+    known = f"{same}reference: real halves 10, baseline: noise 50"
+    assert first.startswith(f"a: nearest, {metric} {value:g} ({known}): ")
     assert words in first

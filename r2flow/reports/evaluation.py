@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
+from r2flow.evaluation.references import AS_MANY, HALVES
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
 from r2flow.reports.tables import print_table, shown, table
@@ -19,7 +20,7 @@ from r2flow.reports.tables import print_table, shown, table
 Kind = Literal["judged", "reference", "baseline"]
 ENDS = (" low", " high")  # suffixes of interval limits
 DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
-ENOUGH = 100  # least number of scans of a set for a verdict
+ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
 AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
 
 # Values that published tables print scaled: heading and factor, for printing only.
@@ -90,33 +91,50 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
 def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     """One sentence per judged set, the nearest first: its first distance against real sets and the best baseline.
 
-    Distances but KID are larger for fewer scans: against a reference of other sizes only one outcome decides.
+    Distances but KID are larger for fewer scans: a set is compared with real halves in as many scans as these have, if
+    measured. Against a reference of other sizes only one outcome decides.
     """
     metric = next((m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)), "")
     found: dict[Kind, list[tuple[float, Comparison]]] = {"judged": [], "reference": [], "baseline": []}
+    equal: dict[str, tuple[float, Comparison]] = {}  # by judged set
     for one in comparisons:
         values = [next(iter(m.figures.values())) for m in one.measured if m.metric == metric]
-        if values and math.isfinite(values[0]) and not (one.kind == "reference" and one.name.endswith(", as many")):
-            found[one.kind].append((values[0], one))
+        if values and math.isfinite(values[0]):
+            if one.kind == "reference" and one.name.endswith(AS_MANY):
+                equal[one.name.removesuffix(AS_MANY)] = values[0], one
+            else:
+                found[one.kind].append((values[0], one))
     judged, real, baselines = (sorted(part, key=lambda pair: pair[0]) for part in found.values())
     title, factor = heading(metric, metric)
-    known = ", ".join(f"{one.title} {value * factor:.3g}" for value, one in (*real[-1:], *baselines[:1]))
     lines = []
     for value, one in judged if real else []:
         (reference, halves), best = real[-1], baselines[0][0] if baselines else math.inf
-        here, there = (min(len(pair.real), len(pair.generated)) for pair in (one, halves))
-        uneven = not metric.startswith("kid_") and (there > here if value > reference else there < here)
+        unbiased = metric.startswith("kid_") or halves.name != HALVES
+        compared, same = (value, one) if unbiased else equal.get(one.name, (value, one))
+        here, there = (min(len(pair.real), len(pair.generated)) for pair in (same, halves))
+        uneven = not metric.startswith("kid_") and (there > here if compared > reference else there < here)
         if value >= best:
             tells = "no nearer to the real scans than a baseline"
+        elif reference >= best:
+            tells = "undecided, as the reference is above a baseline"
         elif min(here, there) < ENOUGH:
-            tells = f"{min(here, there)} scans are too few to say more; give {ENOUGH} or more"
-        elif uneven or reference >= best:
-            tells = "undecided, as the reference is of other numbers of scans or above a baseline"
+            tells = f"{'above' if compared > reference else 'not above'} the reference, below the baselines"
+            other = ", and the reference is of other numbers of scans" if uneven else ""
+            parts = "halves" if halves.name == HALVES else "two drives"
+            tells += (
+                f": an indication, as the {parts} of your {len(one.real)} real scans have {there} or more and the set "
+                f"has {len(one.generated)}{other}: give {2 * ENOUGH} real and {ENOUGH} generated scans for a verdict"
+            )
+        elif uneven:
+            tells = "undecided, as the reference is of other numbers of scans"
         else:
             farther = "farther from the real scans than these are from each other"
-            tells = farther if value > reference else "not distinguishable from real scans by this figure"
+            tells = farther if compared > reference else "not distinguishable from real scans by this figure"
+        known = [f"{c.title} {v * factor:.3g}" for v, c in (real[-1], *baselines[:1])]
+        if same is not one:
+            known.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
         first = "nearest, " if one is judged[0][1] and len(judged) > 1 else ""
-        lines.append(f"{one.name}: {first}{title} {value * factor:.3g} ({known}): {tells}.")
+        lines.append(f"{one.name}: {first}{title} {value * factor:.3g} ({', '.join(known)}): {tells}.")
     return lines
 
 
