@@ -342,3 +342,9 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
     known = f"{same}reference: real halves 10, baseline: noise 50"
     assert first.startswith(f"a: nearest, {metric} {value:g} ({known}): ")
     assert words in first
+
+
+def test_the_verdict_is_of_the_panel_if_measured():
+    results = [MetricResult(name, {name: value}, {}) for name, value in (("kid_x", 5.0), ("panel", 7.0))]
+    both = [Comparison(kind, range(200), range(200), results, 0.0, kind) for kind in ("judged", "reference")]
+    assert verdict(both)[0].startswith("judged: panel 7 (reference: reference 7): not distinguishable")

@@ -45,8 +45,8 @@ class EvaluateOptions:
     metrics: Annotated[
         str | None,
         typer.Option(
-            help="Metrics, separated by commas, or all available here: all. Default: KID and Frechet distance of "
-            "hand-made features, panel, JSD, MMD."
+            help="Metrics, separated by commas, or all available here: all. Default: panel, KID and Frechet distance "
+            "of hand-made features, JSD, MMD."
         ),
     ] = None
     protocol: Annotated[
