@@ -77,8 +77,9 @@ def completed_figure(
     """
     figure, grid = _sheet([2.4] * len(rows) + [1.3] * (spread is not None), space=0.16, top=0.5)
     grey = np.where(unknown[..., None], np.array([0.45, 0.45, 0.45, 1.0]), 0.0)
+    channels = max(len(image) for _, image in rows)  # answers may have reflectance where the scan has none
     for row, (name, image) in enumerate(rows):
-        strips = _draw_row(figure, grid, row, image, rays)
+        strips = _draw_row(figure, grid, row, image, rays, channels)
         legend = " (grey: not measured, black: measured without a return)" if row == 0 else ""
         strips[0].set_title(f"{name}: range{legend}", color=FOREGROUND, fontsize=8, loc="left", pad=3)
         for axes in strips if row == 0 else ():
@@ -103,10 +104,10 @@ def _sheet(heights: Sequence[float], space: float, top: float) -> tuple[Figure, 
     return figure, grid
 
 
-def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tensor) -> list[Any]:
-    """Draw one scan in a row of a sheet; return the axes of range and reflectance."""
-    cells = grid[row, 0].subgridspec(len(image), 1, hspace=0.18)
-    strips = [figure.add_subplot(cell) for cell in cells]
+def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tensor, strips_of: int = 0) -> list[Any]:
+    """Draw one scan in a row of a sheet with space for `strips_of` channels; return the axes of its channels."""
+    cells = grid[row, 0].subgridspec(max(strips_of, len(image)), 1, hspace=0.18)
+    strips = [figure.add_subplot(cells[channel]) for channel in range(len(image))]
     for axes, draw in zip(strips, (draw_range, draw_reflectance), strict=False):
         draw(axes, image, label=row == 0)
     xyz, _ = image_to_points(image, rays)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure, scan_figure
+from r2flow.reports.pictures import completed_figure, contact_sheet, figure_pixels, save_figure, scan_figure
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 E, A = SENSOR.rays().numpy()
@@ -25,6 +25,13 @@ def lit(pixels: np.ndarray) -> int:
 def test_extreme_scans_are_drawn(tmp_path, r):
     for figure in (scan_figure(image(r), SENSOR.rays(), "scan"), contact_sheet([image(r)[:1]] * 2, SENSOR.rays())):
         assert save_figure(figure, tmp_path / "scan.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_known_rays_without_reflectance_are_as_high_as_answers_with_it():
+    scan = image(np.full_like(E, 10.0))
+    figure = completed_figure([("known", scan[:1]), ("answer", scan)], E > 0, SENSOR.rays())
+    known, answer = (axes for axes in figure.axes if "range" in axes.get_title("left"))
+    assert known.get_position().height == pytest.approx(answer.get_position().height)
 
 
 def test_near_and_far_look_different_and_dropped_rays_are_black():
