@@ -25,7 +25,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.jsd_mmd import JSD, MMD
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import standard_normal
-from r2flow.reports.evaluation import Comparison, verdict
+from r2flow.reports.evaluation import Comparison, _figure, verdict
 from r2flow.samplers import build_sampler
 from tests.test_sampling import flow as without_config
 
@@ -348,3 +348,11 @@ def test_the_verdict_is_of_the_panel_if_measured():
     results = [MetricResult(name, {name: value}, {}) for name, value in (("kid_x", 5.0), ("panel", 7.0))]
     both = [Comparison(kind, range(200), range(200), results, 0.0, kind) for kind in ("judged", "reference")]
     assert verdict(both)[0].startswith("judged: panel 7 (reference: reference 7): not distinguishable")
+
+
+@pytest.mark.parametrize(
+    ("values", "scale"), [((1, 20), "log"), ((2, 15), "linear"), ((-1, 20), "linear"), ((0, 20), "linear")]
+)
+def test_positive_figures_that_span_a_decade_are_drawn_on_a_log_axis(values, scale):
+    sets = [Comparison(str(v), (), (), [MetricResult("kid_x", {"kid_x": v}, {})], 0.0) for v in (*values, math.nan)]
+    assert _figure(sets).axes[0].get_xscale() == scale

@@ -286,10 +286,18 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
                 axes.text(0.02, row, "none", transform=axes.get_yaxis_transform(), fontsize=8, va="center")
         axes.set_yticks(range(len(comparisons)), [c.title for c in comparisons] if place % columns == 0 else [])
         axes.set(xlabel=label, ylim=(len(comparisons) - 0.5, -0.5))
-        axes.set_xlim(min(0.0, axes.get_xlim()[0]), axes.get_xlim()[1] * 1.05)
-        axes.locator_params(axis="x", nbins=4)
+        same = [m for m in measured if m.metric == metric and math.isfinite(m.figures.get(name, math.nan))]
+        drawn = [value for m in same for value in (m.figures[name], *m.intervals.get(name, ()))] or [0.0]
+        if max(drawn) > 10 * min(drawn) > 0:
+            axes.set_xscale("log")
+            few_log_ticks(axes.xaxis)
+            if max(drawn) > 100 * min(drawn):
+                axes.xaxis.set_minor_formatter("")
+        else:
+            axes.set_xlim(min(0.0, axes.get_xlim()[0]), axes.get_xlim()[1] * 1.05)
+            axes.locator_params(axis="x", nbins=4)
         axes.grid(True, axis="x", color="0.88", lw=0.6)
-        axes.tick_params(labelsize=8)
+        axes.tick_params(labelsize=8, which="both")
     return figure
 
 
