@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from r2flow.data.opening import open_scans, reading_for
+from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
 from r2flow.generators import Sampler, as_flow
 from r2flow.generators.base import Progress
@@ -27,7 +28,11 @@ class Real(NamedTuple):
 
 
 def real_scans(
-    checkpoint: Checkpoint, specs: Sequence[str | Path], reflectance_scale: float | None = None, most: int = 16
+    checkpoint: Checkpoint,
+    specs: Sequence[str | Path],
+    reflectance_scale: float | None = None,
+    most: int = 16,
+    need_reflectance: bool = True,
 ) -> list[Real]:
     """Read scans with the projection of the checkpoint's training scans.
 
@@ -35,10 +40,12 @@ def real_scans(
         specs: As for `r2flow.data.opening.open_scans`.
         reflectance_scale: Value of full reflectance in the files; None: as in training.
         most: Maximum number of scans per set, evenly spread.
+        need_reflectance: Whether a set without reflectance is refused if the checkpoint has it, or read without it.
     """
     trained = reading_for([], checkpoint)
     scale = trained.reflectance_scale if reflectance_scale is None else reflectance_scale
-    reading = replace(trained, reflectance=checkpoint.encoding.reflectance, reflectance_scale=scale,
+    reflectance = checkpoint.encoding.reflectance and (need_reflectance or AUTO)
+    reading = replace(trained, reflectance=reflectance, reflectance_scale=scale,
                       on_bad_scan="error", within_limits=True)  # fmt: skip
     sets = [open_scans(spec, reading).spread(most) for spec in specs]
     stems = [Path(name).name.split(".")[0].replace(" ", "_") for scans in sets for name in scans.source.names]

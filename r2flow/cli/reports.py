@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -150,7 +151,7 @@ def completion(
         list[str] | None, typer.Argument(help="Models, run folders or checkpoint files. Default: densify.")
     ] = None,
     tasks: Annotated[
-        str | None, typer.Option(help="Masks such as rows:4, separated by spaces. Default: five masks.")
+        str | None, typer.Option(help="Masks such as rows:4, separated by spaces or commas. Default: five masks.")
     ] = None,
     samplers: Annotated[str | None, typer.Option(help="Samplers of the models, such as mmps,replace.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps per sampler.")] = None,
@@ -190,10 +191,11 @@ def completion(
         for sampler in (samplers.split(",") if samplers else [None])
     ]
     first = ways[0].checkpoint
-    masks = tasks.split() if tasks else list(TASKS)
+    masks = re.split(r"\s+|,(?=[a-z]+:)", tasks.strip()) if tasks else list(TASKS)
     for task in masks:
         measured_by(task, first.sensor, 0)
-    scans = real_scans(first, [real], reflectance_scale or first.sensor.reflectance_scale, num)
+    scale = reflectance_scale or first.sensor.reflectance_scale
+    scans = real_scans(first, [real], scale, num, need_reflectance=False)
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
     check(truths, f"{real}: no scan has a return, so there is nothing to hide.")
     prepare_folder(out)

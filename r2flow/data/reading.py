@@ -133,7 +133,7 @@ def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
         f"{path} has no reflectance and the config, the model or the first scan of its set has it. In training give "
         "encoding.reflectance=false for range alone, and no stage.init that has reflectance; in measuring give metrics "
-        "of range."
+        "of range, or only scans that have it."
     )
 
 

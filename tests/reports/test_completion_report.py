@@ -1,6 +1,7 @@
 """`r2flow report completion`: what is hidden, who answers, what is written."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +88,7 @@ def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: P
     out = tmp_path / "out"
     code, _, error = r2flow(
         "report", "completion", "simulated:3", tmp_path / "model.safetensors", "--num", 2, "--answers", 2,
-        "--samplers", "euler,jump", "--steps", 1, "--tasks", "rows:4 rows:2", "--out", out,
+        "--samplers", "euler,jump", "--steps", 1, "--tasks", "rows:4,rows:2", "--out", out,
     )  # fmt: skip
     assert code == 0, error
     assert (out / "completion.png").stat().st_size > 10_000
@@ -95,6 +96,19 @@ def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: P
     ways = "model, euler, 1 step", "model, jump, 1 step"
     assert [row["method"] for row in rows] == [*INTERPOLATIONS, *ways, *INTERPOLATIONS, *ways]
     assert "coverage" in (out / "completion.md").read_text()
+
+
+def test_scans_without_reflectance_have_no_column_of_it(r2flow, checkpoint, tmp_path: Path):
+    checkpoint.save(tmp_path / "model.safetensors")
+    np.save(tmp_path / "scan.npy", simulate(checkpoint.sensor, 3, 0).image[:1])
+    code, _, error = r2flow(
+        "report", "completion", tmp_path / "scan.npy", tmp_path / "model.safetensors", "--tasks", "rows:2",
+        "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert code == 0, error
+    rows = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
+    assert all(math.isfinite(row["panel"]) and "reflectance_mae" not in row for row in rows)
+    assert "reflectance MAE" not in (tmp_path / "out" / "completion.md").read_text()
 
 
 @pytest.mark.parametrize("given", [(), ("--sensor", "vlp16", "--size", "8x96")])  # the folder's manifest, or options
