@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.lidar.scan_files.points import check_xyz
 from r2flow.lidar.sensors import Convention, Sensor
 from r2flow.lidar.unfolding import unfolded_rows
 
@@ -44,7 +45,7 @@ def project(
         Range in metres and reflectance, (2, H, W) float32; 0 without a return.
 
     Raises:
-        InputError: the scan does not unfold into the sensor's rings.
+        InputError: `xyz` has another shape, or the scan does not unfold into the sensor's rings.
     """
     hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
     return scatter(sensor, hit, [r, np.zeros_like(r) if reflectance is None else reflectance[chosen]])
@@ -72,6 +73,7 @@ def project_indices(
     assert convention in get_args(Convention), convention
     assert projection in get_args(Projection), projection
     xyz = np.asarray(xyz, dtype=np.float32)
+    check_xyz(xyz)
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     finite = np.isfinite(r)
@@ -94,12 +96,7 @@ def project_indices(
 
 
 def _rows(
-    xyz: np.ndarray,
-    r: np.ndarray,
-    sensor: Sensor,
-    projection: str,
-    convention: Convention,
-    ring: np.ndarray | None,
+    xyz: np.ndarray, r: np.ndarray, sensor: Sensor, projection: str, convention: Convention, ring: np.ndarray | None
 ) -> np.ndarray:
     """Row of every point, (N,) int64; outside [0, H) for points outside the view."""
     if projection == "unfolding":
