@@ -21,6 +21,7 @@ from r2flow.files import atomic_write, parse_json, telling
 from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
 from r2flow.model.published import FORMATS, format_of, inert, plain
@@ -90,11 +91,11 @@ class Checkpoint:
         """
         return torch.stack([completed.images for completed in complete(self, images, state, num, seed, **how)])
 
-    def through(self, sensor: Sensor, numbered: bool = True) -> "Checkpoint":
+    def through(self, sensor: Sensor | str, numbered: bool = True) -> "Checkpoint":
         """The same model for another sensor's images; see `TransferFlow.at`."""
         if not isinstance(self.generator, TransferFlow):
             raise InputError(f"{self.path} is a model of one sensor: leave --to, --sensor and --size out.")
-        return replace(self, generator=self.generator.at(self.generator.space.through(sensor), numbered))
+        return replace(self, generator=self.generator.at(self.generator.space.through(named_sensor(sensor)), numbered))
 
     def points(self, images: Tensor) -> list[np.ndarray]:
         """The returns of each range image, (N, 4): x, y, z in metres and reflectance; see `ModelSpace.points`."""

@@ -37,9 +37,11 @@ def test_points_to_image_to_points(sensor, projection):
     again = project(xyz, reflectance, sensor, projection)
     np.testing.assert_allclose(again[0], image[0], rtol=1e-6)
     np.testing.assert_array_equal(again[1], image[1])
-    back, back_reflectance = image_to_points(again, sensor.rays())
+    back, back_reflectance = image_to_points(again, sensor.rays().numpy())
     np.testing.assert_allclose(back, xyz, rtol=0, atol=1e-4)
     np.testing.assert_array_equal(back_reflectance, reflectance)
+    np.testing.assert_array_equal(image_to_points(again, sensor.name)[0], back)
+    np.testing.assert_array_equal(project(xyz, reflectance, sensor.name, projection), again)
 
 
 def test_unproject_agrees_with_trigonometry():
