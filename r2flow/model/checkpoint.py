@@ -38,7 +38,7 @@ NOTES = "r2flow"  # key of the JSON metadata in a .safetensors
 SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Checkpoint:
     """A trained generator. `Checkpoint(generator, config)` wraps a generator that was trained without a run.
 
@@ -55,6 +55,12 @@ class Checkpoint:
     step: int = 0
     path: Path = Path("unsaved")
     format: str = "r2flow"
+
+    def __repr__(self) -> str:
+        name = self.path.stem if step_of(self.path) < 0 else self.path.absolute().parent.parent.name  # the run's
+        kind = (self.config.get("generator") or {}).get("name", "rectified_flow")
+        size = "x".join(map(str, self.sensor.shape))
+        return f"Checkpoint({name}, {kind}, {size} {self.sensor.name}, step {self.step})"
 
     @property
     def model(self) -> nn.Module:
