@@ -10,6 +10,7 @@ import sys
 import textwrap
 from collections import Counter
 from collections.abc import Iterator
+from enum import EnumType
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ VERBS |= {f"report-{name}": verb for name, verb in VERBS.pop("report").commands.
 def first(text: str | None) -> str:
     """The first sentence of a docstring, a help text or a comment, without its full stop."""
     paragraph = re.sub(r"\s+", " ", (text or "").strip().split("\n\n")[0])
-    return re.sub(r"(?<=[\w)`%\"])\.$", "", re.split(r": python train.py |(?<=\.)\s+(?=[A-Za-z`])", paragraph)[0])
+    return re.sub(r"(?<=[\w)`%\"+])\.$", "", re.split(r": python train.py |(?<=\.)\s+(?=[A-Za-z`])", paragraph)[0])
 
 
 def plain(annotation: Any) -> str:
@@ -44,6 +45,7 @@ def plain(annotation: Any) -> str:
     )
     text = re.sub(r"Optional\[([^()=]+?)\](?= =|,|\)|$)", r"\1 | None", text).replace("<factory>", "{}")
     text = re.sub(r"PosixPath\(('.*?')\)", r"\1", text)
+    text = re.sub(r"(= \w+)\(.*<function .*>.*?'\)", r"\1(...)", text)
     return re.sub(r"(: |-> )'([^']*)'", r"\1\2", text)
 
 
@@ -54,8 +56,9 @@ def signatures(*places: str) -> Iterator[str]:
         thing = import_module(module)
         for name in names.split("."):
             thing = getattr(thing, name)
-        if isinstance(thing, Registry):
-            yield f"{module}.{names}\n" + textwrap.indent(textwrap.fill(", ".join(thing), 112), "    # ")
+        if isinstance(thing, Registry | EnumType):
+            known = thing if isinstance(thing, Registry) else thing.__members__
+            yield f"{module}.{names}\n" + textwrap.indent(textwrap.fill(", ".join(known), 112), "    # ")
             continue
         call = "" if isinstance(thing, property) else plain(inspect.signature(thing)).removesuffix(" -> None")
         call = call.replace("(self, ", "(").replace("(self)", "()")

@@ -74,8 +74,7 @@ class Registry(Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         if name not in self:
-            names = ", ".join(sorted(self))
-            hint = did_you_mean(str(name), list(self))
+            names, hint = ", ".join(sorted(self)), did_you_mean(str(name), list(self))
             raise UnknownName(f"no {self.kind} named {name!r}; known: {names}.{hint}")
         entry = self._entries[name]
         if isinstance(entry, _Lazy):
@@ -92,6 +91,9 @@ class Registry(Generic[T]):
 
     def __len__(self) -> int:
         return len(self._entries)
+
+    def __repr__(self) -> str:
+        return f"Registry({self.kind}: {', '.join(self)})"
 
     def items(self) -> Iterator[tuple[str, T]]:
         return ((name, self[name]) for name in self._entries)

@@ -254,3 +254,4 @@ def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
     loaded = load_checkpoint(tmp_path / "mine.safetensors")
     torch.testing.assert_close(loaded.generator.state_dict(), mine.generator.state_dict(), rtol=0, atol=0)
     assert loaded.config == config
+    assert repr(loaded) == "Checkpoint(mine, rectified_flow, 8x64 hdl64e, step 0)"

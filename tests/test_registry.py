@@ -32,6 +32,7 @@ def test_a_name_that_is_taken_is_refused():
     table = Registry("thing", a=1)
     table.add("b", 2)
     assert table["b"] == 2
+    assert repr(table) == "Registry(thing: a, b)"
     with pytest.raises(ValueError, match="exists already"):
         table.add("a", 3)
 

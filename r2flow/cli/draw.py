@@ -189,10 +189,11 @@ def complete(
 
     import numpy as np
 
-    from r2flow.data.opening import named_sensor, reading_for
+    from r2flow.data.opening import reading_for
     from r2flow.data.partial import PartialScan, open_partial
     from r2flow.generators import TransferFlow
     from r2flow.lidar.known import mask_identity, parse_mask
+    from r2flow.lidar.sensor_files import named_sensor
     from r2flow.model.checkpoint import Checkpoint, load_checkpoint
     from r2flow.model.completion import completing
     from r2flow.models import DEFAULT, DENSIFY, MODELS

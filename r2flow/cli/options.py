@@ -60,7 +60,7 @@ def named_columns(text: str | None) -> tuple[str, ...] | None:
 
 def build_sized(sensor: str, size: str | None) -> "Sensor":
     """Build a sensor from its name or YAML file and an image size such as 64x1024."""
-    from r2flow.data.opening import named_sensor
+    from r2flow.lidar.sensor_files import named_sensor
 
     return named_sensor(sensor, rows_and_columns(size))
 

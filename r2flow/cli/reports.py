@@ -168,9 +168,10 @@ def completion(
     """Mask scans and complete them by models and by interpolation: errors against evaluations."""
     import numpy as np
 
-    from r2flow.data.opening import named_sensor, own_reading
+    from r2flow.data.opening import own_reading
     from r2flow.generators import TransferFlow
     from r2flow.inversion import real_scans
+    from r2flow.lidar.sensor_files import named_sensor
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
     from r2flow.models import DENSIFY

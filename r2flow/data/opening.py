@@ -26,9 +26,9 @@ from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, warn_of_other_sensor
 from r2flow.errors import InputError, check, tell_odd
 from r2flow.lidar.scan_files import read_range_image
-from r2flow.lidar.sensor_files import ENDINGS, read_sensor
-from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
-from r2flow.registry import Registry, UnknownName
+from r2flow.lidar.sensor_files import named_sensor
+from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.registry import Registry
 from r2flow.store import MANIFEST, read_manifest
 
 log = logging.getLogger(__name__)
@@ -220,18 +220,6 @@ def _reading_of(model: Model) -> Reading:
     fields = ("projection", "convention", "reflectance_scale")
     agreed = {key: values.pop() for key in fields if len(values := {(r or {}).get(key) for r in readings}) == 1}
     return Reading(model.sensor, **{key: value for key, value in agreed.items() if value is not None})
-
-
-def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
-    """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
-    if isinstance(sensor, Sensor):
-        return sensor if size is None else sensor.resized(*size)
-    if sensor.lower().endswith(ENDINGS):
-        return read_sensor(sensor, *(size or (None, None)))
-    try:
-        return build_sensor(sensor, *(size or (None, None)))
-    except UnknownName as error:
-        raise UnknownName(f"{error} Your own is a YAML file: r2flow sensor SCANS --out NAME.yaml") from None
 
 
 def read(path: str | Path, sensor: Sensor | str | None = None) -> Tensor:

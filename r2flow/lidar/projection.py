@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.lidar.scan_files.points import check_xyz
+from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import Convention, Sensor
 from r2flow.lidar.unfolding import unfolded_rows
 
@@ -17,7 +19,7 @@ Projection = Literal["spherical", "unfolding"]
 def project(
     xyz: np.ndarray,
     reflectance: np.ndarray | None,
-    sensor: Sensor,
+    sensor: Sensor | str,
     projection: Projection = "spherical",
     convention: Convention = "centre",
     ring: np.ndarray | None = None,
@@ -36,7 +38,7 @@ def project(
         xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. Points that are not finite are rays without
             return.
         reflectance: (N,), or None.
-        sensor: Rows, columns and range limits.
+        sensor: Rows, columns and range limits; or its name or YAML file.
         ring: Ring number of each point, (N,), counted from 0 or 1, monotonic in elevation or in the sensor's firing
             order.
 
@@ -44,8 +46,9 @@ def project(
         Range in metres and reflectance, (2, H, W) float32; 0 without a return.
 
     Raises:
-        InputError: the scan does not unfold into the sensor's rings.
+        InputError: `xyz` has another shape, or the scan does not unfold into the sensor's rings.
     """
+    sensor = named_sensor(sensor)
     hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
     return scatter(sensor, hit, [r, np.zeros_like(r) if reflectance is None else reflectance[chosen]])
 
@@ -72,6 +75,7 @@ def project_indices(
     assert convention in get_args(Convention), convention
     assert projection in get_args(Projection), projection
     xyz = np.asarray(xyz, dtype=np.float32)
+    check_xyz(xyz)
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     finite = np.isfinite(r)
@@ -94,12 +98,7 @@ def project_indices(
 
 
 def _rows(
-    xyz: np.ndarray,
-    r: np.ndarray,
-    sensor: Sensor,
-    projection: str,
-    convention: Convention,
-    ring: np.ndarray | None,
+    xyz: np.ndarray, r: np.ndarray, sensor: Sensor, projection: str, convention: Convention, ring: np.ndarray | None
 ) -> np.ndarray:
     """Row of every point, (N,) int64; outside [0, H) for points outside the view."""
     if projection == "unfolding":
@@ -168,18 +167,19 @@ def unproject(r: Tensor, rays: Tensor) -> Tensor:
 
 
 def image_to_points(
-    image: np.ndarray, rays: Tensor, measured: np.ndarray | None = None
+    image: np.ndarray, rays: Tensor | np.ndarray | Sensor | str, measured: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The returns of an image as a point cloud, ring after ring from the top, with azimuth increasing from 0.
 
     Args:
         image: Range in metres and reflectance, (2, H, W); reflectance may be missing, (1, H, W).
-        rays: (2, H, W) radians.
+        rays: (2, H, W) radians; or a sensor or its name, for rays through the pixels' centres.
         measured: Points of the pixels in metres, (3, H, W), used except at the origin.
 
     Returns:
         Points in metres, (N, 3), and reflectance, (N,), float32; N is the number of returns.
     """
+    rays = named_sensor(rays).rays() if isinstance(rays, Sensor | str) else torch.as_tensor(rays)
     r = torch.from_numpy(np.ascontiguousarray(image[:1]))[None]
     xyz = unproject(r, rays)[0].numpy()
     if measured is not None:

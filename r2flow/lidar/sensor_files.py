@@ -8,7 +8,7 @@ import yaml
 from r2flow.errors import InputError, naming
 from r2flow.files import atomic_write, reading
 from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.registry import check_options
+from r2flow.registry import UnknownName, check_options
 
 ENDINGS = (".yaml", ".yml")
 LARGEST_FILE = 1 << 20  # bytes; a sensor is a dozen lines
@@ -31,6 +31,18 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
     check_options(str(path), build_sensor, options)
     with naming(path):
         return build_sensor(**options)
+
+
+def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
+    """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
+    if isinstance(sensor, Sensor):
+        return sensor if size is None else sensor.resized(*size)
+    if sensor.lower().endswith(ENDINGS):
+        return read_sensor(sensor, *(size or (None, None)))
+    try:
+        return build_sensor(sensor, *(size or (None, None)))
+    except UnknownName as error:
+        raise UnknownName(f"{error} Your own is a YAML file: r2flow sensor SCANS --out NAME.yaml") from None
 
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:

@@ -127,11 +127,7 @@ def image_of_same(image: np.ndarray, target: Sensor) -> Partial:
 
 
 def _cast(
-    target: Sensor,
-    xyz: np.ndarray,
-    pixel: np.ndarray,
-    empty: np.ndarray,
-    reflectance: np.ndarray | None,
+    target: Sensor, xyz: np.ndarray, pixel: np.ndarray, empty: np.ndarray, reflectance: np.ndarray | None
 ) -> Partial:
     """The image of returns at their pixels, and of pixels of rays without a return.
 

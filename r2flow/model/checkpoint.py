@@ -21,6 +21,7 @@ from r2flow.files import atomic_write, parse_json, telling
 from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
 from r2flow.model.published import FORMATS, format_of, inert, plain
@@ -37,7 +38,7 @@ NOTES = "r2flow"  # key of the JSON metadata in a .safetensors
 SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Checkpoint:
     """A trained generator. `Checkpoint(generator, config)` wraps a generator that was trained without a run.
 
@@ -54,6 +55,12 @@ class Checkpoint:
     step: int = 0
     path: Path = Path("unsaved")
     format: str = "r2flow"
+
+    def __repr__(self) -> str:
+        name = self.path.stem if step_of(self.path) < 0 else self.path.absolute().parent.parent.name  # the run's
+        kind = (self.config.get("generator") or {}).get("name", "rectified_flow")
+        size = "x".join(map(str, self.sensor.shape))
+        return f"Checkpoint({name}, {kind}, {size} {self.sensor.name}, step {self.step})"
 
     @property
     def model(self) -> nn.Module:
@@ -90,11 +97,11 @@ class Checkpoint:
         """
         return torch.stack([completed.images for completed in complete(self, images, state, num, seed, **how)])
 
-    def through(self, sensor: Sensor, numbered: bool = True) -> "Checkpoint":
+    def through(self, sensor: Sensor | str, numbered: bool = True) -> "Checkpoint":
         """The same model for another sensor's images; see `TransferFlow.at`."""
         if not isinstance(self.generator, TransferFlow):
             raise InputError(f"{self.path} is a model of one sensor: leave --to, --sensor and --size out.")
-        return replace(self, generator=self.generator.at(self.generator.space.through(sensor), numbered))
+        return replace(self, generator=self.generator.at(self.generator.space.through(named_sensor(sensor)), numbered))
 
     def points(self, images: Tensor) -> list[np.ndarray]:
         """The returns of each range image, (N, 4): x, y, z in metres and reflectance; see `ModelSpace.points`."""

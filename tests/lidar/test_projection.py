@@ -1,4 +1,5 @@
 import math
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from r2flow.data.reading import Reading, read_projected
 from r2flow.errors import InputError
 from r2flow.lidar.beams import find_beams, steps_of_a_turn
 from r2flow.lidar.projection import image_to_points, project, project_indices, unproject
-from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 
 HDL64E = SENSORS["hdl64e"]
@@ -36,9 +37,11 @@ def test_points_to_image_to_points(sensor, projection):
     again = project(xyz, reflectance, sensor, projection)
     np.testing.assert_allclose(again[0], image[0], rtol=1e-6)
     np.testing.assert_array_equal(again[1], image[1])
-    back, back_reflectance = image_to_points(again, sensor.rays())
+    back, back_reflectance = image_to_points(again, sensor.rays().numpy())
     np.testing.assert_allclose(back, xyz, rtol=0, atol=1e-4)
     np.testing.assert_array_equal(back_reflectance, reflectance)
+    np.testing.assert_array_equal(image_to_points(again, sensor.name)[0], back)
+    np.testing.assert_array_equal(project(xyz, reflectance, sensor.name, projection), again)
 
 
 def test_unproject_agrees_with_trigonometry():
@@ -82,6 +85,13 @@ def test_points_that_are_not_finite_are_no_returns(convention, lost):
     alone, beside = (project(p, None, sensor, convention=convention) for p in (xyz, with_lost))
     assert (alone[0] > 0).sum() == 3
     np.testing.assert_array_equal(beside, alone)
+
+
+@pytest.mark.parametrize("shape", [(5, 4), (3, 5), (5, 2), (3,)])
+def test_coordinates_of_another_shape_are_refused(shape):
+    for take in (lambda xyz: project(xyz, None, HDL64E), Points, lambda xyz: write_points("never.ply", xyz)):
+        with pytest.raises(InputError, match=re.escape(f"(N, 3), found {shape}; ")):
+            take(np.ones(shape, np.float32))
 
 
 def test_points_out_of_view_are_dropped_not_clamped():

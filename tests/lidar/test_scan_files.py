@@ -222,11 +222,7 @@ def test_written_scans_are_read_back_bit_for_bit(tmp_path, ending):
 
 @pytest.mark.parametrize(
     ("name", "change", "word"),
-    [
-        ("a.bin", {"reflectance": None}, "reflectance"),
-        ("a.pcd.bin", {}, "written as"),
-        ("a.las", {}, ".npy"),
-    ],
+    [("a.bin", {"reflectance": None}, "reflectance"), ("a.pcd.bin", {}, "written as"), ("a.las", {}, ".npy")],
 )
 def test_a_refused_write_leaves_the_old_file(tmp_path, name, change, word):
     path = saved(tmp_path, name, b"old")

@@ -11,14 +11,7 @@ from r2flow.lidar.known import Ray
 from r2flow.lidar.projection import project
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.lidar.transfer import (
-    image_of_same,
-    image_through,
-    points_of_same,
-    points_through,
-    rows_of,
-    sensor_of,
-)
+from r2flow.lidar.transfer import image_of_same, image_through, points_of_same, points_through, rows_of, sensor_of
 
 TARGET = SENSORS["hdl64e"].resized(32, 256)
 VLP16 = SENSORS["vlp16"]

@@ -12,7 +12,7 @@ import numpy as np
 from r2flow.errors import InputError, check, note_odd
 from r2flow.files import atomic_write, reading
 from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
-from r2flow.lidar.scan_files.points import NoPointsError, Points, check_columns, column_points
+from r2flow.lidar.scan_files.points import NoPointsError, Points, check_columns, check_xyz, column_points
 from r2flow.lidar.scan_files.tables import (
     read_array,
     read_arrow,
@@ -148,6 +148,7 @@ def write_points(
         reflectance: (N,), or None.
         ring: Number of each point's beam, (N,), or None; only for .ply.
     """
+    check_xyz(xyz)
     path = Path(path)
     ending = path.suffix.lower()
     if ending not in WRITTEN or scan_ending(path.name) != ending or (ending == ".bin" and reflectance is None):

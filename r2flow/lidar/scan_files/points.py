@@ -36,6 +36,9 @@ class Points:
     dropped: int = 0  # number of dropped rows: a value was NaN or infinite, or a coordinate beyond `FARTHEST`
     kept: np.ndarray | None = None  # index in the file of each remaining row, (N,); None if all remain
 
+    def __post_init__(self) -> None:
+        check_xyz(self.xyz)
+
     def with_lost_rays(self) -> "Points":
         """All rows of the file, with dropped rows at the origin, as rays without return.
 
@@ -51,6 +54,12 @@ class Points:
             reflectance = np.zeros(len(xyz), np.float32)
             reflectance[self.kept] = self.reflectance
         return Points(xyz, reflectance)
+
+
+def check_xyz(xyz: np.ndarray) -> None:
+    """Refuse coordinates of another shape than (N, 3), such as rows of KITTI's four numbers."""
+    shape, split = np.shape(xyz), "rows of x, y, z, reflectance are given as points[:, :3], points[:, 3]"
+    check(len(shape) == 2 and shape[1] == 3, f"xyz must have the shape (N, 3), found {shape}; {split}.")
 
 
 def check_columns(columns: Sequence[str] | None) -> None:
