@@ -83,8 +83,8 @@ def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
     )
     assert done.returncode == 0, done.stderr
     assert "JSD" in done.stdout
-    sets = [one["generated"] for one in json.loads((tmp_path / "e.json").read_text())["comparisons"]]
-    steps = [one["sampler"].get("steps") for one in sets if one.get("kind") == "sampled"]
+    comparisons = json.loads((tmp_path / "e.json").read_text())["comparisons"]
+    steps = [one["generated"]["sampler"].get("steps") for one in comparisons if one["kind"] == "judged"]
     assert steps == ([None] if family is GAN else [1, 2])
 
 
