@@ -168,7 +168,7 @@ def completion(
     """Mask scans and complete them by models and by interpolation: errors against evaluations."""
     import numpy as np
 
-    from r2flow.data.opening import own_reading
+    from r2flow.data.opening import own_reading, usual_scale
     from r2flow.generators import TransferFlow
     from r2flow.inversion import real_scans
     from r2flow.lidar.sensor_files import named_sensor
@@ -192,10 +192,10 @@ def completion(
         for sampler in (samplers.split(",") if samplers else [None])
     ]
     first = ways[0].checkpoint
-    masks = re.split(r"\s+|,(?=[a-z]+:)", tasks.strip()) if tasks else list(TASKS)
+    masks = re.split(r"\s*,\s*(?=[a-z]+:)|\s+", tasks.strip()) if tasks else list(TASKS)
     for task in masks:
         measured_by(task, first.sensor, 0)
-    scale = reflectance_scale or first.sensor.reflectance_scale
+    scale = reflectance_scale or usual_scale(real, first.sensor)
     scans = real_scans(first, [real], scale, num, need_reflectance=False)
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
     check(truths, f"{real}: no scan has a return, so there is nothing to hide.")

@@ -102,7 +102,10 @@ class ScanDataModule(L.LightningDataModule):
 
         Without `validation.data`, each part of a mixture holds out one block.
         """
-        whole = [self._open(part, sensor=sensor) for part, sensor in zip(self.parts, self.sensors, strict=True)]
+        whole, first_scene = list[ScanSource](), 0  # parts and held-out scans have different simulated scenes
+        for part, sensor in zip(self.parts, self.sensors, strict=True):
+            whole.append(self._open(part, first_scene, sensor))
+            first_scene += part.scenes if part.name == SIMULATED else 0
         # A prefix makes the names of the parts' scans distinct.
         labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
         self.names = [f"{label}{name}" for label, source in zip(labels, whole, strict=True) for name in source.names]
@@ -115,8 +118,6 @@ class ScanDataModule(L.LightningDataModule):
                 training.append(source.subset(first))
                 held.append(source.subset(last))
         else:
-            # Held-out scenes come after training scenes.
-            first_scene = max((part.scenes for part in self.parts if part.name == SIMULATED), default=0)
             training, held = whole, [self._open(other, first_scene)]
             shared = held[0].places() & set().union(*(source.places() for source in whole))
             if shared:

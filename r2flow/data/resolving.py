@@ -29,7 +29,9 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     reading = {**{key: parent[key] for key in inherited if parent and parent.get(key) is not None}, **run.chosen}
 
     def whole(options: Mapping[str, Any], usual: Mapping[str, Any]) -> Data:
-        return {**options, "reading": _whole_reading(PartOptions(**options), usual, scale)}
+        sensor = options.get("sensor")
+        own = scale if sensor is None else build_sensor(**sensor).reflectance_scale
+        return {**options, "reading": _whole_reading(PartOptions(**options), usual, own)}
 
     data = {**data, "reading": _whole_reading(run, reading, scale)}
     if run.name == MIXED:
@@ -72,9 +74,6 @@ def _checked_parts(run: DataOptions) -> list[Data]:
             check_options(f"data.parts[{number}].sensor", build_sensor, part["sensor"])
     if len({part.get("weight") is None for part in run.parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
-    simulated = [part.get("sensor") for part in run.parts if part["name"] == SIMULATED]
-    if any(sensor in simulated[:i] for i, sensor in enumerate(simulated)):
-        raise InputError("data.parts: simulated scenes are numbered; give one simulated part of a sensor.")
     return [{"scenes": run.scenes, **part} for part in run.parts]
 
 

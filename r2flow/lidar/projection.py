@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.errors import check
 from r2flow.lidar.scan_files.points import check_xyz
 from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import Convention, Sensor
@@ -179,7 +180,10 @@ def image_to_points(
     Returns:
         Points in metres, (N, 3), and reflectance, (N,), float32; N is the number of returns.
     """
-    rays = named_sensor(rays).rays() if isinstance(rays, Sensor | str) else torch.as_tensor(rays)
+    rays = torch.as_tensor(rays) if isinstance(rays, Tensor | np.ndarray) else named_sensor(rays).rays()
+    check(image.ndim == 3 and image.shape[1:] == rays.shape[1:],
+          f"the image is {image.shape}, its rays are {tuple(rays.shape)}: give (2 or 1, H, W), and the rays of as many "
+          "pixels.")  # fmt: skip
     r = torch.from_numpy(np.ascontiguousarray(image[:1]))[None]
     xyz = unproject(r, rays)[0].numpy()
     if measured is not None:

@@ -37,6 +37,7 @@ def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> S
     """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
     if isinstance(sensor, Sensor):
         return sensor if size is None else sensor.resized(*size)
+    sensor = str(sensor)
     if sensor.lower().endswith(ENDINGS):
         return read_sensor(sensor, *(size or (None, None)))
     try:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Convention, Sensor, build_sensor
@@ -78,6 +78,7 @@ class ModelSpace:
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:
     """The model space of a config with the keys `sensor` and `encoding`."""
+    check({"sensor", "encoding"} <= config.keys(), "the config of a model needs 'sensor' and 'encoding'.")
     options = dict(config["sensor"])
     convention: Convention = options.pop("rays", "centre")
     check_options("sensor", build_sensor, options)

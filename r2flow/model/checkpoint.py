@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.config import check_tree, learned
-from r2flow.errors import InputError
+from r2flow.errors import InputError, naming
 from r2flow.files import atomic_write, parse_json, telling
 from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
 from r2flow.hashing import state_hash
@@ -211,7 +211,13 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     path = find_checkpoint(path)
     with telling(path):
         content = read_safetensors(path) if path.suffix == ".safetensors" else read_checkpoint(path)
-        checkpoint = _built(content, path, averaged)
+    try:
+        with naming(path):
+            checkpoint = _built(content, path, averaged)
+    except InputError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is not what r2flow writes, or damaged ({type(error).__name__}: {error}).") from error
     return replace(checkpoint, generator=checkpoint.generator.to(device))
 
 

@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from r2flow.config import at_most_three, check_tree, differences, flatten, rule
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.files import atomic_write
 from r2flow.model.checkpoint import FOLDER, checkpoints_of, read_checkpoint, step_of
 
@@ -135,7 +135,9 @@ def _whole(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
     """The readable checkpoints, newest first."""
     for path in checkpoints_of(run):
         try:
-            yield path, read_checkpoint(path)
+            content = read_checkpoint(path)
+            check(isinstance(content, dict), f"{path} is not a checkpoint of a run.")
+            yield path, content
         except InputError as error:
             log.warning("%s Passing it over.", error)
 
