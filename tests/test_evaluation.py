@@ -306,23 +306,17 @@ FEW = "the halves of your 24 real scans have 12 or more and the set has 18"
     ("metric", "real", "scans", "value", "equal", "words"),
     [
         ("kid_x", 200, 200, 9.0, 99.0, "not distinguishable"),
-        ("kid_x", 200, 200, 11.0, 1.0, "farther from the real scans than these are"),
+        ("kid_x", 200, 200, 11.0, 1.0, "not distinguishable"),  # within the margin
+        ("kid_x", 200, 200, 13.0, 1.0, "farther from the real scans than these are"),
         ("kid_x", 200, 200, 50.0, 1.0, "no nearer to the real scans than a baseline"),
-        ("kid_x", 200, 20, 9.0, None, "not above the reference, below the baselines: an indication"),
-        (
-            "panel",
-            24,
-            18,
-            9.0,
-            11.0,
-            f"above the reference, below the baselines: an indication, as {FEW}: give 200",
-        ),
-        ("panel", 24, 18, 9.0, 9.5, f"not above the reference, below the baselines: an indication, as {FEW}: give 200"),
-        ("panel", 24, 18, 9.0, None, f"as {FEW}, and the reference is of other numbers of scans"),
-        ("panel", 200, 200, 9.0, None, "undecided"),  # the halves' distance is larger since they are fewer
+        ("kid_x", 200, 20, 9.0, None, "not above the real halves, below the baselines: an indication"),
+        ("panel", 24, 18, 9.0, 11.0, f"above the real halves, below the baselines: an indication, as {FEW}: give 200"),
+        ("panel", 24, 18, 60.0, 9.5, f"not above the real halves, not below the baselines: an indication, as {FEW}"),
+        ("panel", 24, 18, 9.0, None, f"an indication, as {FEW}"),
+        ("panel", 200, 200, 9.0, None, "give 100 generated"),  # the halves' distance is larger since they are fewer
         ("panel", 200, 200, 9.0, 9.5, "not distinguishable"),
-        ("panel", 200, 200, 9.0, 11.0, "farther from the real scans than these are"),
-        ("panel", 200, 200, 11.0, None, "farther from the real scans than these are"),
+        ("panel", 200, 200, 9.0, 13.0, "farther from the real scans than these are"),
+        ("panel", 200, 200, 13.0, None, "farther from the real scans than these are"),
     ],
 )
 def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, value, equal, words):
@@ -346,8 +340,9 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
 
 def test_the_verdict_is_of_the_panel_if_measured():
     results = [MetricResult(name, {name: value}, {}) for name, value in (("kid_x", 5.0), ("panel", 7.0))]
-    both = [Comparison(kind, range(200), range(200), results, 0.0, kind) for kind in ("judged", "reference")]
-    assert verdict(both)[0].startswith("judged: panel 7 (reference: reference 7): not distinguishable")
+    named = (("a", "judged"), ("real halves", "reference"))
+    both = [Comparison(name, range(200), range(200), results, 0.0, kind) for name, kind in named]
+    assert verdict(both)[0].startswith("a: panel 7 (reference: real halves 7): not distinguishable")
 
 
 @pytest.mark.parametrize(

@@ -207,9 +207,8 @@ def _follow_loaded_rays(backbone: Backbone, _keys: Any) -> None:
 
 def _times(name: str, times: Tensor | float, x: Tensor) -> Tensor:
     times = torch.as_tensor(times, device=x.device)
-    # len(x), or 1 first, would fix an export's batch size
-    fits = times.ndim <= 1 and times.numel() in (x.shape[0], 1)
-    assert fits, f"{name} must be a scalar or of shape ({len(x)},), found {tuple(times.shape)}"
+    if times.ndim > 1 or times.numel() not in (x.shape[0], 1):  # len(x), or 1 first, would fix an export's batch size
+        raise InputError(f"{name} must be a scalar or of shape ({len(x)},), found {tuple(times.shape)}.")
     return at_least_float32(times).reshape(-1)
 
 

@@ -1,6 +1,5 @@
 """Flows: generators by the ODE dx/dt = v(t, x), from noise at t = 0 to data at t = 1."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
 from typing import Any, ClassVar, Self
@@ -20,7 +19,7 @@ from r2flow.samplers import MMPS, FixedSteps, ODESampler, Progress, Sampler
 USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # default of a new flow
 
 
-class Flow(Generator, ABC):
+class Flow(Generator):
     """A generator by an ODE. A subclass defines `velocity`.
 
     Attributes:
@@ -30,9 +29,9 @@ class Flow(Generator, ABC):
     plain = "euler"
     completers: ClassVar[tuple[Sampler, ...]] = (MMPS(),)
 
-    @abstractmethod
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
+        """v(t, x), (B, C, H, W), at times t of shape () or (B,); a flow map without it is drawn by jumps alone."""
+        raise NotImplementedError
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
         """u(t, x, s), the mean velocity from t to s; v(t, x) unless the flow is a flow map."""

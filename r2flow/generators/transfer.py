@@ -116,6 +116,7 @@ class TransferFlow(Flow):
             )
         self.rows = RowFeatures(space.rays[0, :, 0])
         self.elevations, self.numbered = space.rays[0, :, 0], True
+        self.foreign = False  # whether the scans are of another sensor than the training scans
         self.run_by(Jump(steps=1))
 
     def at(self, space: ModelSpace, numbered: bool = True) -> Self:
@@ -126,6 +127,7 @@ class TransferFlow(Flow):
         """
         part = copy(self)
         part.space, part.noise_shape, part.elevations = space, space.shape, space.rays[0, :, 0]
+        part.foreign = self.foreign or not numbered or space.sensor.name != self.space.sensor.name
         part.numbered = numbered and bool(self.rows.known(part.elevations[None]))
         return part
 
@@ -212,9 +214,9 @@ class TransferFlow(Flow):
         condition = {name: value.to(weight) for name, value in condition.items()}
         image, known = parts_of(condition, noise.to(weight))
         # Another sensor's intensities have another scale than those that the network has seen.
-        gain = self._gain(image, known) if self.space.encoding.reflectance and not self.numbered else None
+        gain = gain_of(self.space, image, known) if self.space.encoding.reflectance and self.foreign else None
         if gain is not None:
-            condition[IMAGE] = _scaled(image, gain)
+            condition[IMAGE] = scaled(image, gain)
         elevations = self.elevations.to(weight)[None].expand(len(image), -1)
         steps = steps_of(elevations, 2 * math.pi / image.shape[3])
         about = Surroundings.of(self.space, condition, True, steps)
@@ -223,16 +225,9 @@ class TransferFlow(Flow):
         generated = super().forward(start, {**condition, **about._asdict(), "rows": rows}, **how)
         nothing = encoded(self.space, torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1]))
         x = generated.x.to(image)
-        x = x if gain is None else _scaled(x, 1 / gain)
+        x = x if gain is None else scaled(x, 1 / gain)
         x = torch.where(_within_reach(known[:, :1]), x, nothing)
         return replace(generated, x=torch.where(known > 0, image, x))
-
-    def _gain(self, image: Tensor, known: Tensor) -> Tensor:
-        """Factor from each scan's mean reflectance to `REFLECTANCE`, (B, 1, 1, 1); 1 without known reflectance."""
-        metres = self.space.decode(image)
-        returned = (known[:, -1:] > 0) & (metres[:, :1] > 0)
-        total = (metres[:, 1:] * returned).sum((1, 2, 3), keepdim=True)
-        return torch.where(total > 0, REFLECTANCE * returned.sum((1, 2, 3), keepdim=True) / total, 1.0)
 
     def loss(
         self, x_1: Tensor, condition: Condition, t: Tensor, noise: Tensor, steps: Tensor, rows: Tensor
@@ -268,7 +263,15 @@ class TransferFlow(Flow):
         return losses
 
 
-def _scaled(image: Tensor, gain: Tensor) -> Tensor:
+def gain_of(space: ModelSpace, image: Tensor, known: Tensor) -> Tensor:
+    """Factor from each scan's mean reflectance to `REFLECTANCE`, (B, 1, 1, 1); 1 without known reflectance."""
+    metres = space.decode(image)
+    returned = (known[:, -1:] > 0) & (metres[:, :1] > 0)
+    total = (metres[:, 1:] * returned).sum((1, 2, 3), keepdim=True)
+    return torch.where(total > 0, REFLECTANCE * returned.sum((1, 2, 3), keepdim=True) / total, 1.0)
+
+
+def scaled(image: Tensor, gain: Tensor) -> Tensor:
     """An image in model space, (B, C, H, W), with its reflectance multiplied, at most 1."""
     return torch.cat([image[:, :-1], ((image[:, -1:] + 1) * gain).clamp(max=2) - 1], 1)
 

@@ -21,6 +21,7 @@ Kind = Literal["judged", "reference", "baseline"]
 ENDS = (" low", " high")  # suffixes of interval limits
 DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
 ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
+MARGIN = 1.25  # sets of the same source differ by as much
 HEADLINE = "panel"  # metric of the verdict, if measured
 AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
 
@@ -90,52 +91,52 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
 
 
 def verdict(comparisons: Sequence[Comparison]) -> list[str]:
-    """One sentence per judged set, the nearest first: its panel against real sets and the best baseline.
+    """One sentence per judged set, the nearest first: its panel next to those of real halves and the best baseline.
 
     Without the panel the first distance is taken. Distances but KID are larger for fewer scans: a set is compared with
-    real halves in as many scans as they have, if measured. Against a reference of other sizes one outcome decides.
+    real halves in as many scans as they have, if measured.
     """
     measured = [m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)]
     metric = HEADLINE if HEADLINE in measured else next(iter(measured), "")
-    found: dict[Kind, list[tuple[float, Comparison]]] = {"judged": [], "reference": [], "baseline": []}
-    equal: dict[str, tuple[float, Comparison]] = {}  # by judged set
+    found: dict[str, dict[str, tuple[float, Comparison]]] = {"judged": {}, "reference": {}, "baseline": {}}
     for one in comparisons:
         values = [next(iter(m.figures.values())) for m in one.measured if m.metric == metric]
         if values and math.isfinite(values[0]):
-            if one.kind == "reference" and one.name.endswith(AS_MANY):
-                equal[one.name.removesuffix(AS_MANY)] = values[0], one
-            else:
-                found[one.kind].append((values[0], one))
-    judged, real, baselines = (sorted(part, key=lambda pair: pair[0]) for part in found.values())
+            found[one.kind][one.name] = values[0], one
+    if HALVES not in found["reference"]:
+        return []
+    reference, halves = found["reference"][HALVES]
+    judged, baselines = (sorted(found[kind].values(), key=lambda pair: pair[0]) for kind in ("judged", "baseline"))
+    best = baselines[0][0] if baselines else math.inf
     title, factor = heading(metric, metric)
+    unbiased = metric.startswith("kid_")
     lines = []
-    for value, one in judged if real else []:
-        (reference, halves), best = real[-1], baselines[0][0] if baselines else math.inf
-        unbiased = metric.startswith("kid_") or halves.name != HALVES
-        compared, same = (value, one) if unbiased else equal.get(one.name, (value, one))
+    for value, one in judged:
+        compared, same = (value, one) if unbiased else found["reference"].get(f"{one.name}{AS_MANY}", (value, one))
         here, there = (min(len(pair.real), len(pair.generated)) for pair in (same, halves))
-        uneven = not metric.startswith("kid_") and (there > here if compared > reference else there < here)
-        if value >= best:
+        farther = compared > MARGIN * max(reference, 0)
+        if min(here, there) < ENOUGH:
+            order = f"{'above' if compared > reference else 'not above'} the real halves"
+            tells = f"{order}, {'below' if value < best else 'not below'} the baselines"
+            tells += (
+                f": an indication, as the halves of your {len(one.real)} real scans have {there} or more and the set "
+                f"has {len(one.generated)}: give {2 * ENOUGH} real and {ENOUGH} generated scans for a verdict"
+            )
+        elif value >= best:
             tells = "no nearer to the real scans than a baseline"
         elif reference >= best:
-            tells = "undecided, as the reference is above a baseline"
-        elif min(here, there) < ENOUGH:
-            tells = f"{'above' if compared > reference else 'not above'} the reference, below the baselines"
-            other = ", and the reference is of other numbers of scans" if uneven else ""
-            parts = "halves" if halves.name == HALVES else "two drives"
-            tells += (
-                f": an indication, as the {parts} of your {len(one.real)} real scans have {there} or more and the set "
-                f"has {len(one.generated)}{other}: give {2 * ENOUGH} real and {ENOUGH} generated scans for a verdict"
-            )
-        elif uneven:
-            tells = "undecided, as the reference is of other numbers of scans"
+            tells = "undecided, as the real halves are above a baseline"
+        elif not unbiased and (here < there if farther else here > there):
+            tells = f"undecided, as the halves have other numbers of scans: give {there} generated scans"
+        elif farther:
+            tells = "farther from the real scans than these are from each other"
         else:
-            farther = "farther from the real scans than these are from each other"
-            tells = farther if compared > reference else "not distinguishable from real scans by this figure"
-        known = [f"{c.title} {v * factor:.3g}" for v, c in (real[-1], *baselines[:1])]
+            tells = "not distinguishable from real scans by this figure"
+        known = [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
         if same is not one:
             known.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
-        first = "nearest, " if one is judged[0][1] and len(judged) > 1 else ""
+        equal = len(judged) > 1 and len({len(c.generated) for _, c in judged}) == 1
+        first = "nearest, " if equal and one is judged[0][1] else ""
         lines.append(f"{one.name}: {first}{title} {value * factor:.3g} ({', '.join(known)}): {tells}.")
     return lines
 

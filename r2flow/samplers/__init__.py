@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from r2flow.errors import check
 from r2flow.flow.solvers import SOLVERS, usual_grid
 from r2flow.registry import Registry, lazy
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _with_steps
@@ -87,5 +88,6 @@ def _plain(text: str) -> Any:
 def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
     """Build a sampler from name and fields, or from a text (`parse_sampler`). `steps` follows from a grid of times."""
     options = parse_sampler(options) if isinstance(options, str) else options
+    check(isinstance(options, Mapping), f"a sampler needs a 'name' and its fields, found {options!r}.")
     sampler: Sampler = SAMPLERS.build(_with_steps({k: v for k, v in {**options, **fields}.items() if v is not None}))
     return sampler

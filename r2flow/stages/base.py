@@ -46,7 +46,7 @@ class Stage(L.LightningModule):
         learns: Class of the generators that it can train.
         config: The run's config, which its checkpoints store.
         gradient_clip_val: Gradient clipping of the run, for a stage with manual optimisation.
-        further: Makes additional batch entries of x_1, (C, H, W), and draws of each image, in the loader's workers.
+        further: Makes additional batch entries of x_1, (C, H, W), its sensor and draws of each image, in the loader.
     """
 
     learns: ClassVar[type[Generator]] = Generator

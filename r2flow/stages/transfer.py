@@ -14,7 +14,7 @@ from r2flow.errors import InputError
 from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
 from r2flow.generators.surroundings import steps_of
-from r2flow.generators.transfer import WEIGHTS
+from r2flow.generators.transfer import WEIGHTS, gain_of, scaled
 from r2flow.lidar.known import every_row, random_points, random_rows
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.lidar.space import ModelSpace
@@ -55,6 +55,8 @@ class Tasks:
             sensor: Sensor of the scan x_1.
         """
         space = own if sensor == own.sensor else own.through(sensor)
+        if sensor != own.sensor and space.encoding.reflectance:  # as in use: the intensities of sensors differ
+            x_1 = scaled(x_1[None], gain_of(space, x_1[None], torch.ones_like(x_1[None])))[0]
         halve, silent, unnumbered, top, left = draws.random(5)
         elevations = space.rays[0, :, 0]
         if halve < self.halved and x_1.shape[1] >= 2 * self.rows and x_1.shape[2] >= 4 * self.columns:

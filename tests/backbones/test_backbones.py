@@ -53,7 +53,7 @@ def test_scalar_and_batched_times_agree(name):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("t", [torch.rand(2), torch.rand(3, 1)])
 def test_times_of_another_shape_are_refused(name, t):
-    with pytest.raises(AssertionError, match=r"t must be a scalar or of shape \(3,\), found \((2,|3, 1)\)"):
+    with pytest.raises(InputError, match=r"t must be a scalar or of shape \(3,\), found \((2,|3, 1)\)"):
         tiny(name)(t, image(3))
 
 
