@@ -138,7 +138,7 @@ def at_most_three(texts: Sequence[str]) -> str:
 
 
 def check_tree(config: Mapping[str, Any]) -> None:
-    """Raise an error for a config that contains itself, possible in YAML and pickles, or lacks a group of keys."""
+    """Raise an error for a config that contains itself, as YAML and pickles can, or whose groups are not groups."""
     json.dumps(config, skipkeys=True, default=str)
     for key in ("stage", "data", "trainer"):
         if not isinstance(config.get(key) or {}, Mapping):

@@ -182,10 +182,9 @@ def completion(
     loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or [DENSIFY]}
     stored = own_reading(real)
     for name, model in loaded.items():
-        told = stored is not None and isinstance(model.generator, TransferFlow)
-        if sensor or size or told:
-            own = stored.sensor if stored and told else model.sensor
-            loaded[name] = model.through(named_sensor(sensor or own, rows_and_columns(size)))
+        other = stored.sensor if stored and isinstance(model.generator, TransferFlow) else None
+        if sensor or size or other:
+            loaded[name] = model.through(named_sensor(sensor or other or model.sensor, rows_and_columns(size)))
     ways = [
         Way(name, model, completing(model.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
         for name, model in loaded.items()

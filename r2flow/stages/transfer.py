@@ -55,7 +55,7 @@ class Tasks:
             sensor: Sensor of the scan x_1.
         """
         space = own if sensor == own.sensor else own.through(sensor)
-        if sensor != own.sensor and space.encoding.reflectance:  # as in use: the intensities of sensors differ
+        if sensor.name != own.sensor.name and space.encoding.reflectance:  # as in use: intensities of sensors differ
             x_1 = scaled(x_1[None], gain_of(space, x_1[None], torch.ones_like(x_1[None])))[0]
         halve, silent, unnumbered, top, left = draws.random(5)
         elevations = space.rays[0, :, 0]
