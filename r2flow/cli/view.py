@@ -49,9 +49,11 @@ def show(
     how: ReadingOptions,
     most: Annotated[int, typer.Option("--num", min=1, help="Maximum number of scans per folder.")] = SCANS,
     labels: Annotated[bool, typer.Option("--labels", help="Also draw classes of .label files.")] = False,
-    format: Annotated[Literal["png", "npy"], typer.Option(help="png: pictures; npy: range images, (2, H, W).")] = "png",
+    format: Annotated[
+        Literal["png", "pdf", "npy"], typer.Option(help="png, pdf: pictures; npy: range images, (2, H, W).")
+    ] = "png",
 ) -> None:
-    """Draw each scan as a PNG (range, reflectance, bird's-eye view, perspective), or write range images."""
+    """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write range images."""
     from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure
 

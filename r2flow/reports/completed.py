@@ -192,5 +192,6 @@ def _draw(
     names, images = zip(*named, strict=True)
     write_page(out / f"{scan.name}.html", images, rays, names, title=scan.name)
     spread = completed.spread.numpy() if len(completed.images) > 1 else None
-    figure = completed_figure([first, *answers[:2], *whole], given.state == Ray.UNKNOWN, rays, scan.name, spread)
+    true = truth.image if truth else None
+    figure = completed_figure([first, *answers[:2]], given.state == Ray.UNKNOWN, rays, scan.name, spread, true)
     save_figure(figure, out / f"{scan.name}.png")

@@ -140,5 +140,4 @@ def pictured(truth: np.ndarray, shown: Sequence[tuple[Mapping[str, Any], np.ndar
     task = shown[0][0]["task"]
     measured = measured_by(task, sensor, 0)
     answers = [(row["method"], image) for row, image in shown if row["task"] == task]
-    rows = [(f"measured, {task}", truth * measured), *answers, ("truth", truth)]
-    return completed_figure(rows, ~measured, sensor.rays())
+    return completed_figure([(f"measured, {task}", truth * measured), *answers], ~measured, sensor.rays(), truth=truth)

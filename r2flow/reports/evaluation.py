@@ -14,7 +14,7 @@ from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
 from r2flow.evaluation.references import AS_MANY, HALVES
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
-from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
+from r2flow.reports.pictures import draw_range
 from r2flow.reports.tables import print_table, shown, table
 
 Kind = Literal["judged", "reference", "baseline"]
@@ -349,12 +349,11 @@ def copies_figure(nearest: Mapping[str, Nearest], training: ScanSet, pairs: int 
     """Draw the scans of each set nearest to training scans, next to the aligned training scan."""
     chosen = [(name, copies, int(i)) for name, copies in nearest.items() for i in np.argsort(copies.distances)[:pairs]]
     figure = blank_figure(14, 0.9 * len(chosen) + 0.2)
-    figure.set_facecolor(BACKGROUND)
     panels = figure.subplots(len(chosen), 2, squeeze=False)
     for (left, right), (name, copies, place) in zip(panels, chosen, strict=True):
         number = int(copies.numbers[place])
         draw_range(left, copies.scans.source[number], label=False)
         draw_range(right, copies.match(place, training), label=False)
         title = f"{name} {number}: {shown(float(copies.distances[place]))} away"
-        left.set_title(title, color=FOREGROUND, fontsize=8, pad=2)
+        left.set_title(title, fontsize=8, pad=2)
     return figure

@@ -16,8 +16,6 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.outputs import ScanBar, warn_unsolved, write_scan
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import (
-    FOREGROUND,
-    dark_figure,
     draw_birds_eye,
     draw_perspective,
     draw_range,
@@ -33,7 +31,7 @@ PANELS = {
     "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
     "reflectance": draw_reflectance,
 }  # fmt: skip
-REAL = "#ffd479"
+REAL = "#c2410c"
 BETWEEN = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
 ENDS = {
     "scan": "scan", "rms": "RMS, model space", "median_m": "median, m", "dropped": "rays lost or gained",
@@ -97,17 +95,17 @@ def interpolation_figure(
     between = [("round trip" if i in (0, last) else f"w = {weights[i]:.2f}", frames[i]) for i in chosen]
     columns = [(f"real: {names[0]}", real[0]), *between, (f"real: {names[1]}", real[1])]
     heights = [1.15, 1.6, *[0.5] * real.shape[1]]
-    figure = dark_figure(2.45 * len(columns), 1.55 * sum(heights) + 0.45)
+    figure = Figure((1.4 * len(columns), 0.9 * sum(heights) + 0.4), facecolor="white")
     figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
     panels = figure.subplots(len(heights), len(columns), squeeze=False, height_ratios=heights)
     for place, (title, image) in enumerate(columns):
         xyz, _ = image_to_points(image, rays)
-        colour = REAL if place in (0, len(columns) - 1) else FOREGROUND
+        colour = REAL if place in (0, len(columns) - 1) else "black"
         for axes, (name, draw) in zip(panels[:, place], PANELS.items(), strict=False):
             draw(axes, xyz if name in ("perspective", "bird's-eye view") else image, label=False)
             if place == 0:
-                axes.set_ylabel(name, color=FOREGROUND, fontsize=8)
+                axes.set_ylabel(name, fontsize=7)
             if colour == REAL:
                 axes.spines[:].set(visible=True, color=REAL, linewidth=1.2)
-        panels[0, place].set_title(title, color=colour, fontsize=9, pad=4)
+        panels[0, place].set_title(title, color=colour, fontsize=7, pad=3)
     return figure

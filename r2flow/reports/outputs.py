@@ -195,9 +195,11 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str
 
 def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> None:
     """Write `samples.png` of scans without range, (1, h, w) each: reflectance images in a column."""
-    from r2flow.reports.pictures import dark_figure, draw_reflectance, save_figure
+    from matplotlib.figure import Figure
 
-    figure = dark_figure(13, 1.2 * len(images) + 0.3)
+    from r2flow.reports.pictures import WIDTH, draw_reflectance, save_figure
+
+    figure = Figure((WIDTH, 0.7 * len(images) + 0.3), facecolor="white")
     figure.set_layout_engine("constrained")
     axes: Any = figure.subplots(len(images), 1, squeeze=False)[:, 0]
     for row, (image, place) in enumerate(zip(images, axes, strict=True)):

@@ -44,7 +44,7 @@ class Page:
         name: Stem of the files, such as `solvers`.
         text: Paragraphs and tables of Markdown.
         rows: One row per measurement, for the CSV and the `rows` of the JSON.
-        figures: Figures by name, written as `NAME.png`.
+        figures: Figures by name, written as `NAME.png` and `NAME.pdf`.
         command: Command that reproduces the page.
         seeds: All seeds, by purpose.
         device: Device of the networks.
@@ -63,13 +63,14 @@ class Page:
 
 
 def write_page(page: Page, out: str | Path) -> list[Path]:
-    """Write `out/NAME.png ...`, `NAME.csv`, `NAME.json` and `NAME.md` atomically; returns the files."""
+    """Write `out/NAME.png ...`, `NAME.pdf`, `NAME.csv`, `NAME.json` and `NAME.md` atomically; returns the files."""
     out, origin = Path(out), provenance(page)
     # Figures carry their provenance; PNG notes only support Latin-1.
     note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
     written = [
-        save_figure(figure, out / f"{name}.png", 100, Title=page.title, Description=note)
+        save_figure(figure, out / f"{name}.{ending}", Title=page.title, Subject=note)
         for name, figure in page.figures.items()
+        for ending in ("png", "pdf")
     ]
     contents = {
         "csv": _csv(page.rows, origin),

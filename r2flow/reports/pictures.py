@@ -1,6 +1,6 @@
-"""Scans as pictures: range, reflectance, bird's-eye view, 3-D perspective."""
+"""Scans as pictures in the width of a paper's page: range, reflectance, bird's-eye view, 3-D perspective."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
@@ -19,7 +19,7 @@ from r2flow.files import atomic_write
 from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
 
-BACKGROUND, FOREGROUND = "#101418", "#d8dee4"
+WIDTH = 7.16  # inches: two columns of an IEEE paper
 VIEW = 50.0  # metres shown to each side in the bird's-eye view
 HEIGHTS = (-2.8, 3.0)  # metres over which height is coloured, sensor frame
 RANGES = (2.0, 80.0)  # metres over which range is coloured, on a logarithmic scale
@@ -27,11 +27,11 @@ RANGES = (2.0, 80.0)  # metres over which range is coloured, on a logarithmic sc
 
 def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.ndarray | None = None) -> Figure:
     """Draw one scan, with an extra row for semantic ids of pixels, (H, W)."""
-    figure = dark_figure(13, 8.6 if labels is None else 9.6)
+    figure = Figure((WIDTH, 4.6 if labels is None else 5.2), facecolor="white")
     strips = len(image) + (labels is not None)
     grid = figure.add_gridspec(
-        strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.16, wspace=0.06,
-        left=0.03, right=0.97, top=0.93, bottom=0.03, width_ratios=[1, 1.45],
+        strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.28, wspace=0.04,
+        left=0.01, right=0.925, top=0.89, bottom=0.01, width_ratios=[1, 1.45],
     )  # fmt: skip
     draw_range(figure.add_subplot(grid[0, :]), image)
     if len(image) > 1:
@@ -44,19 +44,19 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.nda
     returned = image[0] > 0
     size = " x ".join(map(str, returned.shape))
     about = f"{title}   {size}, {returned.sum():,} returns ({returned.mean():.0%})".strip()
-    figure.suptitle(about, color=FOREGROUND, fontsize=11, x=0.03, ha="left")
+    figure.suptitle(about, fontsize=8, x=0.01, ha="left")
     return figure
 
 
 def contact_sheet(images: Sequence[np.ndarray], rays: Tensor, titles: Sequence[str] = ()) -> Figure:
     """Draw several scans, one per row: images on the left, bird's-eye view and perspective on the right."""
-    figure, grid = _sheet([2.5] * len(images), space=0.12, top=0.3)
+    figure, grid = _sheet([1.2] * len(images), space=0.12, top=0.18)
     for row, (image, title) in enumerate(zip_longest(images, titles)):
         first, *_ = _draw_row(figure, grid, row, image, rays)
         if title is not None:
             first.text(
-                0.004, 0.94, title, transform=first.transAxes, va="top", fontsize=8, color="white",
-                bbox={"facecolor": BACKGROUND, "edgecolor": "none", "alpha": 0.7, "pad": 1.5},
+                0.004, 0.94, title, transform=first.transAxes, va="top", fontsize=6,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1},
             )  # fmt: skip
     return figure
 
@@ -67,49 +67,62 @@ def completed_figure(
     rays: Tensor,
     title: str = "",
     spread: np.ndarray | None = None,
+    truth: np.ndarray | None = None,
 ) -> Figure:
-    """Draw the known rays of a scan, its answers and their spread.
+    """Draw the known rays of a scan, its answers with their errors in metres, the truth and the answers' spread.
 
     Args:
         rows: Name and image, (2 or 1, H, W), of each; the known rays first.
         unknown: Rays that were not measured, (H, W) bool; drawn in grey.
         spread: Standard deviation of the range in metres and share of answers with a return, (2, H, W).
+        truth: The whole scan, (2 or 1, H, W).
     """
-    figure, grid = _sheet([2.4] * len(rows) + [1.3] * (spread is not None), space=0.16, top=0.5)
-    grey = np.where(unknown[..., None], np.array([0.45, 0.45, 0.45, 1.0]), 0.0)
     channels = max(len(image) for _, image in rows)  # answers may have reflectance where the scan has none
-    for row, (name, image) in enumerate(rows):
-        strips = _draw_row(figure, grid, row, image, rays, channels)
-        legend = " (grey: not measured, black: measured without a return)" if row == 0 else ""
-        strips[0].set_title(f"{name}: range{legend}", color=FOREGROUND, fontsize=8, loc="left", pad=3)
+    errors = [None, *(None if truth is None else _error(image, truth, unknown) for _, image in rows[1:])]
+    shown = [(name, image, error) for (name, image), error in zip(rows, errors, strict=True)]
+    shown += [] if truth is None else [("truth", truth, None)]
+    heights = [0.58 * (channels + (error is not None)) for *_, error in shown] + [0.62] * (spread is not None)
+    figure, grid = _sheet(heights, space=0.2, top=0.34)
+    for row, (name, image, error) in enumerate(shown):
+        strips = _draw_row(figure, grid, row, image, rays, channels, error)
+        legend = " (grey: not measured, black: no return)" if row == 0 else ""
+        strips[0].set_title(f"{name}: range, m{legend}", fontsize=7, loc="left", pad=2)
         for axes in strips if row == 0 else ():
-            axes.imshow(grey, aspect="auto", interpolation="nearest")
+            axes.imshow(np.where(unknown[..., None], (0.6, 0.6, 0.6, 1), 0), aspect="auto", interpolation="nearest")
     if spread is not None:
-        shown = ("deviation of the range, 0 to 5 m", 5.0), ("share of answers with a return, 0 to 1", 1.0)
-        for (name, most), values, place in zip(shown, spread, (grid[-1, 0], grid[-1, 1:]), strict=True):
-            axes = figure.add_subplot(place)
-            axes.imshow(values, cmap="magma", vmin=0, vmax=most, aspect="auto", interpolation="nearest")
-            _strip(axes, name)
-    figure.suptitle(title, color=FOREGROUND, fontsize=11, x=0.01, ha="left", y=0.995)
+        names = ("deviation of the range, m", 5), ("share of answers with a return", 1)
+        for (name, most), values, place in zip(names, spread, (grid[-1, 0], grid[-1, 1:]), strict=True):
+            _show(figure.add_subplot(place), values, name, "YlOrRd", {0: 0, most: most})
+    figure.suptitle(title, fontsize=8, x=0.01, ha="left", y=0.995)
     return figure
 
 
+def _error(image: np.ndarray, truth: np.ndarray, unknown: np.ndarray) -> np.ndarray:
+    """Absolute error of the range of unknown rays that return in both, else masked, (H, W)."""
+    return np.ma.masked_where(~unknown | (image[0] <= 0) | (truth[0] <= 0), np.abs(image[0] - truth[0]))
+
+
 def _sheet(heights: Sequence[float], space: float, top: float) -> tuple[Figure, Any]:
-    """Dark figure with a row per scan, heights in inches, and columns of images, bird's-eye view and perspective."""
-    figure = dark_figure(15, sum(heights))
+    """Figure with a row per scan, heights in inches, and columns of images, bird's-eye view and perspective."""
+    figure = Figure((WIDTH, sum(heights) + top), facecolor="white")
     grid = figure.add_gridspec(
-        len(heights), 3, width_ratios=[2.6, 0.9, 1.3], height_ratios=heights, hspace=space, wspace=0.03,
-        left=0.01, right=0.99, top=1 - top / sum(heights), bottom=0.01,
+        len(heights), 3, width_ratios=[2.6, 0.9, 1.3], height_ratios=heights, hspace=space, wspace=0.11,
+        left=0.01, right=0.94, top=1 - top / (sum(heights) + top), bottom=0.02,
     )  # fmt: skip
     return figure, grid
 
 
-def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tensor, strips_of: int = 0) -> list[Any]:
+def _draw_row(
+    figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tensor, strips_of: int = 0, error: Any = None
+) -> list[Any]:
     """Draw one scan in a row of a sheet with space for `strips_of` channels; return the axes of its channels."""
-    cells = grid[row, 0].subgridspec(max(strips_of, len(image)), 1, hspace=0.18)
+    cells = grid[row, 0].subgridspec(max(strips_of, len(image)) + (error is not None), 1, hspace=0.25)
     strips = [figure.add_subplot(cells[channel]) for channel in range(len(image))]
     for axes, draw in zip(strips, (draw_range, draw_reflectance), strict=False):
         draw(axes, image, label=row == 0)
+    if error is not None:
+        scale, title = colormaps["YlOrRd"].with_extremes(bad="0.8"), "error of the range, m (grey: not compared)"
+        _show(figure.add_subplot(cells[-1]), error, title, scale, {0: 0, 1: 1, 2: 2})
     xyz, _ = image_to_points(image, rays)
     draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, label=row == 0)
     draw_perspective(figure.add_subplot(grid[row, 2]), xyz, label=row == 0)
@@ -118,18 +131,25 @@ def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tens
 
 def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Draw range on a logarithmic colour scale, dropped rays black."""
-    _draw_channel(axes, image, "range", np.log(np.maximum(image[0], 1e-3)), np.log(RANGES), label)
+    shown = np.ma.masked_where(image[0] <= 0, np.log(np.maximum(image[0], 1e-3)))
+    _show(
+        axes, shown, "range, m" if label else "", colours("range"), {r: np.log(r) for r in (RANGES[0], 10, RANGES[1])}
+    )
 
 
 def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Draw the square root of reflectance in [0, 1] from blue to yellow, dropped rays black."""
-    _draw_channel(axes, image, "reflectance", np.sqrt(np.clip(image[1], 0, 1)), (0, 0.9), label)
+    shown = np.ma.masked_where(image[0] <= 0, np.sqrt(np.clip(image[1], 0, 1)))
+    _show(axes, shown, "reflectance" if label else "", colours("reflectance"), {0: 0.0, 0.2: 0.2**0.5, 0.81: 0.9})
 
 
-def _draw_channel(axes: Any, image: np.ndarray, what: str, shown: np.ndarray, limits: Any, label: bool) -> None:
-    shown = np.ma.masked_where(image[0] <= 0, shown)
-    axes.imshow(shown, cmap=colours(what), vmin=limits[0], vmax=limits[1], aspect="auto", interpolation="nearest")
-    _strip(axes, what if label else "")
+def _show(axes: Any, values: np.ndarray, title: str, cmap: Any, ticks: Mapping[float, float]) -> None:
+    """Draw values as an image, with a colour bar from the first to the last tick if there is a title."""
+    first, *_, last = ticks.values()
+    drawn = axes.imshow(values, cmap=cmap, vmin=first, vmax=last, aspect="auto", interpolation="nearest")
+    _strip(axes, title)
+    if title:
+        _bar(axes, drawn, ticks)
 
 
 def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
@@ -142,10 +162,10 @@ def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
         entries.setdefault(name, colour)
     axes.imshow(shown, aspect="auto", interpolation="nearest")
     _strip(axes, "labels")
-    x = 0.05
-    for name, colour in list(entries.items())[:14]:  # as many as fit, most frequent first
-        axes.text(x, 1.03, name, transform=axes.transAxes, color=colour, fontsize=8, va="bottom")
-        x += 0.012 + 0.0052 * len(name)
+    x = 0.07
+    for name, colour in list(entries.items())[:9]:  # as many as fit, most frequent first
+        axes.text(x, 1.03, name, transform=axes.transAxes, color=colour, fontsize=7, va="bottom")
+        x += 0.012 + 0.0082 * len(name)
 
 
 def class_colours(labels: np.ndarray, most: int | None = None) -> dict[int, tuple[str, str]]:
@@ -168,11 +188,11 @@ def _numbered_colour(number: int) -> str:
 def draw_birds_eye(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
     """Draw points from above, driving direction upwards, coloured by height."""
     x, y, z = xyz[(np.abs(xyz[:, :2]) < VIEW).all(axis=1)].T
-    dot = float(np.clip(20_000 / max(len(x), 1), 0.25, 3.0))
+    dot = float(np.clip(6_000 / max(len(x), 1), 0.2, 1.0))
     axes.scatter(-y, x, c=z, s=dot, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
     axes.set(xlim=(-VIEW, VIEW), ylim=(-VIEW, VIEW), aspect="equal")
-    axes.plot(0, 0, marker="^", color="white", ms=4)
-    _strip(axes, f"bird's-eye view, {2 * VIEW:.0f} m" if label else "")
+    axes.plot(0, 0, marker="^", color="black", ms=3)
+    _strip(axes, f"bird's-eye view, {2 * VIEW:.0f} m" if label else "", "white")
 
 
 def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
@@ -187,10 +207,12 @@ def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
     relative, depth, z = relative[front], depth[front], xyz[front, 2]
     order = np.argsort(-depth)
     u, v = (-relative[:, 1] / depth)[order], (relative @ up / depth)[order]
-    size = np.clip(18 / depth[order], 0.25, 2.6) * np.sqrt(30_000 / max(len(xyz), 1))
-    axes.scatter(u, v, c=z[order], s=size, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
-    axes.set(xlim=(-0.95, 0.95), ylim=(-0.52, 0.42))
-    _strip(axes, "perspective" if label else "")
+    size = np.clip(7 / depth[order], 0.2, 0.8) * np.sqrt(30_000 / max(len(xyz), 1))
+    dots = axes.scatter(u, v, c=z[order], s=size, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
+    axes.set(xlim=(-0.95, 0.95), ylim=(-0.62, 0.48), aspect="equal")
+    _strip(axes, "perspective, colour: height, m" if label else "", "white")
+    if label:
+        _bar(axes, dots, {z: z for z in (-2, 0, 2)})
 
 
 def take_names_as_they_are(figure: Figure) -> None:
@@ -202,27 +224,22 @@ def take_names_as_they_are(figure: Figure) -> None:
             text.set_parse_math(False)
 
 
-def save_figure(figure: Figure, path: str | Path, dpi: int = 110, **notes: str) -> Path:
-    """Write a PNG with notes, atomically."""
+def save_figure(figure: Figure, path: str | Path, dpi: int = 300, **notes: str) -> Path:
+    """Write a PNG or PDF with notes, as PDF knows them, atomically."""
     path = Path(path)
     take_names_as_they_are(figure)
     with atomic_write(path) as file:
-        figure.savefig(file, format="png", dpi=dpi, facecolor=figure.get_facecolor(), metadata=notes)
+        figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata=notes)
     return path
 
 
-def figure_pixels(figure: Figure, dpi: int = 80) -> np.ndarray:
+def figure_pixels(figure: Figure, dpi: int = 160) -> np.ndarray:
     """Render the figure as (height, width, 3) uint8."""
     take_names_as_they_are(figure)
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def dark_figure(width: float, height: float) -> Figure:
-    """Create an empty figure for scans, sized in inches."""
-    return Figure(figsize=(width, height), facecolor=BACKGROUND)
 
 
 @cache
@@ -234,8 +251,16 @@ def colours(what: str) -> Any:
     return scale.with_extremes(bad="black")
 
 
-def _strip(axes: Any, title: str) -> None:
-    axes.set(xticks=[], yticks=[], facecolor="black")
-    axes.spines[:].set_visible(False)
+def _strip(axes: Any, title: str, background: str = "black") -> None:
+    axes.set(xticks=[], yticks=[], facecolor=background)
+    axes.spines[:].set(color="0.7", linewidth=0.5)
     if title:
-        axes.set_title(title, color=FOREGROUND, fontsize=8, loc="left", pad=3)
+        axes.set_title(title, fontsize=7, loc="left", pad=2)
+
+
+def _bar(axes: Any, drawn: Any, ticks: Mapping[float, float]) -> None:
+    """Colour bar at the right edge of the axes."""
+    bar = axes.figure.colorbar(drawn, cax=axes.inset_axes((1.012, 0, 0.014, 1)))
+    bar.set_ticks([*ticks.values()], labels=[f"{tick:g}" for tick in ticks])
+    bar.outline.set_linewidth(0.5)
+    bar.ax.tick_params(labelsize=6, length=2, width=0.5, pad=1)

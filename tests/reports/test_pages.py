@@ -29,11 +29,11 @@ def page(**changes) -> Page:
 
 def test_a_page_is_a_figure_a_csv_a_json_and_markdown(tmp_path):
     written = write_page(page(), tmp_path / "new")
-    assert [path.name for path in written] == ["speed.png", "speed.csv", "speed.json", "speed.md"]
+    assert [path.name for path in written] == ["speed.png", "speed.pdf", "speed.csv", "speed.json", "speed.md"]
     assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(written)  # no temporary file stays
     png = written[0].read_bytes()
     assert png.startswith(b"\x89PNG")
-    assert struct.unpack(">II", png[16:24]) == (300, 200)
+    assert struct.unpack(">II", png[16:24]) == (900, 600)  # 3 x 2 inches, 300 dpi
 
 
 def test_every_file_says_where_it_comes_from(tmp_path):

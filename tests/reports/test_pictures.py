@@ -12,11 +12,6 @@ def image(r: np.ndarray) -> np.ndarray:
     return np.stack([r, 0.5 * (r > 0)]).astype(np.float32)
 
 
-def lit(pixels: np.ndarray) -> int:
-    """Pixels that are brighter than any background here."""
-    return int((pixels.max(-1) > 90).sum())
-
-
 @pytest.mark.parametrize(
     "r",
     [np.zeros_like(E), np.where((E < -0.3) & (A > 3.0), 5.0, 0.0), np.full_like(E, 79.9), np.full_like(E, 1.45)],
@@ -34,6 +29,28 @@ def test_known_rays_without_reflectance_are_as_high_as_answers_with_it():
     assert known.get_position().height == pytest.approx(answer.get_position().height)
 
 
+def test_the_error_of_an_answer_is_in_metres_where_hidden_rays_return_in_both():
+    truth, answer = np.full_like(E, 10.0), np.full_like(E, 11.5)
+    answer[:, :8], truth[:, 8:16] = 0, 0
+    hidden = np.arange(len(E))[:, None] % 2 == np.ones_like(E)
+    figure = completed_figure(
+        [("known", image(truth * ~hidden)), ("answer", image(answer))], hidden, SENSOR.rays(), truth=image(truth)
+    )
+    (axes,) = (axes for axes in figure.axes if axes.get_title("left").startswith("error"))
+    shown = axes.images[0].get_array()
+    assert (shown.mask == ~(hidden & (np.arange(64) >= 16))).all()
+    assert (shown.compressed() == 1.5).all()
+    (bar,) = (bar for bar in axes.child_axes if bar.get_yticks().size)
+    assert [text.get_text() for text in bar.get_yticklabels()] == ["0", "1", "2"]
+
+
+def test_a_picture_is_as_wide_as_a_page_and_white(tmp_path):
+    figure = scan_figure(image(np.full_like(E, 10.0)), SENSOR.rays())
+    assert figure.get_figwidth() == pytest.approx(7.16)
+    assert (figure_pixels(figure)[[0, -1]] == 255).all()
+    assert save_figure(figure, tmp_path / "scan.pdf").read_bytes().startswith(b"%PDF")
+
+
 def test_near_and_far_look_different_and_dropped_rays_are_black():
     half = np.where(A > 0, 4.0, 60.0)
     half[:, 24:40] = 0
@@ -47,11 +64,14 @@ def test_near_and_far_look_different_and_dropped_rays_are_black():
 
 def test_a_wall_on_the_left_is_drawn_on_the_left():
     wall = np.where((A > 1.2) & (A < 1.9), 20.0, 0.0)
-    pixels = figure_pixels(scan_figure(image(wall), SENSOR.rays()))
-    height, width = pixels.shape[:2]
-    birds_eye = pixels[int(height * 0.42) :, : int(width * 0.4)]
-    middle = birds_eye.shape[1] // 2
-    assert lit(birds_eye[:, : middle - 20]) > 10 * max(lit(birds_eye[:, middle + 20 :]), 1)
+    pixels = figure_pixels(figure := scan_figure(image(wall), SENSOR.rays()))
+    (axes,) = (axes for axes in figure.axes if axes.get_title("left").startswith("bird's-eye"))
+    box, (height, width) = axes.get_position(), pixels.shape[:2]
+    left, right, top, bottom = box.x0 * width, box.x1 * width, (1 - box.y1) * height, (1 - box.y0) * height
+    drawn = (pixels[int(top) + 4 : int(bottom) - 4, int(left) + 4 : int(right) - 4] < 200).any(-1)
+    middle = drawn.shape[1] // 2
+    assert drawn[:, : middle - 20].sum() > 50
+    assert drawn[:, middle + 20 :].sum() == 0
 
 
 def test_labels_are_a_row_of_their_classes_colours():
