@@ -106,7 +106,7 @@ def _sheet(heights: Sequence[float], space: float, top: float) -> tuple[Figure, 
     """Figure with a row per scan, heights in inches, and columns of images, bird's-eye view and perspective."""
     figure = Figure((WIDTH, sum(heights) + top), facecolor="white")
     grid = figure.add_gridspec(
-        len(heights), 3, width_ratios=[2.6, 0.9, 1.3], height_ratios=heights, hspace=space, wspace=0.11,
+        len(heights), 3, width_ratios=[2.6, 0.9, 1.3], height_ratios=heights, hspace=space, wspace=0.13,
         left=0.01, right=0.94, top=1 - top / (sum(heights) + top), bottom=0.02,
     )  # fmt: skip
     return figure, grid

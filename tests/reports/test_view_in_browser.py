@@ -78,6 +78,12 @@ def screen(shown) -> np.ndarray:
     return np.asarray(Image.open(BytesIO(shown.screenshot())).convert("RGB")).astype(int)
 
 
+def colour_by(shown, mode: str) -> None:
+    shown.locator("#modes button", has_text=mode).click()
+    shown.locator("#tiles").focus()
+    settle(shown)
+
+
 def camera_of(shown) -> dict:
     return shown.evaluate("() => ({...window.view.camera})")
 
@@ -116,6 +122,7 @@ def colour_of_range(r: float) -> np.ndarray:
 @pytest.mark.parametrize("keys", [[], ["ArrowLeft"] * 4 + ["ArrowUp"] * 2, ["t"]], ids=["first", "turned", "above"])
 def test_points_are_drawn_where_the_camera_sees_them_in_the_colour_of_their_range(opened, keys):
     shown = opened([lone()], RAYS)
+    colour_by(shown, "range")
     for key in keys:
         shown.keyboard.press(key)
     settle(shown)
@@ -137,6 +144,7 @@ def test_the_image_below_is_the_range_image(opened):
     image = np.random.default_rng(0).uniform(2, 80, (1, *SENSOR.shape)).astype(np.float32)
     image[0, :, ::3] = 0
     shown = opened([image], RAYS)
+    colour_by(shown, "range")
     box, pixels = shown.locator(".image").bounding_box(), screen(shown)
     for row in range(16):
         for column in range(64):

@@ -796,7 +796,7 @@ async function start() {
   }
   prepare();
   page.scans.forEach(buildTile);
-  setMode(MODES[0]);
+  setMode("height");
   canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
   canvas.addEventListener("webglcontextrestored", () => {
     into = null;
