@@ -109,7 +109,8 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):
     how = ("-o", out, "--steps", 4, "--num", 2)
     code, said, _ = r2flow("report", "curvature", path, copy, *how)
     assert code == 0
-    names = {"curvature.png", "trajectories.png", "curvature.csv", "curvature.json", "curvature.md"}
+    figures = {f"{name}.{end}" for name in ("curvature", "trajectories") for end in ("png", "pdf")}
+    names = figures | {"curvature.csv", "curvature.json", "curvature.md"}
     assert {file.name for file in out.iterdir()} == names
     assert str(out / "curvature.md") in said
     content = json.loads((out / "curvature.json").read_text())

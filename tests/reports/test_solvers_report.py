@@ -128,7 +128,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):
         "--budgets", "2,4", "--problems", "gaussian,rotating",
     )  # fmt: skip
     assert code == 0
-    figures = {"solvers.png", "solvers_problems.png"}
+    figures = {f"{name}.{end}" for name in ("solvers", "solvers_problems") for end in ("png", "pdf")}
     assert {path.name for path in out.iterdir()} == figures | {f"solvers.{end}" for end in ("csv", "json", "md")}
     assert f"**{saved[0]}**, 2 scans, against its reference solution" in said
     with (out / "solvers.csv").open() as file:
