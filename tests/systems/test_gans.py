@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,9 +26,10 @@ from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.systems.gan import dcgan, losses, style_gan
 from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, affine, coloured, transformed
-from r2flow.systems.gan.generator import DustyV1
+from r2flow.systems.gan.dcgan import DustyV1, VanillaGan
 from r2flow.systems.gan.layers import logistic, straight_through_mask
 from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
+from r2flow.systems.gan.style_gan import DustyV2
 from r2flow.training import compose
 from tests.conftest import ROOT
 from tests.reference import load_case
@@ -48,17 +50,22 @@ def relative(found: Tensor, expected: Tensor) -> float:
     return float(((found - expected).abs().max() / expected.abs().max()).detach())
 
 
+def space(rows: int, columns: int, channels: int = 1) -> Any:
+    """What a GAN reads of a model space."""
+    return SimpleNamespace(shape=(channels, rows, columns), rays=torch.zeros(2, rows, columns))
+
+
 def generator_of(cfg: Mapping[str, Any]) -> nn.Module:
     """The network of a published `cfg.model.generator`."""
     synthesis, mapping = cfg["synthesis_kwargs"], cfg["mapping_kwargs"]
     out = {one["name"]: one for one in synthesis["out_ch"]}
-    common = {
-        "shape": tuple(synthesis["resolution"]), "channels": out["image"]["ch"], "latent": mapping["in_ch"],
-        "base_channels": synthesis["ch_base"], "max_channels": synthesis["ch_max"],
+    given = space(*synthesis["resolution"], out["image"]["ch"])
+    widths = {
+        "latent": mapping["in_ch"], "base_channels": synthesis["ch_base"], "max_channels": synthesis["ch_max"]
     }  # fmt: skip
     if cfg["arch"] == "dusty_v2":
-        return style_gan.Generator(**common, depth=mapping["depth"], doublings=len(synthesis["layers"]))
-    return dcgan.Generator(**common, drops="raydrop_logit" in out)
+        return DustyV2(given, **widths, depth=mapping["depth"], doublings=len(synthesis["layers"])).network
+    return (DustyV1 if "raydrop_logit" in out else VanillaGan)(given, **widths).network
 
 
 def discriminator_of(cfg: Mapping[str, Any]) -> nn.Module:
@@ -124,28 +131,28 @@ def test_a_discriminator_is_the_published_one_with_its_penalty(cases: Any, name:
     assert_gradient_norms(network, expected["grad_param_norms"])
 
 
-NARROW, WIDE = (64, 512), (64, 1024)
+NARROW, WIDE = (64, 512), (64, 1024, 2)
 FULL = {
-    "vanilla_G": (dcgan.Generator, (NARROW,), 36_308_929),
-    "vanilla_D": (dcgan.Discriminator, (NARROW,), 2_821_057),
-    "dusty_v1_G": (dcgan.Generator, (NARROW, 1, True), 36_309_954),
-    "dusty_v1_D": (dcgan.Discriminator, (NARROW,), 2_821_057),
-    "dusty_v2_G": (style_gan.Generator, (NARROW,), 4_367_594),
-    "dusty_v2_D": (style_gan.Discriminator, (NARROW,), 38_445_569),
-    "vanilla_G_64x1024_2ch": (dcgan.Generator, (WIDE, 2), 69_864_386),
-    "vanilla_D_64x1024_2ch": (dcgan.Discriminator, (WIDE, 2), 2_888_641),
-    "dusty_v1_G_64x1024_2ch": (dcgan.Generator, (WIDE, 2, True), 69_865_411),
-    "dusty_v1_D_64x1024_2ch": (dcgan.Discriminator, (WIDE, 2), 2_888_641),
-    "dusty_v2_G_64x1024_2ch": (style_gan.Generator, (WIDE, 2), 4_368_591),
-    "dusty_v2_D_64x1024_2ch": (style_gan.Discriminator, (WIDE, 2), 72_000_065),
+    "vanilla_G": (VanillaGan, NARROW, 36_308_929),
+    "vanilla_D": (dcgan.Discriminator, NARROW, 2_821_057),
+    "dusty_v1_G": (DustyV1, NARROW, 36_309_954),
+    "dusty_v1_D": (dcgan.Discriminator, NARROW, 2_821_057),
+    "dusty_v2_G": (DustyV2, NARROW, 4_367_594),
+    "dusty_v2_D": (style_gan.Discriminator, NARROW, 38_445_569),
+    "vanilla_G_64x1024_2ch": (VanillaGan, WIDE, 69_864_386),
+    "vanilla_D_64x1024_2ch": (dcgan.Discriminator, WIDE, 2_888_641),
+    "dusty_v1_G_64x1024_2ch": (DustyV1, WIDE, 69_865_411),
+    "dusty_v1_D_64x1024_2ch": (dcgan.Discriminator, WIDE, 2_888_641),
+    "dusty_v2_G_64x1024_2ch": (DustyV2, WIDE, 4_368_591),
+    "dusty_v2_D_64x1024_2ch": (style_gan.Discriminator, WIDE, 72_000_065),
 }
 
 
 @pytest.mark.parametrize("name", FULL)
 def test_full_size_networks_have_the_published_names_shapes_and_count(shared: Path, name: str):
-    build, arguments, count = FULL[name]
+    build, (rows, columns, *channels), count = FULL[name]
     with torch.device("meta"):
-        network = build(*arguments)
+        network = build((rows, columns), *channels) if "_D" in name else build(space(rows, columns, *channels)).network
     assert sum(p.numel() for p in network.parameters()) == count
     said = json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())[name]
     assert said["parameters"] == count
@@ -155,16 +162,14 @@ def test_full_size_networks_have_the_published_names_shapes_and_count(shared: Pa
 def test_an_image_that_cannot_be_halved_so_often_is_refused():
     for shape in ((40, 512), (16, 64)):
         with pytest.raises(InputError, match="multiples of 16, at least 32"):
-            dcgan.Generator(shape)
+            VanillaGan(space(*shape))
 
 
-@pytest.mark.parametrize("networks", [dcgan, style_gan])
-def test_codes_masks_and_scores_stay_float32_in_half_precision(networks: Any):
-    small: dict[str, Any] = {"shape": (32, 64), "base_channels": 4}
-    drops, angle = ({"drops": True}, None) if networks is dcgan else ({}, torch.randn(1, 2, 32, 64))
-    generator, discriminator = networks.Generator(latent=8, **small, **drops), networks.Discriminator(**small)
+@pytest.mark.parametrize(("gan", "critic"), [(DustyV1, dcgan.Discriminator), (DustyV2, style_gan.Discriminator)])
+def test_codes_masks_and_scores_stay_float32_in_half_precision(gan: Any, critic: Any):
+    generator, discriminator = gan(space(32, 64), latent=8, base_channels=4), critic((32, 64), base_channels=4)
     with torch.autocast("cpu", torch.bfloat16):
-        made = generator(torch.randn(2, 8), angle, uniform=torch.rand(2, 1, 32, 64))
+        made = generator.made(torch.randn(2, 8), torch.rand(2, 1, 32, 64))
         scores = discriminator(made["image"])
     assert {value.dtype for value in (*made.values(), scores)} == {torch.float32}
 

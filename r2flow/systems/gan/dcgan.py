@@ -1,12 +1,16 @@
 """Convolutional GANs (Radford et al. 2016): the vanilla GAN and DUSty v1 (Nakashima and Kurazume 2021), as the
 baselines in the code of DUSty v2."""
 
+from collections.abc import Mapping
 from itertools import pairwise
+from typing import Any
 
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32, halved
-from r2flow.registry import Count
+from r2flow.lidar.space import ModelSpace
+from r2flow.registry import Count, Positive
+from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (
     IMAGE,
     LOGIT,
@@ -37,45 +41,72 @@ class Heads(nn.Module):
         return {name: at_least_float32(head(x)) for name, head in self.heads.items()}
 
 
-class Generator(LatentGenerator):
-    """Projection of z to a small map, upsampled to the image by 4 x 4 transposed convolutions; w is z.
+class VanillaGan(Gan):
+    """A convolutional GAN whose image encodes dropped rays; the code w is z.
+
+    z is projected to a small map, which 4 x 4 transposed convolutions upsample to the image.
 
     Args:
-        shape: Rows and columns of the image.
-        channels: Image channels.
-        drops: Whether a second head predicts ray-drop (DUSty v1); else the vanilla GAN.
-
-    See `r2flow.systems.gan.generator.VanillaGan` for other arguments.
+        space: Space of the images.
+        backbone: Not used.
+        latent: Width of z.
+        base_channels: Width of the outermost map; it doubles inwards.
+        max_channels: Maximum width.
+        doublings: From the first map to the image; 4 as published.
+        tanh: Whether the image ends in tanh; the published weights of v2 alone do.
+        ring: Whether the columns are a full turn.
     """
+
+    drops = False
 
     def __init__(
         self,
-        shape: tuple[int, int],
-        channels: int = 1,
-        drops: bool = False,
-        latent: int = 512,
-        base_channels: int = 64,
-        max_channels: int = 512,
-        doublings: int = 4,
+        space: ModelSpace,
+        backbone: Mapping[str, Any] | None = None,
+        latent: Count = 512,
+        base_channels: Count = 64,
+        max_channels: Count = 512,
+        doublings: Count = 4,
         tanh: bool = False,
         ring: bool = True,
     ) -> None:
-        first = halved("this GAN", shape, doublings, least=2)
+        channels, rows, columns = space.shape
+        first = halved("this GAN", (rows, columns), doublings, least=2)
         widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings))]
         projection = nn.Sequential(
             nn.Unflatten(1, (latent, 1, 1)),
             Equalised(nn.ConvTranspose2d(latent, widths[0], first, bias=False)),
             BiasedLeakyReLU(widths[0]),
         )
-        synthesis = nn.Sequential(
-            projection,
-            *(
-                nn.Sequential(*_doubling(wide, narrow, ring, False), BiasedLeakyReLU(narrow))
-                for wide, narrow in pairwise(widths)
-            ),
-            Heads(widths[-1], {IMAGE: channels, LOGIT: 1} if drops else {IMAGE: channels}, ring),
-        )
-        super().__init__(latent, latent, nn.Identity(), synthesis, RayDrop() if drops else None, tanh)
+        blocks = [
+            nn.Sequential(*_doubling(wide, narrow, ring, False), BiasedLeakyReLU(narrow))
+            for wide, narrow in pairwise(widths)
+        ]
+        heads = Heads(widths[-1], {IMAGE: channels, LOGIT: 1} if self.drops else {IMAGE: channels}, ring)
+        synthesis = nn.Sequential(projection, *blocks, heads)
+        mask = RayDrop() if self.drops else None
+        super().__init__(space, LatentGenerator(latent, latent, nn.Identity(), synthesis, mask, tanh))
+
+
+class DustyV1(VanillaGan):
+    """`VanillaGan` with a second output, the logits of a mask of returns (Nakashima and Kurazume 2021).
+
+    Args:
+        temperature: Temperature of the relaxed mask.
+        options: Those of `VanillaGan`.
+    """
+
+    drops = True
+
+    def __init__(
+        self,
+        space: ModelSpace,
+        backbone: Mapping[str, Any] | None = None,
+        temperature: Positive = 1.0,
+        **options: Any,
+    ) -> None:
+        super().__init__(space, backbone, **options)
+        self.network.temperature = temperature
 
 
 class Discriminator(nn.Sequential):

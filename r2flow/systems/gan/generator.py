@@ -1,6 +1,5 @@
-"""GANs: x = G(z) in one evaluation, with or without a mask of dropped rays."""
+"""Base class of GANs: x = G(z) in one evaluation, with or without a mask of dropped rays."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -12,9 +11,8 @@ from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.registry import Bound, Count, Positive
+from r2flow.registry import Bound
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler
-from r2flow.systems.gan import dcgan, style_gan
 from r2flow.systems.gan.layers import LatentGenerator
 
 
@@ -75,92 +73,3 @@ class Direct(Sampler):
         x = generator.made(noise, uniform, truncation=self.truncation)["image"]
         progress()
         return Generated.after(x.clamp(-1, 1), 1, finite(x))
-
-
-class VanillaGan(Gan):
-    """A convolutional GAN whose image encodes dropped rays: `r2flow.systems.gan.dcgan`.
-
-    Args:
-        space: Space of the images.
-        backbone: Not used.
-        latent: Width of z.
-        base_channels: Width of the outermost map; it doubles inwards.
-        max_channels: Widest.
-        doublings: From the first map to the image; 4 as published.
-        tanh: Whether the image ends in tanh; the published weights of v2 alone do.
-        ring: Whether the columns are a full turn.
-    """
-
-    drops = False
-
-    def __init__(
-        self,
-        space: ModelSpace,
-        backbone: Mapping[str, Any] | None = None,
-        latent: Count = 512,
-        base_channels: Count = 64,
-        max_channels: Count = 512,
-        doublings: Count = 4,
-        tanh: bool = False,
-        ring: bool = True,
-    ) -> None:
-        channels, *shape = space.shape
-        widths = latent, base_channels, max_channels, doublings
-        super().__init__(space, dcgan.Generator((shape[0], shape[1]), channels, self.drops, *widths, tanh, ring))
-
-
-class DustyV1(VanillaGan):
-    """`VanillaGan` with a second output, the logits of a mask of returns (Nakashima and Kurazume 2021).
-
-    Args:
-        temperature: Temperature of the relaxed mask.
-        options: Those of `VanillaGan`.
-    """
-
-    drops = True
-
-    def __init__(
-        self,
-        space: ModelSpace,
-        backbone: Mapping[str, Any] | None = None,
-        temperature: Positive = 1.0,
-        **options: Any,
-    ) -> None:
-        super().__init__(space, backbone, **options)
-        self.network.temperature = temperature
-
-
-class DustyV2(Gan):
-    """A style-based GAN that generates each pixel from its ray's angles: `r2flow.systems.gan.style_gan`.
-
-    Args:
-        code: Width of w; null for `latent`.
-        depth: Layers from z to w.
-        temperature: Temperature of the relaxed mask.
-
-    See `VanillaGan` for the others.
-    """
-
-    def __init__(
-        self,
-        space: ModelSpace,
-        backbone: Mapping[str, Any] | None = None,
-        latent: Count = 512,
-        code: Count | None = None,
-        depth: Count = 2,
-        base_channels: Count = 32,
-        max_channels: Count = 512,
-        doublings: Count = 4,
-        tanh: bool = True,
-        ring: bool = True,
-        temperature: Positive = 1.0,
-    ) -> None:
-        channels, *shape = space.shape
-        widths = latent, code, depth, base_channels, max_channels, doublings
-        super().__init__(space, style_gan.Generator((shape[0], shape[1]), channels, *widths, tanh, ring))
-        self.network.temperature = temperature
-        self.angle = space.rays[None].clone()
-
-    def start_from(self, parent: Generator) -> None:
-        """Load a trained generator's weights; keep these angles."""
-        self._take(parent, {**parent.state_dict(), "angle": self.angle})  # type: ignore[dict-item]

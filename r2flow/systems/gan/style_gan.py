@@ -3,16 +3,20 @@ scene priors of 3D LiDAR data"): 1 x 1 convolutions, modulated by a code, map th
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.convolutions import Resample
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, halved
+from r2flow.generators.base import Generator
+from r2flow.lidar.space import ModelSpace
 from r2flow.processes import averaged
-from r2flow.registry import Count
+from r2flow.registry import Count, Positive
+from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (
     IMAGE,
     LOGIT,
@@ -184,33 +188,36 @@ def turned_back(x: Tensor, shift: Tensor) -> Tensor:
     return x.gather(3, left) * (1 - share) + x.gather(3, right) * share
 
 
-class Generator(LatentGenerator):
-    """Map z to a code w, and w with the angles of rays to an image and its mask.
+class DustyV2(Gan):
+    """A style-based GAN that generates each pixel from its ray's angles: z to a code w, and w with angles to the image.
 
     Training rotates the angles at random and rotates the image back, so that all azimuths are alike.
 
     Args:
-        shape: Rows and columns of the image.
-        channels: Image channels.
+        code: Width of w; null for `latent`.
+        depth: Layers from z to w.
+        temperature: Temperature of the relaxed mask.
 
-    See `r2flow.systems.gan.generator.DustyV2` for other arguments.
+    See `r2flow.systems.gan.dcgan.VanillaGan` for the others.
     """
 
     def __init__(
         self,
-        shape: tuple[int, int],
-        channels: int = 1,
-        latent: int = 512,
-        code: int | None = None,
-        depth: int = 2,
-        base_channels: int = 32,
-        max_channels: int = 512,
-        doublings: int = 4,
+        space: ModelSpace,
+        backbone: Mapping[str, Any] | None = None,
+        latent: Count = 512,
+        code: Count | None = None,
+        depth: Count = 2,
+        base_channels: Count = 32,
+        max_channels: Count = 512,
+        doublings: Count = 4,
         tanh: bool = True,
         ring: bool = True,
+        temperature: Positive = 1.0,
     ) -> None:
+        channels, rows, columns = space.shape
         code = code or latent
-        halved("this GAN", shape, doublings)
+        halved("this GAN", (rows, columns), doublings)
         mapping = nn.Sequential(
             nn.RMSNorm(latent, eps=1e-8, elementwise_affine=False),
             *(
@@ -219,8 +226,15 @@ class Generator(LatentGenerator):
             ),
         )
         widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings + 1))]
-        synthesis = Synthesis(shape, {IMAGE: channels, LOGIT: 1}, code, widths, ring)
-        super().__init__(latent, code, mapping, synthesis, RayDrop(), tanh, 2 * (doublings + 1))
+        synthesis = Synthesis((rows, columns), {IMAGE: channels, LOGIT: 1}, code, widths, ring)
+        styles = 2 * (doublings + 1)
+        super().__init__(space, LatentGenerator(latent, code, mapping, synthesis, RayDrop(), tanh, styles))
+        self.network.temperature = temperature
+        self.angle = space.rays[None].clone()
+
+    def start_from(self, parent: Generator) -> None:
+        """Load a trained generator's weights; keep these angles."""
+        self._take(parent, {**parent.state_dict(), "angle": self.angle})  # type: ignore[dict-item]
 
 
 class ResidualBlock(nn.Module):
