@@ -143,12 +143,12 @@ def test_an_adaptive_solver_is_one_set(points, saved):
 
 
 def test_an_evaluation_resumes(points, saved, monkeypatch):
-    import r2flow.evaluation.measuring as measuring
+    from r2flow.evaluation import comparing
 
     first, _ = points(saved[0], "--steps", "1,2", "--batch-size", 2)
     measured: list[int] = []
-    measure = measuring.measure
-    monkeypatch.setattr(measuring, "measure", lambda *a: (measured.append(1), measure(*a))[1])
+    measure = comparing.measure
+    monkeypatch.setattr(comparing, "measure", lambda *a: (measured.append(1), measure(*a))[1])
     second, _ = points(saved[0], "--steps", "4,2,1", "--batch-size", 2)
     assert len(measured) == 1
     assert second[1:] == first[::-1]

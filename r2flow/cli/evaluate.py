@@ -1,7 +1,6 @@
 """`r2flow evaluate`: compare generated with real scans."""
 
 import logging
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -182,69 +181,36 @@ def _compare(
     training: "ScanSet | None",
     options: EvaluateOptions,
 ) -> None:
-    from r2flow.evaluation.copies import Nearest, copies_result, find_nearest
-    from r2flow.evaluation.measuring import gather_real, measure, speed_result
+    """Compare all sets; the first process prints and writes the results."""
+    from r2flow.evaluation.comparing import Comparer, pairs_of
+    from r2flow.evaluation.copies import Nearest, find_nearest, with_copies
     from r2flow.evaluation.protocols import PROTOCOLS
-    from r2flow.evaluation.references import baseline_sets, reference_sets
-    from r2flow.evaluation.results import Results
-    from r2flow.evaluation.statistics import Cache, Statistics
+    from r2flow.evaluation.statistics import Cache
     from r2flow.processes import place
-    from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons
+    from r2flow.reports.evaluation import evaluation_page, print_comparisons
     from r2flow.reports.pages import write_json, write_page
     from r2flow.reports.view.panels import write_sets
 
-    kinds: dict[Kind, dict[str, tuple[ScanSet, ScanSet]]]
-    kinds = {"judged": {name: (truth, scans) for name, scans in judged.items()}}
-    usual = bool(judged)
-    if options.reference or (usual and options.reference is None and len(truth) > 1):
-        kinds["reference"] = reference_sets(truth, judged)
-    if options.baselines or (usual and options.baselines is None):
-        num = max((len(scans) for scans in judged.values()), default=len(truth))
-        baselines = baseline_sets(truth, min(num, SAMPLED))
-        kinds["baseline"] = {name: (truth, scans) for name, scans in baselines.items()}
-    comparisons: list[Comparison] = []
-    (rank, _), rules, cache = place(), PROTOCOLS[options.protocol], None if options.no_cache else Cache()
-    statistics: dict[int, dict[str, Statistics]] = {}
-    folder = options.out and options.out / "results"
-    kept = Results(folder, metrics, bootstrap=options.bootstrap, protocol=options.protocol, device=device)
-    for kind, (name, (real, other)) in ((kind, pair) for kind, pairs in kinds.items() for pair in pairs.items()):
-        start = time.monotonic()
-        sampled = other.about.get("kind") == "sampled"
-        results = kept.read(real, other) if sampled else None
-        if results is None:
-            if id(real) not in statistics:
-                statistics[id(real)] = gather_real(metrics, real, work, cache, rules)
-            draws = 0 if kind == "baseline" else options.bootstrap
-            results = measure(metrics, statistics[id(real)], other, work, draws, rules)
-            if sampled:
-                results.append(speed_result(real, other))
-                if rank == 0:
-                    kept.write(real, other, results)
-        comparisons.append(Comparison(name, real, other, results, time.monotonic() - start, kind))
-    if rank > 0:
+    rules, cache = PROTOCOLS[options.protocol], None if options.no_cache else Cache()
+    compare = Comparer(metrics, work, rules, options.bootstrap, cache, options.out and options.out / "results", device)
+    comparisons = [compare(*pair) for pair in pairs_of(truth, judged, options.reference, options.baselines)]
+    if place()[0] > 0:
         return
     nearest: dict[str, Nearest] = {}
     if training is not None:
         nearest = find_nearest({**judged, REAL: truth}, training, work, device)
-        of = {("judged", name): nearest[name] for name in judged} | {("reference", "real halves"): nearest[REAL]}
-        for index, row in enumerate(comparisons):
-            if (neighbours := of.get((row.kind, row.name))) is not None:
-                result = copies_result(neighbours, nearest[REAL], len(training))
-                comparisons[index] = replace(row, measured=[*row.measured, result])
-    seeds: dict[str, int] = {}
-    if any(scans.about["kind"] == "sampled" for scans in judged.values()):
+        real = nearest.pop(REAL)
+        comparisons = with_copies(comparisons, nearest, real, len(training))
+    seeds = {"bootstrap": 0} if options.bootstrap else {}
+    if any(scans.source.drawn for scans in judged.values()):
         seeds["sampled scans"] = options.seed
-    if options.bootstrap:
-        seeds["bootstrap"] = 0
-    of_judged = {name: neighbours for name, neighbours in nearest.items() if name in judged}
-    page = evaluation_page(comparisons, command(), device, seeds, of_judged, training)
+    page = evaluation_page(comparisons, command(), device, seeds, nearest, training)
     print_comparisons(comparisons)
     if options.json is not None:
         write_json(page, options.json)
         print(options.json)
     if options.out is not None:
-        for path in write_page(page, options.out):
-            print(path)
+        print(*write_page(page, options.out), sep="\n")
         sets = {"real": truth} | {"real, judged" if name == "real" else name: s for name, s in judged.items()}
         print(write_sets(options.out / "evaluation.html", sets, title="Generated and real scans"))
 

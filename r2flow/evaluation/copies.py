@@ -9,7 +9,8 @@ with c by FFT along the rows. The test compares the distances of generated and r
 non-parametric test to detect data-copying in generative models".
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,7 +19,9 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from r2flow.data.sets import ScanSet
 from r2flow.errors import check
+from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.measuring import MetricResult, Work, bar
+from r2flow.evaluation.references import HALVES
 from r2flow.lidar.encoding import Encoding
 from r2flow.metrics.base import Protocol
 from r2flow.metrics.scans import Scans
@@ -126,3 +129,16 @@ def copies_result(judged: Nearest, real: Nearest, training: int) -> MetricResult
     sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(judged.numbers)}
     protocol = {**Protocol("copies", "log-range of cells", settings=settings).asdict(), "sizes": sizes}
     return MetricResult("copies", figures, protocol, remarks)
+
+
+def with_copies(
+    comparisons: Sequence[Comparison], nearest: Mapping[str, Nearest], real: Nearest, training: int
+) -> list[Comparison]:
+    """Add `copies_result` to each judged set in `nearest`, and that of the real scans to the halves."""
+    of = {("judged", name): neighbours for name, neighbours in nearest.items()} | {("reference", HALVES): real}
+    return [
+        replace(row, measured=[*row.measured, copies_result(of[row.kind, row.name], real, training)])
+        if (row.kind, row.name) in of
+        else row
+        for row in comparisons
+    ]

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import cycle, product
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from r2flow.data.sets import ScanSet
+from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
 from r2flow.evaluation.references import AS_MANY, HALVES
@@ -17,7 +18,6 @@ from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.pictures import draw_range
 from r2flow.reports.tables import print_table, shown, table
 
-Kind = Literal["judged", "reference", "baseline"]
 ENDS = (" low", " high")  # suffixes of interval limits
 DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
 ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
@@ -30,22 +30,6 @@ PRINTED = {
     "jsd": ("JSD x 10^2", 1e2),
     "seconds": ("s a scan", 1.0), "mmd": ("MMD x 10^4", 1e4), "mmd_unbiased": ("MMD x 10^4, unbiased", 1e4),
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Results of one set against another; the seconds include gathering the real statistics."""
-
-    name: str
-    real: ScanSet
-    generated: ScanSet
-    measured: Sequence[MetricResult]
-    seconds: float
-    kind: Kind = "judged"
-
-    @property
-    def title(self) -> str:
-        return self.name if self.kind == "judged" else f"{self.kind}: {self.name}"
 
 
 def heading(metric: str, figure: str) -> tuple[str, float]:

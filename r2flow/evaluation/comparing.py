@@ -1,0 +1,115 @@
+"""Comparisons of sets of scans; those of sampled sets are stored, so that an interrupted evaluation resumes."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from r2flow.data.sets import ScanSet
+from r2flow.evaluation.measuring import MetricResult, Work, gather_real, measure, speed_result
+from r2flow.evaluation.protocols import Rules
+from r2flow.evaluation.references import baseline_sets, reference_sets
+from r2flow.evaluation.statistics import Cache, Statistics
+from r2flow.files import atomic_write, read_json
+from r2flow.metrics.base import ScanMetric
+from r2flow.processes import place
+from r2flow.store import checksum
+
+MOST_BASELINES = 1000  # largest number of scans of a baseline
+
+Kind = Literal["judged", "reference", "baseline"]
+Pair = tuple[Kind, str, ScanSet, ScanSet]  # kind, name, real scans, scans compared with them
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Results of one set against another; the seconds include gathering the real statistics."""
+
+    name: str
+    real: ScanSet
+    generated: ScanSet
+    measured: Sequence[MetricResult]
+    seconds: float
+    kind: Kind = "judged"
+
+    @property
+    def title(self) -> str:
+        return self.name if self.kind == "judged" else f"{self.kind}: {self.name}"
+
+
+def pairs_of(
+    real: ScanSet, judged: Mapping[str, ScanSet], reference: bool | None = None, baselines: bool | None = None
+) -> list[Pair]:
+    """The judged sets against the real one, real scans against real scans, and baselines.
+
+    Args:
+        reference, baselines: Whether to include them; None: if any set is judged.
+    """
+    pairs: list[Pair] = [("judged", name, real, scans) for name, scans in judged.items()]
+    if reference or (judged and reference is None and len(real) > 1):
+        pairs += [("reference", name, *sets) for name, sets in reference_sets(real, judged).items()]
+    if baselines or (judged and baselines is None):
+        num = min(max((len(scans) for scans in judged.values()), default=len(real)), MOST_BASELINES)
+        pairs += [("baseline", name, real, scans) for name, scans in baseline_sets(real, num).items()]
+    return pairs
+
+
+class Comparer:
+    """Measures pairs of sets; statistics of a real set are gathered once.
+
+    Args:
+        metrics: Built with `keep=True` if `draws` > 0.
+        draws: Bootstrap resamples, except for baselines.
+        folder: Folder of the results of sampled sets, in files named by a hash of everything that these depend on;
+            None: store nothing.
+    """
+
+    def __init__(
+        self,
+        metrics: Mapping[str, ScanMetric],
+        work: Work,
+        rules: Rules,
+        draws: int = 0,
+        cache: Cache | None = None,
+        folder: Path | None = None,
+        device: str = "cpu",
+    ) -> None:
+        self.metrics, self.work, self.rules, self.draws, self.cache = metrics, work, rules, draws, cache
+        self.folder = folder
+        protocols = {name: metric.protocol.asdict() for name, metric in metrics.items()}
+        self.recipe = {"metrics": protocols, "bootstrap": draws, "protocol": rules.name, "device": device}
+        self._statistics: dict[int, dict[str, Statistics]] = {}
+
+    def __call__(self, kind: Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
+        """Compare two sets, or read the stored results."""
+        start = time.monotonic()
+        path = self._path(real, other)
+        results = None if path is None else _read(path)
+        if results is None:
+            if id(real) not in self._statistics:
+                self._statistics[id(real)] = gather_real(self.metrics, real, self.work, self.cache, self.rules)
+            draws = 0 if kind == "baseline" else self.draws
+            results = measure(self.metrics, self._statistics[id(real)], other, self.work, draws, self.rules)
+            if other.source.drawn:
+                results.append(speed_result(real, other))
+            if path is not None and place()[0] == 0:
+                with atomic_write(path, "w") as file:
+                    json.dump([asdict(result) for result in results], file)
+        return Comparison(name, real, other, results, time.monotonic() - start, kind)
+
+    def _path(self, real: ScanSet, other: ScanSet) -> Path | None:
+        """File of the results; None unless they are stored."""
+        if self.folder is None or not other.source.drawn:
+            return None
+        recipe: dict[str, Any] = {"real": real.identity or [real.label, len(real)], "sampled": other.about}
+        return self.folder / f"{checksum({**recipe, **self.recipe})[:16]}.json"
+
+
+def _read(path: Path) -> list[MetricResult] | None:
+    """Stored results; None if missing or damaged."""
+    try:
+        return [MetricResult(**entry) for entry in read_json(path)]
+    except (OSError, ValueError, TypeError):
+        return None
