@@ -1,6 +1,7 @@
 """`r2flow sample`, `complete` and `interpolate`."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,6 +29,7 @@ from r2flow.cli.options import (
 from r2flow.errors import InputError, check
 
 if TYPE_CHECKING:
+    from r2flow.data.partial import PartialScan
     from r2flow.lidar.region import Region
     from r2flow.model.checkpoint import Checkpoint
 
@@ -138,11 +140,53 @@ def interpolate(
     print(f"{frames} scans in {out / 'frames'}; {pages}")
 
 
+@dataclass(frozen=True)
+class PartialOptions:
+    """The scans to complete: their sensor, what is known of them, and the sensor of the completed scans."""
+
+    source: Annotated[
+        str | None,
+        typer.Option("--from", help="Sensor of the scans, name or YAML file. Default: detected from the scans."),
+    ] = None
+    to: Annotated[
+        str | None, typer.Option(help="Sensor of the completed scans, name or YAML file. Default: the model's.")
+    ] = None
+    size: SizeOption = None
+    mask: Annotated[
+        str | None,
+        typer.Option(help="Use a part of the scan: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
+    ] = None
+    fill_gaps: Annotated[
+        bool, typer.Option("--fill-gaps", help="Treat rays without a return as unmeasured, as in a thinned scan.")
+    ] = False
+    reflectance_scale: ScaleChoice = None
+    columns: ColumnsOption = None
+    scans: Annotated[
+        int | None,
+        typer.Option("--scans", min=1, help="Maximum number of scans per folder, evenly spaced. Default: all."),
+    ] = None
+
+    def open(self, model: str, device: str, what: Sequence[str]) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
+        """The model, for another sensor if given, the scans as it takes them, and remarks on their sensor."""
+        from r2flow.data.opening import reading_for
+        from r2flow.data.partial import open_partial
+        from r2flow.lidar.sensor_files import named_sensor
+        from r2flow.model.checkpoint import load_checkpoint
+
+        loaded = load_checkpoint(model, choose_device(device))
+        if self.to or self.size:
+            loaded = loaded.through(named_sensor(self.to or loaded.sensor, rows_and_columns(self.size)))
+        reading = replace(reading_for([], loaded), columns=named_columns(self.columns))
+        sensor = None if self.source is None else build_sized(self.source, None)
+        return loaded, *open_partial(what, reading, sensor, self.reflectance_scale, self.scans)
+
+
 @app.command(epilog="Example: r2flow complete scan.pcd --from vlp16 --num 8 --out dense")
 @grouped
 def complete(
     what: Annotated[list[str], typer.Argument(metavar="SCANS...", help=f"Scan files, range images (.npy), or {SETS}.")],
     out: OutOption,
+    given: PartialOptions,
     how: SamplerOptions,
     checkpoint: Annotated[
         Path | None,
@@ -154,29 +198,8 @@ def complete(
         ),
     ] = None,
     precision: PrecisionOption = "32-true",
-    source: Annotated[
-        str | None,
-        typer.Option("--from", help="Sensor of the scans, name or YAML file. Default: detected from the scans."),
-    ] = None,
-    to: Annotated[
-        str | None, typer.Option(help="Sensor of the completed scans, name or YAML file. Default: the model's.")
-    ] = None,
-    size: SizeOption = None,
-    mask: Annotated[
-        str | None,
-        typer.Option(help="Use a part of the scan: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
-    ] = None,
-    fill_gaps: Annotated[
-        bool, typer.Option("--fill-gaps", help="Treat rays without a return as unmeasured, as in a thinned scan.")
-    ] = False,
-    reflectance_scale: ScaleChoice = None,
-    columns: ColumnsOption = None,
     num: Annotated[int, typer.Option(min=1, help="Completions per scan.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="A completion depends only on seed, scan and its index.")] = 0,
-    scans: Annotated[
-        int | None,
-        typer.Option("--scans", min=1, help="Maximum number of scans per folder, evenly spaced. Default: all."),
-    ] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Completions per batch.")] = 1,
     pictures: Annotated[int, typer.Option(min=0, help="Number of scans to show in pictures and a 3-D page.")] = 8,
     device: DeviceOption = "auto",
@@ -185,59 +208,29 @@ def complete(
 
     Output files have the format of the input. The same command resumes an interrupted run.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from r2flow.data.opening import reading_for
-    from r2flow.data.partial import PartialScan, open_partial
     from r2flow.generators import TransferFlow
     from r2flow.lidar.known import mask_identity, parse_mask
-    from r2flow.lidar.sensor_files import named_sensor
-    from r2flow.model.checkpoint import Checkpoint, load_checkpoint
     from r2flow.model.completion import completing
     from r2flow.models import DEFAULT, DENSIFY, MODELS
-    from r2flow.reports.completed import Job, answer_ending, lack_sectors, write_completed
+    from r2flow.reports.completed import Job, lack_sectors, print_completed, remarks_on_files, write_completed
 
-    job = Job(num, seed, None if mask is None else parse_mask(mask), fill_gaps, batch_size, pictures, precision)
-    sensor = None if source is None else build_sized(source, None)
-
-    def opened(name: str) -> tuple[Checkpoint, list[PartialScan], list[str]]:
-        loaded = load_checkpoint(name, device=choose_device(device))
-        if to or size:
-            loaded = loaded.through(named_sensor(to or loaded.sensor, rows_and_columns(size)))
-        reading = replace(reading_for([], loaded), columns=named_columns(columns))
-        return loaded, *open_partial(what, reading, sensor, reflectance_scale, scans)
-
+    mask = given.mask and parse_mask(given.mask)
+    job = Job(num, seed, mask or None, given.fill_gaps, batch_size, pictures, precision)
     by_densify = how.given.get("name", "jump") in ("jump", "transport")
     name = str(checkpoint or (DENSIFY if by_densify else DEFAULT))
-    loaded, partial, messages = opened(name)
-    if name == DENSIFY and not (checkpoint or to or size or how.sampler) and lack_sectors(partial, job):
+    loaded, scans, remarks = given.open(name, device, what)
+    free = not (checkpoint or given.to or given.size or how.sampler)
+    if free and name == DENSIFY and lack_sectors(scans, job):
         name = DEFAULT
-        loaded, partial, messages = opened(name)
-    if messages and isinstance(loaded.generator, TransferFlow):  # another sensor fills other rows
+        loaded, scans, remarks = given.open(name, device, what)
+    if remarks and isinstance(loaded.generator, TransferFlow):  # another sensor fills other rows
         loaded = loaded.through(loaded.sensor, numbered=False)
     if checkpoint is None:
         print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
     sampler = completing(loaded.generator, several=num > 1, **how.given)
-    for line in messages:
-        print(line)
-    for ending in sorted({scan.ending for scan in partial if answer_ending(loaded, scan) != scan.ending}):
-        print(f"completions of {ending} files are written as .ply")
-    if not loaded.encoding.reflectance:
-        print("the model is of range alone: answers have no reflectance")
-    print(f"completions have at most one point per pixel of the image, {'x'.join(map(str, loaded.sensor.shape))}")
+    print(*remarks, *remarks_on_files(loaded, scans), sep="\n")
     about = {
-        "mask": mask and mask_identity(mask), "from": source, "reflectance_scale": reflectance_scale,
-        "columns": columns,
+        "mask": given.mask and mask_identity(given.mask), "from": given.source,
+        "reflectance_scale": given.reflectance_scale, "columns": given.columns,
     }  # fmt: skip
-    done = write_completed(loaded, partial, out, job, sampler, about)
-    skipped = len(partial) - len(done)
-    print(f"{len(done)} scans written to {out}" + (f", {skipped} were there already" if skipped else ""))
-    if errors := [error for error in done.values() if error is not None]:
-        (mae, linear), (wrong, wrong_linear) = np.ma.masked_invalid(errors).mean(0).filled(np.nan)
-        print(f"on hidden rays of {len(errors)} scans (linear interpolation in brackets):")
-        off = (
-            f"MAE {mae:.2f} m ({linear:.2f}) where all return" if np.isfinite(mae) else "no ray returns in all of them"
-        )
-        print(f"{off}, {wrong:.1%} ({wrong_linear:.1%}) wrong in ray-drop")
+    print_completed(write_completed(loaded, scans, out, job, sampler, about), out, len(scans))

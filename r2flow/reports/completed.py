@@ -159,6 +159,27 @@ def hidden_errors(whole: Partial, given: Partial, completed: Completed) -> np.nd
     return np.array([[np.mean(part[:-1]), part[-1]] for part in (off, wrong)])
 
 
+def print_completed(done: Mapping[str, np.ndarray | None], out: Path, scans: int) -> None:
+    """Print how many of the scans were completed, and the mean errors of hidden rays."""
+    skipped = f", {scans - len(done)} were there already" if len(done) < scans else ""
+    print(f"{len(done)} scans written to {out}{skipped}")
+    if errors := [error for error in done.values() if error is not None]:
+        (mae, linear), (wrong, wrong_linear) = np.ma.masked_invalid(errors).mean(0).filled(np.nan)
+        off = f"MAE {mae:.2f} m ({linear:.2f}) where all return" if np.isfinite(mae) else "no ray returns in all"
+        print(f"on hidden rays of {len(errors)} scans (linear interpolation in brackets):")
+        print(f"{off}, {wrong:.1%} ({wrong_linear:.1%}) wrong in ray-drop")
+
+
+def remarks_on_files(checkpoint: Checkpoint, scans: Sequence[PartialScan]) -> list[str]:
+    """What the files of completed scans hold other than those of the scans."""
+    changed = {scan.ending for scan in scans if answer_ending(checkpoint, scan) != scan.ending}
+    remarks = [f"completions of {ending} files are written as .ply" for ending in sorted(changed)]
+    if not checkpoint.encoding.reflectance:
+        remarks.append("the model is of range alone: answers have no reflectance")
+    size = "x".join(map(str, checkpoint.sensor.shape))
+    return [*remarks, f"completions have at most one point per pixel of the image, {size}"]
+
+
 def answer_ending(checkpoint: Checkpoint, scan: PartialScan) -> str:
     """File format of a scan's answers: the scan's, or .ply if not writable or in need of missing reflectance."""
     if scan.ending not in WRITTEN or (scan.ending == ".bin" and not checkpoint.encoding.reflectance):
