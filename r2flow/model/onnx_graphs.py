@@ -47,10 +47,6 @@ def sampler_graph(
     network = compose.add_prefix(network, "network.", rename_inputs=False, rename_outputs=False)
     decoded = compose.add_prefix(decoded, "decoded.", rename_inputs=False, rename_outputs=False)
     count = len(times)
-    noise = onnx.ValueInfoProto()
-    noise.CopyFrom(next(value for value in decoded.graph.input if value.name == "x_1"))
-    noise.name = "noise"
-    image = [1 + count, *(size.dim_param or size.dim_value for size in noise.type.tensor_type.shape.dim)]
     constants = {
         "times": np.array(times, dtype=np.float32),
         "states": states.astype(np.float32),
@@ -64,42 +60,19 @@ def sampler_graph(
         "zero": np.array(0, dtype=np.float32),
         **({"second": np.array(second, dtype=np.float32)} if second else {}),
     }
-
-    def state(row: str, known: str, name: str) -> list[onnx.NodeProto]:
-        """Nodes of the weighted sum of `known` with the coefficients in a row of `states`."""
-        return [
-            helper.make_node("Gather", ["states", row], [f"{name}.row"]),
-            helper.make_node("Reshape", [known, "flat"], [f"{name}.flat"]),
-            helper.make_node("MatMul", [f"{name}.row", f"{name}.flat"], [f"{name}.sum"]),
-            helper.make_node("Reshape", [f"{name}.sum", "shape"], [name]),
-        ]
-
-    answer = [
-        helper.make_node("Add", ["j", "one"], ["next"]),
-        helper.make_node("Equal", ["numbers", "next"], ["here"]),
-        helper.make_node("Unsqueeze", ["v", "front"], ["answer"]),
-        helper.make_node("Where", ["here", "answer", "known"], ["known.next"]),
-        helper.make_node("Identity", ["going"], ["going.next"]),
-    ]
-    body = helper.make_graph(
-        [
-            helper.make_node("Gather", ["times", "j"], ["t"]),
-            *([helper.make_node("Gather", ["second", "j"], ["s"])] if second else []),
-            *state("j", "known", "x"),
-            *network.graph.node,
-            *answer,
-        ],
-        "evaluation",
-        [_value("j", TensorProto.INT64, []), _value("going", TensorProto.BOOL, []), _value("known", 1, image)],
-        [_value("going.next", TensorProto.BOOL, []), _value("known.next", 1, image)],
-    )
+    noise = onnx.ValueInfoProto()
+    noise.CopyFrom(next(value for value in decoded.graph.input if value.name == "x_1"))
+    noise.name = "noise"
+    known = [1 + count, *(size.dim_param or size.dim_value for size in noise.type.tensor_type.shape.dim)]
     nodes = [
         helper.make_node("Shape", ["noise"], ["shape"]),
         helper.make_node("Unsqueeze", ["noise", "front"], ["noise.first"]),
         helper.make_node("Equal", ["numbers", "front"], ["first"]),
         helper.make_node("Where", ["first", "noise.first", "zero"], ["known.0"]),
-        helper.make_node("Loop", ["evaluations", "true", "known.0"], ["known.all"], body=body),
-        *state("last", "known.all", "x_1"),
+        helper.make_node(
+            "Loop", ["evaluations", "true", "known.0"], ["known.all"], body=_evaluation(network, second, known)
+        ),
+        *_state("last", "known.all", "x_1"),
         *decoded.graph.node,
     ]
     initializers = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
@@ -113,5 +86,33 @@ def sampler_graph(
     return model
 
 
-def _value(name: str, kind: int, shape: list[Any]) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, kind, shape)
+def _evaluation(network: onnx.ModelProto, second: Sequence[float] | None, known: list[Any]) -> onnx.GraphProto:
+    """Body of the loop: evaluation j of the network, whose output becomes entry j + 1 of the loop state."""
+    nodes = [
+        helper.make_node("Gather", ["times", "j"], ["t"]),
+        *([helper.make_node("Gather", ["second", "j"], ["s"])] if second else []),
+        *_state("j", "known", "x"),
+        *network.graph.node,
+        helper.make_node("Add", ["j", "one"], ["next"]),
+        helper.make_node("Equal", ["numbers", "next"], ["here"]),
+        helper.make_node("Unsqueeze", ["v", "front"], ["answer"]),
+        helper.make_node("Where", ["here", "answer", "known"], ["known.next"]),
+        helper.make_node("Identity", ["going"], ["going.next"]),
+    ]
+    value = helper.make_tensor_value_info
+    return helper.make_graph(
+        nodes,
+        "evaluation",
+        [value("j", TensorProto.INT64, []), value("going", TensorProto.BOOL, []), value("known", 1, known)],
+        [value("going.next", TensorProto.BOOL, []), value("known.next", 1, known)],
+    )
+
+
+def _state(row: str, known: str, name: str) -> list[onnx.NodeProto]:
+    """Nodes of the sum of `known`, weighted by a row of `states`."""
+    return [
+        helper.make_node("Gather", ["states", row], [f"{name}.row"]),
+        helper.make_node("Reshape", [known, "flat"], [f"{name}.flat"]),
+        helper.make_node("MatMul", [f"{name}.row", f"{name}.flat"], [f"{name}.sum"]),
+        helper.make_node("Reshape", [f"{name}.sum", "shape"], [name]),
+    ]

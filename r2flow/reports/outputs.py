@@ -66,35 +66,22 @@ def write_samples(
         region, channels: See `r2flow.model.sampling.sample`. Files have the sensor's shape, 0 outside the region.
         replace: Whether to delete samples of other settings in the folder.
     """
-    generator = checkpoint.generator
+    generator, out, rays = checkpoint.generator, Path(out), checkpoint.sensor.rays()
     sampler = sampler or generator.sampler
     generator.space.check_channels(channels)
-    fitting = formats_of(checkpoint, channels)
-    formats = fitting if formats is None else formats
-    if other := [name for name in formats if name not in fitting]:
-        raise InputError(f"--format {','.join(other)} is none of {','.join(fitting)}, which can hold these scans.")
+    endings = _endings(checkpoint, channels, formats)
     sampler.check(generator)
-    out, rays = Path(out), checkpoint.sensor.rays()
-    part: dict[str, Any] = {} if region is None else {"region": asdict(region)}
-    part |= {} if channels == "both" else {"channels": channels}
-    part |= {} if precision == "32-true" else {"precision": precision}
-    endings = ["reflectance.npy"] if channels == "reflectance" else formats
+    how: dict[str, Any] = {"region": region, "channels": channels, "precision": precision}
+    plain = how | {"region": region and asdict(region)}
+    part = {key: value for key, value in plain.items() if value not in (None, "both", "32-true")}
     store = FileStore(out, "samples", recipe_of(checkpoint, seed, sampler, **part), endings)
     stale = _stale(store, replace)
-    if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
-        log.warning(
-            "the model uses rays through the corners of bins (rays=reference); points are written along rays through "
-            "bin centres, closer to the returns (docs/data.md, Projection)"
-        )
     shown: list[np.ndarray] = []
     with ScanBar("sampling", num, batches(num, batch_size) * (sampler.evaluations(generator) or 0)) as bar:
         for first in range(0, num, batch_size):
             numbers = range(first, min(first + batch_size, num))
             if first < pictures or stale or store.missing(numbers):
-                drawn = draw(
-                    generator, numbers, seed, sampler, region=region, channels=channels, precision=precision,
-                    progress=bar.evaluated,
-                )  # fmt: skip
+                drawn = draw(generator, numbers, seed, sampler, **how, progress=bar.evaluated)
                 warn_unsolved(drawn.converged, first)
                 while stale:  # the first scan shows that the settings are valid
                     stale.pop().unlink()
@@ -111,6 +98,20 @@ def write_samples(
         path = checkpoint.path.resolve()
         model = path.parents[1].name if path.parent.name == FOLDER else path.stem
         draw_pages(shown, rays, out, f"{model}, seed {seed}")
+
+
+def _endings(checkpoint: Checkpoint, channels: str, formats: Sequence[str] | None) -> Sequence[str]:
+    """Endings of the files of a sample; refuses formats that cannot hold the channels."""
+    fitting = formats_of(checkpoint, channels)
+    formats = fitting if formats is None else formats
+    if other := [name for name in formats if name not in fitting]:
+        raise InputError(f"--format {','.join(other)} is none of {','.join(fitting)}, which can hold these scans.")
+    if {"ply", "bin"} & set(formats) and not torch.equal(checkpoint.generator.space.rays, checkpoint.sensor.rays()):
+        log.warning(
+            "the model uses rays through the corners of bins (rays=reference); points are written along rays through "
+            "bin centres, closer to the returns (docs/data.md, Projection)"
+        )
+    return ["reflectance.npy"] if channels == "reflectance" else formats
 
 
 def warn_unsolved(converged: Tensor, first: int = 0) -> None:
