@@ -233,18 +233,6 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):
     assert (np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 4).all()
 
 
-def test_one_channel_is_written_alone(r2flow, run, tmp_path):
-    for channels in ("both", "range", "reflectance"):
-        out = tmp_path / channels
-        assert r2flow("sample", run, "--num", 1, "--steps", 2, "--channels", channels, "-o", out)[0] == 0
-    both = np.load(tmp_path / "both" / "000000.npy")
-    np.testing.assert_array_equal(np.load(tmp_path / "range" / "000000.npy"), both[:1])
-    np.testing.assert_array_equal(np.load(tmp_path / "reflectance" / "000000.reflectance.npy"), both[1:])
-    assert read_points(tmp_path / "range" / "000000.ply").reflectance is None
-    assert not list((tmp_path / "range").glob("*.bin"))
-    assert {path.suffix for path in (tmp_path / "reflectance").iterdir()} == {".npy", ".png", ".json"}
-
-
 def test_named_grids_are_sampled_on(r2flow, run, tmp_path):
     images = {}
     for grid in ("uniform", "power:2", "power-start:1.5"):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -42,9 +42,6 @@ class RegionOptions:
         str | None, typer.Option(help="Generate only these azimuths, in degrees: -45,45 is the quarter ahead.")
     ] = None
     rows: Annotated[str | None, typer.Option(help="Image rows, such as 0-31 for the upper half of 64.")] = None
-    channels: Annotated[Literal["both", "range", "reflectance"], typer.Option(help="Channels to decode and write.")] = (
-        "both"
-    )
 
     def region(self, checkpoint: "Checkpoint") -> "Region | None":
         """Region of --sector and --rows; prints the part that the generator evaluates."""
@@ -95,13 +92,12 @@ def sample(
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     loaded = load_checkpoint(model or find_model(DEFAULT), device=choose_device(draw.device))
     sampler = loaded.generator.choose(**how.given)
-    formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded, part.channels)
+    formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded)
     region = part.region(loaded)
-    write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels,
-        precision=precision,
-    )  # fmt: skip
-    pages = f", pictures in {out / 'samples.png'}" if pictures else ""
-    pages += f", in 3-D in {out / 'samples.html'}" if pictures and part.channels != "reflectance" else ""
+    write_samples(
+        loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, precision=precision
+    )
+    pages = f", pictures in {out / 'samples.png'}, in 3-D in {out / 'samples.html'}" if pictures else ""
     print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{pages}")
 
 

@@ -1,6 +1,5 @@
 """Model space: encoded images of a sensor, and decoding to metres and points."""
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +13,6 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Convention, Sensor, build_sensor
 from r2flow.registry import check_options
-
-CHANNELS = ("both", "range", "reflectance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,24 +32,9 @@ class ModelSpace:
         """(C, H, W) of an image."""
         return self.encoding.shape
 
-    def check_channels(self, channels: str) -> None:
-        """Refuse channels that images of this space do not have."""
-        own = CHANNELS if self.encoding.reflectance else CHANNELS[:2]
-        if channels not in own:
-            raise InputError(f"channels must be one of {', '.join(own)}, which this model has, found {channels!r}.")
-
-    def decode(self, x: Tensor, channels: str = "both") -> Tensor:
-        """Decode model space, (B, C, h, w), to metres and reflectance, (B, 2 or 1, h, w).
-
-        `reflectance` also decodes the range, to find dropped rays; `range` skips the reflectance.
-        """
-        encoding = self.encoding
-        if channels == "range" and encoding.reflectance:
-            encoding = copy.copy(encoding)
-            encoding.reflectance = False
-            x = x[:, : encoding.channels]
-        image = encoding.decode(x)
-        return image[:, 1:] if channels == "reflectance" else image
+    def decode(self, x: Tensor) -> Tensor:
+        """Decode model space, (B, C, h, w), to metres and reflectance, (B, 2 or 1, h, w)."""
+        return self.encoding.decode(x)
 
     def points(self, images: Tensor) -> list[np.ndarray]:
         """The returns of each range image as a point cloud, along rays through the pixels' centres.

@@ -30,7 +30,7 @@ class Samples:
 
     Attributes:
         images: Range in metres and reflectance, (B, 2 or 1, H, W), on the CPU; 0 for rays that were dropped or not
-            requested. One channel if only one was requested.
+            requested.
         first: Number of the first scan.
         evaluations: Network evaluations per scan, (B,), on the CPU.
         converged: Whether the sampler converged, per scan, (B,) bool, on the CPU.
@@ -53,7 +53,6 @@ def sample(
     batch_size: int = 1,
     condition: Condition | None = None,
     region: Region | None = None,
-    channels: str = "both",
     precision: Precision = "32-true",
     progress: Progress = None,
     **changes: Any,
@@ -67,27 +66,25 @@ def sample(
         condition: Condition of the scans, each tensor (num, ...).
         region: Region of the image to generate. The network sees `evaluated_region` only, with the same noise as in the
             whole image.
-        channels: `range` or `reflectance` decodes one channel; `both` decodes all channels of the model.
         precision: Precision of the network, see `Generator.forward`.
         progress: Called after every network evaluation of a batch.
         changes: `name` and fields of the sampler (`Generator.choose`): steps, tolerance, grid, ...
 
     Raises:
-        InputError: num or batch_size below 1, a sampler or channel that the generator does not have, an invalid field
+        InputError: num or batch_size below 1, a sampler that the generator does not have, an invalid field
             of the sampler, a condition of the wrong length, or a region that the generator cannot be cropped to.
     """
     generator = source if isinstance(source, Generator) else source.generator
     if not (isinstance(num, Integral) and isinstance(batch_size, Integral) and num >= 1 and batch_size >= 1):
         raise InputError(f"needs at least one scan and a batch of at least one; found {num!r} and {batch_size!r}.")
     chosen = sampler.changed(**changes) if sampler else generator.choose(**changes)
-    generator.space.check_channels(channels)
     for name, value in (condition or {}).items():
         if len(value) != num:
             raise InputError(f"the condition's {name} has {len(value)} scans, but num is {num}.")
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
         batch_condition = condition and {name: value[first : numbers.stop] for name, value in condition.items()}
-        yield draw(generator, numbers, seed, chosen, batch_condition, region, channels, precision, progress)
+        yield draw(generator, numbers, seed, chosen, batch_condition, region, precision, progress)
 
 
 @torch.no_grad()
@@ -98,7 +95,6 @@ def draw(
     sampler: Sampler | None = None,
     condition: Condition | None = None,
     region: Region | None = None,
-    channels: str = "both",
     precision: Precision = "32-true",
     progress: Progress = None,
 ) -> Samples:
@@ -123,7 +119,7 @@ def draw(
     generated = generator(noise, condition, sampler=sampler, draws=draws, precision=precision, progress=progress)
     x_1 = generated.x.cpu()  # also synchronises the GPU
     seconds = time.perf_counter() - start
-    images = generator.space.decode(x_1, channels)
+    images = generator.space.decode(x_1)
     if region is not None and evaluated is not None:
         images = region.place(region.crop(evaluated.place(images)))
     return Samples(images, numbers[0], generated.evaluations.cpu(), generated.converged.cpu(), seconds)

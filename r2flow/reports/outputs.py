@@ -30,14 +30,12 @@ from r2flow.store import MANIFEST, FileStore, read_manifest
 log = logging.getLogger(__name__)
 
 FORMATS = ("ply", "bin", "npy")
-OWN = re.compile(r"\d{6}(\.reflectance)?\.(ply|bin|npy|png)|samples\.(png|html)")  # file names of samples
+OWN = re.compile(r"\d{6}\.(ply|bin|npy|png)|samples\.(png|html)")  # file names of samples
 
 
-def formats_of(checkpoint: Checkpoint, channels: str = "both") -> list[str]:
-    """Output formats that suit the channels: .bin needs reflectance, points need range."""
-    if channels == "reflectance":
-        return ["npy"]
-    return [name for name in FORMATS if name != "bin" or (channels == "both" and checkpoint.encoding.reflectance)]
+def formats_of(checkpoint: Checkpoint) -> list[str]:
+    """Output formats that suit the model: .bin needs reflectance."""
+    return [name for name in FORMATS if name != "bin" or checkpoint.encoding.reflectance]
 
 
 def write_samples(
@@ -50,7 +48,6 @@ def write_samples(
     pictures: int = 8,
     batch_size: int = 1,
     region: Region | None = None,
-    channels: str = "both",
     replace: bool = False,
     precision: Precision = "32-true",
 ) -> None:
@@ -61,19 +58,18 @@ def write_samples(
     Args:
         sampler: Sampler; default: the generator's.
         formats: File formats; default: all of `formats_of`. `ply` and `bin`: points in metres with reflectance; `npy`:
-            range image, float32 (2 or 1, H, W); reflectance without range is `NNNNNN.reflectance.npy`.
+            range image, float32 (2 or 1, H, W).
         pictures: Number of scans with pictures; the contact sheet shows at most 8.
-        region, channels: See `r2flow.model.sampling.sample`. Files have the sensor's shape, 0 outside the region.
+        region: See `r2flow.model.sampling.sample`. Files have the sensor's shape, 0 outside the region.
         replace: Whether to delete samples of other settings in the folder.
     """
     generator, out, rays = checkpoint.generator, Path(out), checkpoint.sensor.rays()
     sampler = sampler or generator.sampler
-    generator.space.check_channels(channels)
-    endings = _endings(checkpoint, channels, formats)
+    endings = _chosen(checkpoint, formats)
     sampler.check(generator)
-    how: dict[str, Any] = {"region": region, "channels": channels, "precision": precision}
+    how: dict[str, Any] = {"region": region, "precision": precision}
     plain = how | {"region": region and asdict(region)}
-    part = {key: value for key, value in plain.items() if value not in (None, "both", "32-true")}
+    part = {key: value for key, value in plain.items() if value not in (None, "32-true")}
     store = FileStore(out, "samples", recipe_of(checkpoint, seed, sampler, **part), endings)
     stale = _stale(store, replace)
     shown: list[np.ndarray] = []
@@ -92,17 +88,15 @@ def write_samples(
             bar.set(numbers.stop)
     if region is not None:
         shown, rays = [region.crop(torch.from_numpy(image)).numpy() for image in shown], region.crop(rays)
-    if shown and channels == "reflectance":
-        draw_reflectances(shown[:8], out)
-    elif shown:
+    if shown:
         path = checkpoint.path.resolve()
         model = path.parents[1].name if path.parent.name == FOLDER else path.stem
         draw_pages(shown, rays, out, f"{model}, seed {seed}")
 
 
-def _endings(checkpoint: Checkpoint, channels: str, formats: Sequence[str] | None) -> Sequence[str]:
-    """Endings of the files of a sample; refuses formats that cannot hold the channels."""
-    fitting = formats_of(checkpoint, channels)
+def _chosen(checkpoint: Checkpoint, formats: Sequence[str] | None) -> Sequence[str]:
+    """The formats, by default all of `formats_of`; refuses others."""
+    fitting = formats_of(checkpoint)
     formats = fitting if formats is None else formats
     if other := [name for name in formats if name not in fitting]:
         raise InputError(f"--format {','.join(other)} is none of {','.join(fitting)}, which can hold these scans.")
@@ -111,7 +105,7 @@ def _endings(checkpoint: Checkpoint, channels: str, formats: Sequence[str] | Non
             "the model uses rays through the corners of bins (rays=reference); points are written along rays through "
             "bin centres, closer to the returns (docs/data.md, Projection)"
         )
-    return ["reflectance.npy"] if channels == "reflectance" else formats
+    return formats
 
 
 def warn_unsolved(converged: Tensor, first: int = 0) -> None:
@@ -192,20 +186,6 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str
     images = images[: most_images(rays.shape)]
     captions = [f"sample {number}" for number in range(len(images))]
     write_page(out / "samples.html", images, rays, captions, title=title)
-
-
-def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> None:
-    """Write `samples.png` of scans without range, (1, h, w) each: reflectance images in a column."""
-    from matplotlib.figure import Figure
-
-    from r2flow.reports.pictures import WIDTH, draw_reflectance, save_figure
-
-    figure = Figure((WIDTH, 0.7 * len(images) + 0.3), facecolor="white")
-    figure.set_layout_engine("constrained")
-    axes: Any = figure.subplots(len(images), 1, squeeze=False)[:, 0]
-    for row, (image, place) in enumerate(zip(images, axes, strict=True)):
-        draw_reflectance(place, np.concatenate([image, image]), label=row == 0)  # rays without reflectance are dropped
-    save_figure(figure, out / "samples.png")
 
 
 def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
