@@ -4,7 +4,7 @@ import logging
 import os
 import sys
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
@@ -19,7 +19,7 @@ from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, ch
 from r2flow.errors import InputError, check
 
 if TYPE_CHECKING:
-    from r2flow.reports.view.panels import Panel, View
+    from r2flow.reports.view.panels import Panel
 
 log = logging.getLogger(__name__)
 
@@ -27,18 +27,15 @@ SCANS, SAMPLES = 16, 4  # default numbers per folder and per generator
 MOST = 256  # largest number of each per page
 
 
-def views(scans: Sequence[str], how: ReadingOptions, most: int) -> "list[View]":
-    """Load scans as views, at most `most` per folder."""
+def panels_of(spec: str, how: ReadingOptions, most: int, labelled: bool = True) -> "Iterator[Panel]":
+    """At most `most` scans of a set as panels."""
     from r2flow.data.opening import own_reading
-    from r2flow.reports.view.panels import views_of
+    from r2flow.reports.view.panels import scan_panels
 
-    loaded: list[View] = []
-    for spec in scans:
-        reading = how.reading([spec])
-        if how.reflectance_scale is None and own_reading(spec) is None:  # do not guess it from the values
-            reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
-        loaded += views_of(spec, reading, most)
-    return loaded
+    reading = how.reading([spec])
+    if how.reflectance_scale is None and own_reading(spec) is None:  # do not guess it from the values
+        reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
+    return scan_panels(spec, reading, most, labelled)
 
 
 @app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
@@ -58,19 +55,18 @@ def show(
     from r2flow.reports.pictures import save_figure, scan_figure
 
     names: list[str] = []
-    for view in views(scans, how, most):
-        stem = view.path.stem
-        names.append(next(s for n in count(1) if (s := stem if n == 1 else f"{stem}_{n}") not in names))
+    for caption, (image,), rays, classes in (panel for spec in scans for panel in panels_of(spec, how, most, labels)):
+        file = Path(caption)
+        names.append(next(s for n in count(1) if (s := file.stem if n == 1 else f"{file.stem}_{n}") not in names))
         path = out / f"{names[-1]}.{format}"
         if format == "npy":
-            save_array(path, view.image)
-            size, returns = " x ".join(map(str, view.image.shape)), (view.image[0] > 0).mean()
+            save_array(path, image)
+            size, returns = " x ".join(map(str, image.shape)), (image[0] > 0).mean()
             print(f"{path}: {size}, {returns:.1%} returns")
             continue
-        image, classes = view.labelled() if labels else (view.image, None)
         if labels and classes is None:
-            log.warning("%s: no .label file next to it", view.path)
-        print(save_figure(scan_figure(image, view.rays, view.path.name, classes), path))
+            log.warning("%s: no .label file next to it", caption)
+        print(save_figure(scan_figure(image, rays, file.name, None if classes is None else classes[0]), path))
 
 
 @app.command(epilog="Example: r2flow view street velodyne/0000000100.bin --steps 1,2,4,32 --out page.html")
@@ -106,7 +102,7 @@ def view(
     """
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.reports.view.panels import in_turn, sample_panels, scan_panels, way_panels, write_panels
+    from r2flow.reports.view.panels import in_turn, sample_panels, way_panels, write_panels
 
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out must be a file that ends in .html, found {out}.")
@@ -123,7 +119,7 @@ def view(
     frames: list[str] = []
     for spec in what:
         if spec not in models:
-            new = scan_panels(views([spec], how, num or SCANS))
+            new = list(panels_of(spec, how, num or SCANS))
             if sequence and len(new) > 1:
                 combined, frames = in_turn(new, spec)
                 new = [combined]

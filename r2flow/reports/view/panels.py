@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +16,7 @@ from r2flow.data.opening import find_drives, open_scans, own_reading, parse
 from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import Reading, read_labelled_scan
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanFiles, SimulatedScans, spread, warn_of_other_sensor
+from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.generators import as_flow
 from r2flow.generators.flow import ode_sampler
@@ -28,69 +28,6 @@ from r2flow.noise import Draws
 from r2flow.reports.outputs import ScanBar, warn_unsolved
 from r2flow.reports.view import write_page
 from r2flow.samplers import OnGrid
-
-
-class View(NamedTuple):
-    """A scan to draw: its path, and its index in an opened set."""
-
-    path: Path
-    scans: ScanSet
-    number: int
-
-    @property
-    def image(self) -> np.ndarray:
-        return self.scans.source[self.number]
-
-    @property
-    def rays(self) -> Tensor:
-        return self.scans.sensor.rays()
-
-    def labelled(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """The image, and semantic ids, (H, W), from a .label file or the simulator; else None."""
-        source = self.scans.source
-        if isinstance(source, SimulatedScans):
-            from r2flow.simulator import simulate
-
-            made = simulate(source.sensor, source.seed, source.scenes[self.number])
-            return made.image[: 1 + source.reflectance], made.labels
-        if not isinstance(source, ScanFiles):
-            return self.image, None
-        path, reading = Path(source.paths[self.number]), source.reading
-        if labels_beside(path) is None or read_range_image(path) is not None:
-            return self.image, None
-        return read_labelled_scan(path, replace(reading, on_bad_scan="error"))
-
-
-def scans_of(path: Path) -> list[Path]:
-    """A scan file, or the scans of a folder."""
-    if not path.is_dir():
-        return [path]
-    return [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
-
-
-def _print_choice(what: str | Path, count: int, most: int) -> None:
-    if count > most:
-        print(f"{what}: {most} of its {count:,} scans, evenly spread (--num)")
-
-
-def views_of(spec: str, reading: Reading, most: int) -> list[View]:
-    """Up to `most` scans of a set (`open_scans`), evenly spread.
-
-    Files not written by r2flow are opened one by one, since sizes of range images and reflectance may differ.
-    """
-    reading = replace(reading, on_bad_scan="error")
-    options, file = parse(spec)
-    if own_reading(spec) is None and options.name == FOLDER:
-        paths = scans_of(file or Path(options.folder))
-        _print_choice(spec, len(paths), most)
-        chosen = [paths[index] for index in spread(len(paths), most)]
-        warn_of_other_sensor(chosen, reading, spec)
-        return [View(path, open_scans(path, reading, own_size=True), 0) for path in chosen]
-    opened = open_scans(spec, reading)
-    if options.name != SIMULATED:  # simulated sets have any size
-        _print_choice(spec, len(opened), most)
-    scans = opened.spread(most)
-    return [View(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
 
 
 class Panel(NamedTuple):
@@ -114,15 +51,60 @@ def write_panels(path: str | Path, panels: Sequence[Panel], frames: Sequence[str
     return write_page(path, images, rays, captions, frames=frames, labels=labels, title=title)
 
 
-def scan_panels(views: Sequence[View]) -> list[Panel]:
-    """One panel per scan, captioned by file name, with the folder where names are ambiguous."""
-    counts = Counter(view.path.name for view in views)
-    panels = []
-    for view in views:
-        image, labels = view.labelled()
-        caption = view.path.name if counts[view.path.name] == 1 else f"{view.path.parent.name}/{view.path.name}"
-        panels.append(Panel(caption, image[None], view.rays, None if labels is None else labels[None]))
-    return panels
+def scans_of(path: Path) -> list[Path]:
+    """A scan file, or the scans of a folder."""
+    if not path.is_dir():
+        return [path]
+    return [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
+
+
+def _print_choice(what: str | Path, count: int, most: int) -> None:
+    if count > most:
+        print(f"{what}: {most} of its {count:,} scans, evenly spread (--num)")
+
+
+def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -> Iterator[Panel]:
+    """A panel for each of up to `most` scans of a set (`open_scans`), evenly spread.
+
+    The caption is the file name, with the folder where names are ambiguous. Files not written by r2flow are opened one
+    by one, since sizes of range images and reflectance may differ.
+
+    Args:
+        labelled: Whether to read semantic ids, of .label files or of the simulator.
+    """
+    reading = replace(reading, on_bad_scan="error")
+    options, file = parse(spec)
+    views: list[tuple[Path, ScanSet, int]]
+    if own_reading(spec) is None and options.name == FOLDER:
+        paths = scans_of(file or Path(options.folder))
+        _print_choice(spec, len(paths), most)
+        chosen = [paths[index] for index in spread(len(paths), most)]
+        warn_of_other_sensor(chosen, reading, spec)
+        views = [(path, open_scans(path, reading, own_size=True), 0) for path in chosen]
+    else:
+        opened = open_scans(spec, reading)
+        if options.name != SIMULATED:  # simulated sets have any size
+            _print_choice(spec, len(opened), most)
+        scans = opened.spread(most)
+        views = [(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
+    counts = Counter(path.name for path, *_ in views)
+    for path, scans, number in views:
+        image, labels = _labelled(scans.source, number) if labelled else (scans.source[number], None)
+        caption = path.name if counts[path.name] == 1 else f"{path.parent.name}/{path.name}"
+        yield Panel(caption, image[None], scans.sensor.rays(), None if labels is None else labels[None])
+
+
+def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """An image, and its semantic ids, (H, W), if there are any."""
+    if isinstance(source, SimulatedScans):
+        from r2flow.simulator import simulate
+
+        made = simulate(source.sensor, source.seed, source.scenes[number])
+        return made.image[: 1 + source.reflectance], made.labels
+    path = Path(source.paths[number]) if isinstance(source, ScanFiles) else None
+    if path is None or labels_beside(path) is None or read_range_image(path) is not None:
+        return source[number], None
+    return read_labelled_scan(path, replace(source.reading, on_bad_scan="error"))  # type: ignore[attr-defined]
 
 
 def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
