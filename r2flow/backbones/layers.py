@@ -136,11 +136,9 @@ class MappingLayer(nn.Module):
         return x + self.linear(self.dropout(self.glu(self.gegelu(self.norm(x)))))
 
 
-def mapping_network(
-    channels: int, layers: int = 2, linear: type[nn.Linear] = ExactLinear, dropout: float = 0.0
-) -> nn.Sequential:
-    """RMSNorm, residual GEGLU layers, RMSNorm: the mapping network of HDiT's embeddings."""
-    middle = [MappingLayer(channels, linear, dropout) for _ in range(layers)]
+def mapping_network(channels: int, linear: type[nn.Linear] = ExactLinear, dropout: float = 0.0) -> nn.Sequential:
+    """RMSNorm, two residual GEGLU layers, RMSNorm: the mapping network of HDiT's embeddings."""
+    middle = [MappingLayer(channels, linear, dropout) for _ in range(2)]
     return nn.Sequential(RMSNorm(channels), *middle, RMSNorm(channels))
 
 

@@ -50,13 +50,6 @@ def test_the_inner_network_sees_the_mean_rays():
     assert torch.allclose(model.inner.coords, rays(ROWS // 2, COLUMNS // 4), atol=1e-6)
 
 
-def test_a_turned_image_gives_a_turned_answer():
-    model = tiny("pyramid", inner={**tiny_options("adm_unet"), "position": "none"}).double()
-    x = image().double()
-    turned = model(0.4, x.roll(16, -1))
-    assert torch.allclose(turned, model(0.4, x).roll(16, -1), atol=1e-5)
-
-
 @pytest.mark.parametrize("channel", [2, 3, 4])
 def test_a_condition_is_seen_inside_and_around(channel):
     model, seen = tiny("pyramid", 5, 2), []
@@ -91,7 +84,7 @@ def test_jumps_move_the_means_as_the_inner_network_does():
     ({"factor": [2]}, "factor must be 2 integers"),
     ({"inner": {"name": "hdi"}}, "hdit"),
     ({"inner": {"depths": [1]}}, "needs a 'name'"),
-    ({"inner": {"name": "hdit", "patch": [3, 4]}}, "height 16 cannot be used by HDiT"),
+    ({"inner": {"name": "hdit", "patch": [3, 4]}}, "height 16 cannot be used by Pyramid"),
     ({"data_std": 0.5}, "leave backbone.data_std out"),
 ])  # fmt: skip
 def test_what_cannot_be_built(options, message):
