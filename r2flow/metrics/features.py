@@ -39,14 +39,11 @@ class FeatureMetric(ScanMetric):
         return Protocol(self.name, self.representation, self.mask, network.name, network.weights, layer, self.settings)
 
     def rows(self, scans: Scans) -> Tensor:
-        return extract(self.extractor, scans)
-
-
-def extract(extractor: Extractor, scans: Scans) -> Tensor:
-    """Features of a batch, (B, D), computed once per network for all metrics."""
-    # Networks with equal names and weights are the same; random networks are identified by object.
-    key = extractor if extractor.weights == "random" else (extractor.name, extractor.weights)
-    if key not in scans.features:
-        with torch.no_grad():
-            scans.features[key] = extractor.features(scans)
-    return scans.features[key]
+        """Features of a batch, (B, D), computed once per network for all metrics."""
+        # Networks with equal names and weights are the same; random networks are identified by object.
+        network = self.extractor
+        key = network if network.weights == "random" else (network.name, network.weights)
+        if key not in scans.features:
+            with torch.no_grad():
+                scans.features[key] = network.features(scans)
+        return scans.features[key]
