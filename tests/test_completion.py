@@ -148,8 +148,6 @@ def test_a_flow_that_was_not_trained_to_complete_does_so_too():
         known = (of != Ray.UNKNOWN).expand(2, 2, -1, -1)
         assert torch.equal(found.images[known], image.expand(2, -1, -1, -1)[known])
         assert found.evaluations.tolist() == [30, 30]  # three in each of ten steps
-    nothing = torch.zeros_like(state)
-    assert torch.equal(checkpoint.complete(images, nothing)[:, 0], checkpoint.sample(2))
 
 
 def test_spread_is_over_the_answers_with_a_return():

@@ -57,8 +57,6 @@ sample run -o out --sector nan,3
 sample run -o out --rows 5-3
 sample run -o out --rows 0-99
 sample run -o out --rows ' -1-3'
-sample run -o out --channels reflectance --format ply
-sample run -o out --channels range --format bin
 sample run -o out --grid nope
 sample run -o out --grid nowhere.json
 sample run -o out --sampler dopri5 --grid power:2

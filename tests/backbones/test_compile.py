@@ -11,9 +11,9 @@ from torch import Tensor
 MODES = list(itertools.product((True, False), (True, False)))  # gradients, autocast
 
 
-def quick(names):
+def quick(names, times):
     """All of them, those but HDiT in the long run of the tests: tracing takes seconds."""
-    return [name if name == "hdit" else pytest.param(name, marks=pytest.mark.slow) for name in names]
+    return [pytest.param(name, times, marks=() if name == "hdit" else pytest.mark.slow) for name in names]
 
 
 class Counter:
@@ -27,23 +27,14 @@ class Counter:
         return graph.forward
 
 
-@pytest.mark.parametrize("name", quick(NAMES))
-def test_the_whole_model_is_one_graph(name):
+@pytest.mark.parametrize(("name", "times"), [*quick(NAMES, 1), *quick(TWO_TIMES, 2)])
+def test_the_whole_model_is_one_graph(name, times):
     torch.compiler.reset()
-    model, counter = tiny(name), Counter()
+    model, counter = tiny(name, second_time=times == 2), Counter()
     compiled, x = torch.compile(model, backend=counter, fullgraph=True), image()
-    for t in (torch.rand(2), torch.rand(2)):
-        torch.testing.assert_close(compiled(t, x), model(t, x), rtol=0, atol=1e-5)
-    assert counter.graphs == 1
-
-
-@pytest.mark.parametrize("name", quick(TWO_TIMES))
-def test_two_times_are_one_graph(name):
-    torch.compiler.reset()
-    model, counter = tiny(name, second_time=True), Counter()
-    compiled, x = torch.compile(model, backend=counter, fullgraph=True), image()
-    for t, s in (torch.rand(2, 2), torch.rand(2, 2)):
-        torch.testing.assert_close(compiled(t, x, s), model(t, x, s), rtol=0, atol=1e-5)
+    for _ in range(2):
+        t, *s = torch.rand(times, 2)
+        torch.testing.assert_close(compiled(t, x, *s), model(t, x, *s), rtol=0, atol=1e-5)
     assert counter.graphs == 1
 
 

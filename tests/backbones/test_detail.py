@@ -33,13 +33,6 @@ def test_the_path_sees_single_pixels():
     assert changed[:, 63].nonzero()[:, 0].tolist() == [6, 7, 8, 9, 10]
 
 
-def test_a_turned_image_gives_a_turned_answer():
-    model = tiny("hdit", detail=[2, 8], position="none", window=[3, 5], depths=[1, 1]).double()
-    x = image().double()
-    turned = model(0.4, x.roll(16, -1))
-    assert torch.allclose(turned, model(0.4, x).roll(16, -1), atol=1e-5)  # rays are float32
-
-
 def test_a_part_of_the_image_has_no_ring():
     model = tiny("hdit", detail=[2, 8])
     part = model.cropped(torch.arange(16), torch.arange(16, 48))

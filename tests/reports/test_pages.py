@@ -44,16 +44,12 @@ def test_every_file_says_where_it_comes_from(tmp_path):
         assert str(tmp_path) not in content  # nor any other path of the machine
 
 
-def test_the_csv_reads_back(tmp_path):
-    write_page(page(), tmp_path)
+def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
+    write_page(page(more={"paths": [{"values": [1.0, math.inf]}]}), tmp_path)
     lines = (tmp_path / "speed.csv").read_text().splitlines()
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     assert rows[0] == {"solver": "euler", "evaluations": "4", "error": "0.5", "note": ""}
     assert rows[1]["solver"] == "a|b, c"
-
-
-def test_the_json_is_strict_and_whole(tmp_path):
-    write_page(page(more={"paths": [{"values": [1.0, math.inf]}]}), tmp_path)
 
     def refuse(constant):
         raise AssertionError(constant)
@@ -63,18 +59,8 @@ def test_the_json_is_strict_and_whole(tmp_path):
     assert content["paths"] == [{"values": [1.0, None]}]
     assert content["origin"]["seeds"] == {"scenes": 3}
     assert content["origin"]["machine"]["cores"] >= 1
-
-
-def test_the_markdown_shows_the_figure_the_text_and_the_command(tmp_path):
-    write_page(page(), tmp_path)
-    text = (tmp_path / "speed.md").read_text()
-    for words in (
-        "# How fast\n",
-        "![speed](speed.png)",
-        "First.",
-        "| a\\|b, c | - |",
-        "```\nr2flow report speed 'a b'\n",
-    ):
+    text, command = (tmp_path / "speed.md").read_text(), "```\nr2flow report speed 'a b'\n"
+    for words in ("# How fast\n", "![speed](speed.png)", "First.", "| a\\|b, c | - |", command):
         assert words in text
 
 

@@ -125,15 +125,15 @@ def fitted(stage: Reflow, steps: int = 1200) -> Reflow:
 X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
 
 
-@pytest.mark.parametrize("loss", ["pseudo_huber", "pseudo_huber_elementwise", "mse"])
-def test_a_reflowed_gaussian_takes_one_step(loss: str):
-    end = solve(fitted(Reflow(affine(), loss)).generator.velocity, X_0, steps=1).x.detach()
-    torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
-
-
-@pytest.mark.parametrize("k", [1, 2, 4])
-def test_a_distilled_flow_is_right_at_its_own_number_of_steps(k: int):
-    end = solve(fitted(Distill(affine(), steps=k)).generator.velocity, X_0, steps=k).x.detach()
+@pytest.mark.parametrize(
+    ("stage", "options", "steps"),
+    [
+        *((Reflow, {"loss": loss}, 1) for loss in ("pseudo_huber", "pseudo_huber_elementwise", "mse")),
+        *((Distill, {"steps": k}, k) for k in (1, 2, 4)),
+    ],
+)
+def test_a_reflowed_gaussian_takes_one_step_and_a_distilled_one_its_own_number(stage, options: dict, steps: int):
+    end = solve(fitted(stage(affine(), **options)).generator.velocity, X_0, steps=steps).x.detach()
     torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
 
 

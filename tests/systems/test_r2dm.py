@@ -2,10 +2,8 @@
 
 import json
 import math
-import re
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +11,6 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones import Backbone, build_backbone
-from r2flow.callbacks.ema import ema_decay
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
@@ -104,16 +101,10 @@ def test_loss_weights_are_the_published(shared):
             torch.testing.assert_close(PREDICTIONS[name].weight(log_snr, gamma), expected, rtol=1e-6, atol=0)
 
 
-def test_learning_rate_and_average_are_the_published(shared):
-    case = load_case(shared, "r2dm_schedules.pt")
-    lr, ema = case["lr_factor"], case["ema"]
+def test_the_learning_rate_is_the_published(shared):
+    lr = load_case(shared, "r2dm_schedules.pt")["lr_factor"]
     found = [learning_rate_factor(n, lr["warmup"], lr["total"]) for n in range(lr["total"] + 1)]
     assert found == pytest.approx(lr["factor"].tolist(), abs=1e-6)
-    average = ema["online"][0]
-    for call, online in enumerate(ema["online"]):
-        if call % ema["update_every"] == 0:
-            average = torch.lerp(online, average, ema_decay(call, ema["update_after_step"], ema["beta"], ema["power"]))
-        assert_near(average, ema["ema"][call], 1e-6)
 
 
 @pytest.mark.parametrize("name", ["eps_l2", "eps_l2_masked"])
@@ -306,37 +297,13 @@ def test_a_published_checkpoint_predicts_what_its_authors_did(shared, averaged):
     assert diffusion.sampler == build_sampler("ddpm", steps=256)
 
 
-def damaged(path: Path, tmp_path: Path, change) -> Path:
-    content = torch.load(path, weights_only=True)
-    change(content["cfg"])
-    torch.save(content, tmp_path / "changed.pth")
-    return tmp_path / "changed.pth"
-
-
 def test_unfolded_scans_look_along_the_rings_of_the_weights(shared, tmp_path):
     path = shared / "oracle_baselines" / "r2dm_published.pth"
-    changed = damaged(path, tmp_path, lambda cfg: cfg["data"].update(projection="unfolding-64"))
-    rings = torch.rad2deg(torch.load(path, weights_only=True)["ema_weights"]["model.coords"][0, 0, :, 0].double())
+    content, changed = torch.load(path, weights_only=True), tmp_path / "changed.pth"
+    content["cfg"]["data"]["projection"] = "unfolding-64"
+    torch.save(content, changed)
+    rings = torch.rad2deg(content["ema_weights"]["model.coords"][0, 0, :, 0].double())
     assert load_checkpoint(changed).sensor.elevations == pytest.approx(rings.tolist())
-
-
-CHANGES = {
-    "found 90.0 and 80.0": lambda cfg: cfg["data"].update(min_depth=90.0),
-    "only diffusions of range in continuous time": lambda cfg: cfg["diffusion"].update(timestep_type="discrete"),
-    "only diffusions of range": lambda cfg: cfg["data"].update(train_depth=False),
-    "KeyError: 'data'": lambda cfg: cfg.pop("data"),
-    "KeyError: 'disparity'": lambda cfg: cfg["data"].update(depth_format="disparity"),
-    "no published architecture named 'refinenet'": lambda cfg: cfg["model"].update(architecture="refinenet"),
-    "no log-SNR schedule named 'sigmoid'": lambda cfg: cfg["diffusion"].update(noise_schedule="sigmoid"),
-}
-
-
-@pytest.mark.parametrize("said", CHANGES)
-def test_a_published_config_that_is_not_understood_is_one_line(shared, tmp_path, said):
-    path = damaged(shared / "oracle_baselines" / "r2dm_published.pth", tmp_path, CHANGES[said])
-    with pytest.raises(InputError, match=re.escape(said)) as refused:
-        load_checkpoint(path)
-    assert len(str(refused.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize("name", PREDICTIONS)
