@@ -112,8 +112,7 @@ class Registry(Generic[T]):
         chosen = dict(options)
         name = chosen.pop("name")
         constructor: Any = self[name]
-        check_options(f"{self.kind} '{name}'", constructor, chosen, given=len(args))
-        return constructor(*args, **chosen)
+        return construct(f"{self.kind} '{name}'", constructor, chosen, *args)
 
 
 def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> None:
@@ -129,6 +128,12 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
         return
     if problem := next(_problems(_by_keyword(parameters[given:]), options), None):
         raise InputError(f"{what}{problem}")
+
+
+def construct(what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any) -> T:
+    """Call a constructor with `args` and a config's options, which are checked; None: its defaults."""
+    check_options(what, constructor, options or {}, given=len(args))
+    return constructor(*args, **(options or {}))
 
 
 def _problems(known: Mapping[str, inspect.Parameter], options: Mapping[str, Any]) -> Iterator[str]:

@@ -11,10 +11,10 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
+    DeviceOption,
     PrecisionOption,
     ReadingOptions,
     SamplerOptions,
-    WorkOptions,
     choose_device,
     command,
     grouped,
@@ -25,7 +25,6 @@ from r2flow.errors import InputError, check
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
-    from r2flow.evaluation.measuring import Work
     from r2flow.generators import Generator, Sampler
     from r2flow.metrics.base import ScanMetric
     from r2flow.model.checkpoint import Checkpoint
@@ -81,6 +80,9 @@ class EvaluateOptions:
     tolerance: Annotated[float | None, typer.Option(help="Error tolerance per step, for adaptive samplers.")] = None
     precision: PrecisionOption = "32-true"
     seed: Annotated[int, typer.Option(min=0, help="Seed of sampled scans.")] = 0
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans per batch.")] = 8
+    workers: Annotated[int, typer.Option(min=0, help="Additional processes that read scans.")] = 2
+    device: DeviceOption = "auto"
     json: Annotated[Path | None, typer.Option("--json", help="JSON file for all results with their protocols.")] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page.", show_default=False)] = None
 
@@ -104,7 +106,6 @@ def evaluate(
     real: Annotated[str, typer.Argument(help=f"Real scans: {SETS}.", show_default=False)],
     options: EvaluateOptions,
     how: ReadingOptions,
-    work: WorkOptions,
     generated: Annotated[
         list[str] | None,
         typer.Argument(
@@ -119,30 +120,26 @@ def evaluate(
     several --steps or --sampler plot distance against evaluations and seconds. The same command with --out resumes.
     Under torchrun, processes share the scans.
     """
-    from r2flow.evaluation.measuring import Work, check_reflectance
+    from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
-    from r2flow.metrics import METRICS, default_metrics
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.processes import joined, place
-    from r2flow.reports.compare import labels
     from r2flow.reports.pages import prepare_folder
 
     named = list(dict.fromkeys(generated or []))
     sampled = [name for name in named if is_checkpoint(name)]
     rules = PROTOCOLS[options.protocol]
     options.check(named, sampled)
-    with joined(choose_device(work.device)) as device:
-        keep = options.bootstrap > 0
-        chosen = None
-        if options.metrics not in (None, "all"):
-            chosen = _build(options.metrics.split(","), keep, device)
+    with joined(choose_device(options.device)) as device:
+        names = None if options.metrics in (None, "all") else options.metrics.split(",")
+        chosen = names and {name: _build(name, options, device) for name in dict.fromkeys(names)}
         flows = {name: load_checkpoint(name, device) for name in sampled}
         if len({(flow.sensor.shape, flow.sensor.elevations) for flow in flows.values()}) > 1:
             raise InputError(f"{', '.join(flows)} have different sensors or image sizes; measure each by itself.")
         if flows and options.num is None and place()[0] == 0:
             print(f"{', '.join(flows)}: sampling {SAMPLED} scans per set (change the number by --num)")
-        files = [name for name in named if name not in sampled]
+        files = [name for name in named if name not in flows]
         reading = how.reading([real, *files, options.train], next(iter(flows.values()), None))
         if rules.convention is not None and how.convention is None:
             reading = replace(reading, convention=rules.convention)
@@ -150,32 +147,20 @@ def evaluate(
             reading = replace(reading, reflectance=False)  # else a scale would be required
         truth = _open(real, reading, options.split, options.real_num)
         rules.check(truth)
-        scaled = replace(reading, reflectance_scale=options.generated_scale or reading.reflectance_scale)
-        judged: dict[str, ScanSet] = {}
-        for text, name in zip(named, labels([Path(text) for text in named]), strict=True):
-            if text in sampled:
-                judged |= _sampled(name, flows[text], options)
-            else:
-                judged[name] = _open(text, scaled, options.generated_split, options.num)
-        if len(judged) == 1:
-            judged = {"generated": next(iter(judged.values()))}
+        judged = _judged(named, flows, reading, options)
         sets = [truth, *judged.values()]
-        reflectance = all(s.about["reflectance"] for s in sets)
-        reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
-        usual = [*METRICS] if options.metrics == "all" else default_metrics(reflectance)
-        metrics = chosen or _build_possible(usual, reflectance, keep, device)
+        metrics = chosen or _build_possible(all(s.about["reflectance"] for s in sets), options, device)
         check_reflectance(metrics, sets)
         training = None if options.train is None else _open(options.train, reading, options.train_split, None)
         for folder in (options.out, options.json.parent if options.json else None):
             if folder is not None:
                 prepare_folder(folder)
-        _compare(truth, metrics, Work(work.batch_size, work.workers), device, judged, training, options)
+        _compare(truth, metrics, device, judged, training, options)
 
 
 def _compare(
     truth: "ScanSet",
     metrics: "Mapping[str, ScanMetric]",
-    work: "Work",
     device: str,
     judged: "dict[str, ScanSet]",
     training: "ScanSet | None",
@@ -184,6 +169,7 @@ def _compare(
     """Compare all sets; the first process prints and writes the results."""
     from r2flow.evaluation.comparing import Comparer, pairs_of
     from r2flow.evaluation.copies import Nearest, find_nearest, with_copies
+    from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.statistics import Cache
     from r2flow.processes import place
@@ -191,6 +177,7 @@ def _compare(
     from r2flow.reports.pages import write_json, write_page
     from r2flow.reports.view.panels import write_sets
 
+    work = Work(options.batch_size, options.workers)
     rules, cache = PROTOCOLS[options.protocol], None if options.no_cache else Cache()
     compare = Comparer(metrics, work, rules, options.bootstrap, cache, options.out and options.out / "results", device)
     comparisons = [compare(*pair) for pair in pairs_of(truth, judged, options.reference, options.baselines)]
@@ -223,6 +210,22 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
     check(len(scans), f"{text} contains no scan.")
     _ = scans.source[0]  # fail before the other set is read
     return scans
+
+
+def _judged(
+    named: Sequence[str], flows: "Mapping[str, Checkpoint]", reading: "Reading", options: EvaluateOptions
+) -> "dict[str, ScanSet]":
+    """The sets of GENERATED by name: files, and samples of models."""
+    from r2flow.reports.compare import labels
+
+    reading = replace(reading, reflectance_scale=options.generated_scale or reading.reflectance_scale)
+    sets: dict[str, ScanSet] = {}
+    for text, name in zip(named, labels([Path(text) for text in named]), strict=True):
+        if text in flows:
+            sets |= _sampled(name, flows[text], options)
+        else:
+            sets[name] = _open(text, reading, options.generated_split, options.num)
+    return {"generated": next(iter(sets.values()))} if len(sets) == 1 else sets
 
 
 def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[str, ScanSet]":
@@ -270,19 +273,21 @@ def _samplers(
     return chosen
 
 
-def _build(names: Sequence[str], keep: bool, device: str) -> "dict[str, ScanMetric]":
+def _build(name: str, options: EvaluateOptions, device: str) -> "ScanMetric":
     from r2flow.metrics import METRICS
 
-    return {name: METRICS[name](keep=keep).to(device) for name in dict.fromkeys(names)}
+    return METRICS[name](keep=options.bootstrap > 0).to(device)
 
 
-def _build_possible(names: Sequence[str], reflectance: bool, keep: bool, device: str) -> "dict[str, ScanMetric]":
-    """Build the metrics that can be computed here; warn about the others."""
+def _build_possible(reflectance: bool, options: EvaluateOptions, device: str) -> "dict[str, ScanMetric]":
+    """Build the default metrics, or all, that can be computed here; warn about the others."""
+    from r2flow.metrics import METRICS, default_metrics
+
     built: dict[str, ScanMetric] = {}
     left_out: dict[str, list[str]] = {}
-    for name in names:
+    for name in METRICS if options.metrics == "all" else default_metrics(reflectance):
         try:
-            metric = _build([name], keep, device)[name]
+            metric = _build(name, options, device)
         except InputError:
             left_out.setdefault("their weights are not installed (r2flow weights)", []).append(name)
             continue

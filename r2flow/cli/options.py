@@ -138,15 +138,6 @@ class ReadingOptions:
 
 
 @dataclass(frozen=True)
-class WorkOptions:
-    """Batch size, processes and device; results do not depend on them."""
-
-    batch_size: Annotated[int, typer.Option(min=1, help="Scans per batch.")] = 8
-    workers: Annotated[int, typer.Option(min=0, help="Additional processes that read scans.")] = 2
-    device: DeviceOption = "auto"
-
-
-@dataclass(frozen=True)
 class SamplerOptions:
     """Sampler of a generator; defaults come from the generator's sampler."""
 

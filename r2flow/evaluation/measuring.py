@@ -67,7 +67,6 @@ def gather_real(
     metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, cache: Cache | None = None, protocol: Rules = R2FLOW
 ) -> dict[str, Statistics]:
     """Compute each metric's statistics of the real scans, or read them from the cache."""
-    protocol.check(real)
     chosen = {name: real_rule(metric, real, protocol) for name, metric in metrics.items()}
     points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
     statistics: dict[str, Statistics] = {}

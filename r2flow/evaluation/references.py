@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanSource
 from r2flow.errors import check
+from r2flow.evaluation.sets import MadeScans
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator, standard_normal
@@ -39,29 +39,19 @@ def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None
     return pairs
 
 
-class Baseline(ScanSource):
-    """Scans (2 or 1, H, W) of a baseline without a model, by index.
+class Baseline(MadeScans):
+    """Scans (2 or 1, H, W) of a baseline without a model.
 
     Args:
-        name: Name in `BASELINES`.
+        word: Name in `BASELINES`.
         training: Real scans, (N, 2 or 1, H, W).
     """
 
-    def __init__(self, name: str, training: np.ndarray, sensor: Sensor, numbers: Sequence[int], seed: int = 0) -> None:
-        self.name, self.training, self.sensor, self.numbers, self.seed = name, training, sensor, numbers, seed
-
-    def __len__(self) -> int:
-        return len(self.numbers)
+    def __init__(self, word: str, training: np.ndarray, sensor: Sensor, numbers: Sequence[int], seed: int = 0) -> None:
+        self.word, self.training, self.sensor, self.numbers, self.seed = word, training, sensor, numbers, seed
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return BASELINES[self.name](self, self.numbers[index])
-
-    @property
-    def names(self) -> list[str]:
-        return [f"{self.name} {number}" for number in self.numbers]
-
-    def subset(self, indices: Sequence[int]) -> "Baseline":
-        return Baseline(self.name, self.training, self.sensor, [self.numbers[i] for i in indices], self.seed)
+        return BASELINES[self.word](self, self.numbers[index])
 
     def about(self) -> dict[str, object]:
         return {"kind": "baseline", "seed": self.seed, "reflectance": self.training.shape[1] > 1}

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from torch import Tensor
@@ -48,10 +49,29 @@ def sampled_set(
     return ScanSet(label, SampledScans(flow, range(num), sampler, seed, precision), flow.sensor, about)
 
 
-class SampledScans(ScanSource):
-    """Scans of a generator by number; each depends only on (seed, number)."""
+class MadeScans(ScanSource):
+    """Scans made on access, by their numbers; `word` begins their names."""
 
-    drawn = True
+    word: str
+    numbers: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{self.word} {number}" for number in self.numbers]
+
+    def subset(self, indices: Sequence[int]) -> Self:
+        part = copy.copy(self)
+        part.numbers = [self.numbers[i] for i in indices]
+        return part
+
+
+class SampledScans(MadeScans):
+    """Scans of a generator; each depends only on (seed, number)."""
+
+    drawn, word = True, "sample"
 
     def __init__(
         self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int, precision: Precision = "32-true"
@@ -61,19 +81,11 @@ class SampledScans(ScanSource):
         self.evaluations: list[int] = []  # network evaluations per scan
         self.seconds: list[float] = []  # seconds per scan, for each batch
 
-    def __len__(self) -> int:
-        return len(self.numbers)
-
     def __getitem__(self, index: int) -> np.ndarray:
         return self.batch([index])[0].numpy()
 
-    @property
-    def names(self) -> list[str]:
-        return [f"sample {number}" for number in self.numbers]
-
-    def subset(self, indices: Sequence[int]) -> "SampledScans":
-        part = copy.copy(self)
-        part.numbers = [self.numbers[i] for i in indices]
+    def subset(self, indices: Sequence[int]) -> Self:
+        part = super().subset(indices)
         part.evaluations, part.seconds = [], []
         return part
 

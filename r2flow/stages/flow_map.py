@@ -11,7 +11,7 @@ from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
-from r2flow.registry import Positive, check_options
+from r2flow.registry import Positive, construct
 from r2flow.samplers import Jump, build_sampler
 from r2flow.stages.base import Batch
 from r2flow.stages.reflow import Reflow
@@ -49,8 +49,7 @@ class LearnFlowMap(Reflow):
             raise InputError("a flow map learns jumps between times: give stage.jumps and leave stage.time out.")
         super().__init__(generator, time={"name": "uniform"}, **options)
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
-        check_options("stage.jumps", JumpTimes, jumps or {})
-        self.jumps = JumpTimes(**(jumps or {}))
+        self.jumps = construct("stage.jumps", JumpTimes, jumps)
         self.on_pairs = True
         generator.run_by(Jump(grid=self.jumps.grid))
 

@@ -18,7 +18,7 @@ from r2flow.generators.transfer import WEIGHTS, gain_of, scaled
 from r2flow.lidar.known import every_row, random_points, random_rows
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.lidar.space import ModelSpace
-from r2flow.registry import Count, Portion, check_options
+from r2flow.registry import Count, Portion, construct
 from r2flow.stages.base import Batch, SingleLoss
 
 
@@ -113,8 +113,7 @@ class Transfer(SingleLoss):
 
     def __init__(self, generator: Generator, tasks: Mapping[str, Any] | None = None, **options: Any) -> None:
         super().__init__(generator, **options)
-        check_options("stage.tasks", Tasks, tasks or {})
-        self.tasks = Tasks(**(tasks or {}))
+        self.tasks = construct("stage.tasks", Tasks, tasks)
         self.further = partial(self.tasks, generator.space)
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.generators import Generator
-from r2flow.registry import Count, NonNegative, Portion, Registry, check_options
+from r2flow.registry import Count, NonNegative, Portion, Registry, construct
 from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_gan
 from r2flow.systems.gan.augment import AdaptiveAugment, BatchDraws
@@ -61,10 +61,8 @@ class LearnGan(Stage):
         self.batch_size, self.r1, self.r1_every = batch_size, r1, r1_every
         channels, h, w = generator.space.shape
         self.discriminator: nn.Module = DISCRIMINATORS.build(discriminator or {"name": "dcgan"}, (h, w), channels)
-        check_options("stage.warmup", Warmup, warmup or {})
-        self.warmup = Warmup(**(warmup or {}))
-        check_options("stage.augment", AdaptiveAugment, augment or {})
-        self.augment = None if augment is None else AdaptiveAugment(**augment)
+        self.warmup = construct("stage.warmup", Warmup, warmup)
+        self.augment = None if augment is None else construct("stage.augment", AdaptiveAugment, augment)
 
     def configure_optimizers(self) -> Any:
         betas = self.betas[0], self.betas[1]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from r2flow.errors import check
 from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
-from r2flow.registry import Bound, Count, check_options
+from r2flow.registry import Bound, Count, construct
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.diffusion.generator import Share
 from r2flow.systems.diffusion.log_snr import square_root_linear
@@ -21,12 +21,6 @@ from r2flow.systems.latent.unet import LatentUNet
 
 Steps = Annotated[int, Bound("of at least 2", lambda n: n >= 2)]
 Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
-
-
-def build_autoencoder(space: ModelSpace, options: Mapping[str, Any] | None) -> Autoencoder:
-    """Build the autoencoder of a config's `generator.autoencoder` for an image space."""
-    check_options("generator.autoencoder", Autoencoder, options or {}, given=1)
-    return Autoencoder(space.shape[0], **(options or {}))
 
 
 class VQAutoencoder(Generator):
@@ -44,7 +38,7 @@ class VQAutoencoder(Generator):
         self, space: ModelSpace, backbone: Mapping[str, Any], autoencoder: Mapping[str, Any] | None = None
     ) -> None:
         super().__init__(space)
-        self.first_stage_model = build_autoencoder(space, autoencoder)
+        self.first_stage_model = construct("generator.autoencoder", Autoencoder, autoencoder, space.shape[0])
         self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
 
 
@@ -76,10 +70,9 @@ class LatentDiffusion(Generator):
     ) -> None:
         super().__init__(space)
         self.run_by(LatentDDIM())
-        self.first_stage_model = build_autoencoder(space, autoencoder)
+        self.first_stage_model = construct("generator.autoencoder", Autoencoder, autoencoder, space.shape[0])
         self.noise_shape = shape = self.first_stage_model.latent_shape(*space.shape[1:])
-        check_options("generator.unet", LatentUNet, unet or {}, given=1)
-        self.model = nn.ModuleDict({"diffusion_model": LatentUNet(shape, **(unet or {}))})
+        self.model = nn.ModuleDict({"diffusion_model": construct("generator.unet", LatentUNet, unet, shape)})
         with torch.device("cpu"):
             log_snr = square_root_linear(beta_first, beta_last, diffusion_steps)
         self.register_buffer("log_snr", log_snr.float(), persistent=False)

@@ -10,7 +10,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.lidar.encoding import Encoding, ShiftedLog
-from r2flow.registry import Natural, NonNegative, check_options
+from r2flow.registry import Natural, NonNegative, construct
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.diffusion.sampling import noised
 from r2flow.systems.latent.discriminator import (
@@ -68,10 +68,9 @@ class LearnAutoencoder(Stage):
     ) -> None:
         super().__init__(generator, **options)
         self.automatic_optimization = False
-        check_options("stage.discriminator", PatchDiscriminator, discriminator or {}, given=1)
         self.autoencoder = self.generator.first_stage_model
         channels = generator.space.shape[0] + self.autoencoder.mask
-        self.discriminator = PatchDiscriminator(channels, **(discriminator or {}))
+        self.discriminator = construct("stage.discriminator", PatchDiscriminator, discriminator, channels)
         rows, columns = generator.space.shape[1:]
         if min(rows, columns) < self.discriminator.smallest:
             raise InputError(
