@@ -82,46 +82,47 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     """
     measured = [m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)]
     metric = HEADLINE if HEADLINE in measured else next(iter(measured), "")
-    found: dict[str, dict[str, tuple[float, Comparison]]] = {"judged": {}, "reference": {}, "baseline": {}}
-    for one in comparisons:
-        values = [next(iter(m.figures.values())) for m in one.measured if m.metric == metric]
-        if values and math.isfinite(values[0]):
-            found[one.kind][one.name] = values[0], one
-    if HALVES not in found["reference"]:
+    values: dict[str, dict[str, tuple[float, Comparison]]] = {"judged": {}, "reference": {}, "baseline": {}}
+    for comparison in comparisons:
+        figures = [next(iter(m.figures.values())) for m in comparison.measured if m.metric == metric]
+        if figures and math.isfinite(figures[0]):
+            values[comparison.kind][comparison.name] = figures[0], comparison
+    if HALVES not in values["reference"]:
         return []
-    reference, halves = found["reference"][HALVES]
-    judged, baselines = (sorted(found[kind].values(), key=lambda pair: pair[0]) for kind in ("judged", "baseline"))
+    reference, halves = values["reference"][HALVES]
+    judged, baselines = (sorted(values[kind].values(), key=lambda pair: pair[0]) for kind in ("judged", "baseline"))
     best = baselines[0][0] if baselines else math.inf
     title, factor = heading(metric, metric)
     unbiased = metric.startswith("kid_")
+    equal = len(judged) > 1 and len({len(c.generated) for _, c in judged}) == 1
     lines = []
-    for value, one in judged:
-        compared, same = (value, one) if unbiased else found["reference"].get(f"{one.name}{AS_MANY}", (value, one))
-        here, there = (min(len(pair.real), len(pair.generated)) for pair in (same, halves))
+    for value, comparison in judged:
+        as_many = None if unbiased else values["reference"].get(f"{comparison.name}{AS_MANY}")
+        compared, pair = as_many or (value, comparison)
+        scans, of_half = (min(len(c.real), len(c.generated)) for c in (pair, halves))
         farther = compared > MARGIN * max(reference, 0)
-        if min(here, there) < ENOUGH:
-            order = f"{'above' if compared > reference else 'not above'} the real halves"
-            tells = f"{order}, {'below' if value < best else 'not below'} the baselines"
-            tells += (
-                f": an indication, as the halves of your {len(one.real)} real scans have {there} or more and the set "
-                f"has {len(one.generated)}: give {2 * ENOUGH} real and {ENOUGH} generated scans for a verdict"
+        if min(scans, of_half) < ENOUGH:
+            judgement = (
+                f"{'above' if compared > reference else 'not above'} the real halves, "
+                f"{'below' if value < best else 'not below'} the baselines: an indication, as the halves of your "
+                f"{len(comparison.real)} real scans have {of_half} or more and the set has "
+                f"{len(comparison.generated)}: give {2 * ENOUGH} real and {ENOUGH} generated scans for a verdict"
             )
         elif value >= best:
-            tells = "no nearer to the real scans than a baseline"
+            judgement = "no nearer to the real scans than a baseline"
         elif reference >= best:
-            tells = "undecided, as the real halves are above a baseline"
-        elif not unbiased and (here < there if farther else here > there):
-            tells = f"undecided, as the halves have other numbers of scans: give {there} generated scans"
+            judgement = "undecided, as the real halves are above a baseline"
+        elif not unbiased and (scans < of_half if farther else scans > of_half):
+            judgement = f"undecided, as the halves have other numbers of scans: give {of_half} generated scans"
         elif farther:
-            tells = "farther from the real scans than these are from each other"
+            judgement = "farther from the real scans than these are from each other"
         else:
-            tells = "not distinguishable from real scans by this figure"
-        known = [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
-        if same is not one:
-            known.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
-        equal = len(judged) > 1 and len({len(c.generated) for _, c in judged}) == 1
-        first = "nearest, " if equal and one is judged[0][1] else ""
-        lines.append(f"{one.name}: {first}{title} {value * factor:.3g} ({', '.join(known)}): {tells}.")
+            judgement = "not distinguishable from real scans by this figure"
+        bounds = [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
+        if as_many:
+            bounds.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
+        first = "nearest, " if equal and comparison is judged[0][1] else ""
+        lines.append(f"{comparison.name}: {first}{title} {value * factor:.3g} ({', '.join(bounds)}): {judgement}.")
     return lines
 
 
