@@ -1,6 +1,8 @@
 """Reference cases, tensors computed once with the published code of a system: reading and comparing."""
 
+import json
 import zlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,16 +51,46 @@ def assert_near(found: Any, expected: Any, tolerance: float) -> None:
     assert (found - expected).abs().max() <= tolerance * expected.abs().max()
 
 
-def assert_norms(model: nn.Module, expected: dict[str, float], tolerance: float = 1e-3, prefix: str = "") -> None:
+def assert_norms(
+    model: nn.Module, norms: Mapping[str, float | None], tolerance: float = 1e-3, prefix: str = ""
+) -> None:
     """The norm of every parameter's gradient; those that the case does not name have none.
 
     Where a gradient is 0 by the mathematics, as by a bias before a softmax, both are rounding.
     """
+    expected = {name: norm or 0.0 for name, norm in norms.items()}
     least = 1e-6 * max(expected.values())
     for name, parameter in model.named_parameters():
         norm, known = 0.0 if parameter.grad is None else parameter.grad.norm().item(), expected.get(prefix + name, 0.0)
         assert abs(norm - known) <= tolerance * known + least, name
     assert set(expected) <= {prefix + name for name, _ in model.named_parameters()}
+
+
+def assert_published(
+    model: nn.Module, case: dict[str, Any], tolerance: float, call: Callable[[dict[str, Tensor]], Any]
+) -> dict[str, Tensor]:
+    """A network's outputs, and their gradients by inputs and parameters, are the case's; the outputs, by name."""
+    given = {name: value.clone() for name, value in case["inputs"].items()}
+    for name in case["grad_inputs"]:
+        given[name].requires_grad_()
+    made = call(given)
+    made = made if isinstance(made, dict) else dict.fromkeys(case["outputs"], made)
+    for name, expected in case["outputs"].items():
+        assert_near(made[name], expected, tolerance)
+    sum((made[name] * weight).sum() for name, weight in case["grad_w"].items()).backward()
+    for name, expected in case["grad_inputs"].items():
+        assert_near(given[name].grad, expected, 1e-3)
+    assert_norms(model, case["grad_param_norms"])
+    return made
+
+
+def published_names(shared: Path, system: str) -> dict[str, list[int]]:
+    """The shape of each weight of a published network of full size."""
+    return dict(json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())[system]["names"])
+
+
+def shapes_of(model: nn.Module) -> dict[str, list[int]]:
+    return {name: list(value.shape) for name, value in model.state_dict().items()}
 
 
 def assert_gradients(model: nn.Module, x: Tensor, output: Tensor, case: dict[str, Any]) -> None:

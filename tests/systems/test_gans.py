@@ -1,7 +1,6 @@
 """The vanilla GAN, DUSty v1 and DUSty v2: networks, losses, rules, augmentation, data, published files and training."""
 
 import functools
-import json
 import math
 import subprocess
 import sys
@@ -32,7 +31,7 @@ from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
 from r2flow.systems.gan.style_gan import DustyV2
 from r2flow.training import compose
 from tests.conftest import ROOT
-from tests.reference import load_case
+from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
 
 NETWORKS = [
     "vanilla_g_32x64", "dusty1_g_32x64", "dusty1_g_32x64_2ch", "dusty2_g_32x64_eval", "dusty2_g_32x64_train",
@@ -43,11 +42,6 @@ PUBLISHED = ["vanilla", "dusty1", "dusty2"]
 @pytest.fixture
 def cases(shared: Path) -> Callable[[str], dict[str, Any]]:
     return functools.partial(load_case, shared)
-
-
-def relative(found: Tensor, expected: Tensor) -> float:
-    """The largest difference over the largest expected value."""
-    return float(((found - expected).abs().max() / expected.abs().max()).detach())
 
 
 def space(rows: int, columns: int, channels: int = 1) -> Any:
@@ -77,12 +71,6 @@ def discriminator_of(cfg: Mapping[str, Any]) -> nn.Module:
     return (style_gan if cfg["arch"] == "dusty_v2" else dcgan).Discriminator(**common)
 
 
-def assert_gradient_norms(network: nn.Module, expected: Mapping[str, float | None]) -> None:
-    for name, parameter in network.named_parameters():
-        norm = 0.0 if parameter.grad is None else float(parameter.grad.norm())
-        assert norm == pytest.approx(expected[name] or 0.0, rel=1e-3, abs=1e-9), name
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_generator_is_the_published_one(cases: Any, name: str):
     case, tolerance = cases(f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
@@ -90,16 +78,11 @@ def test_a_generator_is_the_published_one(cases: Any, name: str):
     assert list(network.state_dict()) == list(case["state_dict"])
     network.load_state_dict(case["state_dict"])
     given = case["inputs"]
-    z = given["z"].clone().requires_grad_()
-    made = network(z, given.get("angle"), uniform=given.get("uniform"), shift=given.get("shift_fraction"))
-    for key, expected in case["outputs"].items():
-        assert relative(made[key], expected) < tolerance, key
+    more = {key: given.get(name) for key, name in (("uniform", "uniform"), ("shift", "shift_fraction"))}
+    made = assert_published(network, case, tolerance, lambda at: network(at["z"], at.get("angle"), **more))
     if "uniform" in given:
         assert torch.equal(made["raydrop_mask"], case["outputs"]["raydrop_mask"])
         torch.testing.assert_close(logistic(given["uniform"]), given["logistic_noise"], rtol=1e-5, atol=1e-6)
-    sum((made[key] * weight).sum() for key, weight in case["grad_w"].items()).backward()
-    assert relative(z.grad, case["grad_inputs"]["z"]) < 1e-3
-    assert_gradient_norms(network, case["grad_param_norms"])
     after = network.state_dict()
     for key, expected in case.get("buffers_after", {}).items():
         torch.testing.assert_close(after[key], expected, rtol=1e-5, atol=1e-7)
@@ -111,12 +94,7 @@ def test_a_discriminator_is_the_published_one_with_its_penalty(cases: Any, name:
     network = discriminator_of(case["cfg"])
     assert list(network.state_dict()) == list(case["state_dict"])
     network.load_state_dict(case["state_dict"])
-    x = case["inputs"]["x"].clone().requires_grad_()
-    scores = network(x)
-    assert relative(scores, case["outputs"]["score"]) < tolerance
-    (scores * case["grad_w"]["score"]).sum().backward()
-    assert relative(x.grad, case["grad_inputs"]["x"]) < 1e-3
-    assert_gradient_norms(network, case["grad_param_norms"])
+    assert_published(network, case, tolerance, lambda given: network(given["x"]))
 
     expected = case["r1"]
     network.zero_grad()
@@ -125,10 +103,10 @@ def test_a_discriminator_is_the_published_one_with_its_penalty(cases: Any, name:
     (slope,) = torch.autograd.grad(scores.sum(), x, retain_graph=True)
     penalty = r1(scores, x)
     penalty.backward()
-    assert relative(slope, expected["grad_x_of_score_sum"]) < 1e-4
+    assert_near(slope, expected["grad_x_of_score_sum"], 1e-4)
     assert penalty.item() == pytest.approx(expected["penalty"], rel=1e-4)
     torch.testing.assert_close(x.grad, expected["grad_x_of_penalty"], rtol=1e-3, atol=1e-7)
-    assert_gradient_norms(network, expected["grad_param_norms"])
+    assert_norms(network, expected["grad_param_norms"])
 
 
 NARROW, WIDE = (64, 512), (64, 1024, 2)
@@ -154,9 +132,7 @@ def test_full_size_networks_have_the_published_names_shapes_and_count(shared: Pa
     with torch.device("meta"):
         network = build((rows, columns), *channels) if "_D" in name else build(space(rows, columns, *channels)).network
     assert sum(p.numel() for p in network.parameters()) == count
-    said = json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())[name]
-    assert said["parameters"] == count
-    assert {key: list(value.shape) for key, value in network.state_dict().items()} == said["names"]
+    assert shapes_of(network) == published_names(shared, name)
 
 
 def test_an_image_that_cannot_be_halved_so_often_is_refused():
@@ -226,7 +202,7 @@ def test_rules_of_training(cases: Any):
     uniform = torch.where(applied["keep"] > 0, 0.1, 0.9)  # of which a share of 0.5 is dropped
     assert torch.equal(warmup(applied["x"], 0, uniform), applied["y"])
     blur = case["warmup_blur"]
-    assert relative(losses.blurred(blur["x"], blur["sigma"]), blur["y"]) < 1e-6
+    assert_near(losses.blurred(blur["x"], blur["sigma"]), blur["y"], 1e-6)
     assert torch.equal(losses.Warmup(images=100, blur=1.7)(blur["x"], 100, None), blur["x"])
 
 
@@ -268,11 +244,11 @@ def test_augmentation_is_the_published_one(cases: Any, number: int):
     scale, shift = affine(draws, *x.shape[-2:])
     maps = torch.diag_embed(torch.cat([scale.flip(0), torch.ones(1, len(x))]).T)
     maps[:, :2, 2] = shift.flip(0).T  # the published maps have columns before rows
-    assert relative(maps, case["affine"]) < 1e-4
+    assert_near(maps, case["affine"], 1e-4)
     y = coloured(transformed(x, scale, shift), draws)
-    assert relative(y, case["y"]) < 1e-4
+    assert_near(y, case["y"], 1e-4)
     (y * case["grad_w"]).sum().backward()
-    assert relative(x.grad, case["grad_x"]) < 1e-4
+    assert_near(x.grad, case["grad_x"], 1e-4)
 
 
 class Source:
@@ -309,14 +285,14 @@ def test_augmentation_draws_the_published_distributions():
 def test_augmentation_without_a_transformation_leaves_it_out_and_refuses_an_unknown_one():
     augment = AdaptiveAugment(initial=0.9, policy=dict.fromkeys(TRANSFORMATIONS, 0))
     x = torch.randn(2, 1, 8, 16)
-    assert relative(augment(x, augment.draw(Source(2))), x) < 0.05  # the filter alone, there and back
+    assert_near(augment(x, augment.draw(Source(2))), x, 0.05)  # the filter alone, there and back
     with pytest.raises(InputError, match="no augmentation named 'flip'"):
         AdaptiveAugment(policy={"flip": 1})
 
 
 def test_whole_shifts_on_a_ring_are_rolls_where_the_filter_lets_all_pass():
     x = torch.sin(torch.arange(64) * 2 * math.pi * 3 / 64).expand(1, 1, 8, 64)  # far below the filter's limit
-    assert relative(transformed(x, torch.ones(2, 1), torch.tensor([[0.0], [5.0]])), x.roll(5, 3)) < 1e-3
+    assert_near(transformed(x, torch.ones(2, 1), torch.tensor([[0.0], [5.0]])), x.roll(5, 3), 1e-3)
 
 
 def test_data_are_the_published_ones(cases: Any):
@@ -341,10 +317,11 @@ def test_a_published_file_is_a_generator(cases: Any, shared: Path, name: str, av
     network = checkpoint.generator.network
     assert sum(p.numel() for p in network.parameters()) == io["num_parameters"]["G"]
     made = checkpoint.generator.made(io["z"], io["uniform"], truncation=io["truncation_psi"])
-    assert (relative(made["image"], io["outputs"]["image"]) < 1e-4) == averaged
+    apart = (made["image"] - io["outputs"]["image"]).abs().max() / io["outputs"]["image"].abs().max()
+    assert (apart < 1e-4) == averaged
     if averaged:
         for key, expected in io["outputs"].items():
-            assert relative(made[key], expected) < 1e-4, key
+            assert_near(made[key], expected, 1e-4)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -354,7 +331,7 @@ def test_a_published_file_holds_its_discriminator_by_our_names(cases: Any, share
     with inert():
         content = torch.load(shared / "oracle_baselines" / f"{name}_published.pth", weights_only=True)
     network.load_state_dict(content["D"])
-    assert relative(network(io["x"]), io["score"]) < 1e-4
+    assert_near(network(io["x"]), io["score"], 1e-4)
 
 
 def test_sensor_and_angles_of_a_published_file_are_its_own(shared: Path):

@@ -1,6 +1,5 @@
 """LiDARGen against its published code: network, objective, sampler, data and checkpoints."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws
 from r2flow.systems.score.langevin import annealed_langevin, noise_levels, score_loss, step_sizes, toward
 from r2flow.systems.score.refinenet import InstanceNormPlus, RefineNet
-from tests.reference import assert_near, assert_norms, load_case
+from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
 
 TINY = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 16, "min_range": 0.5, "max_range": 63.0},
@@ -35,20 +34,15 @@ def network_of(case: dict) -> RefineNet:
 
 def test_output_and_gradients_are_the_published_network_s(shared: Path):
     case = load_case(shared, "lidargen_net_16x64.pt")
-    network, x = network_of(case), case["inputs"]["x"].clone().requires_grad_()
-    output = network(x, case["inputs"]["y"])
-    assert_near(output, case["outputs"]["output"], 1e-4)
-    (output * case["grad_w"]["output"]).sum().backward()
-    assert_near(x.grad, case["grad_inputs"]["x"], 1e-3)
-    assert_norms(network, case["grad_param_norms"])
+    network = network_of(case)
+    assert_published(network, case, 1e-4, lambda given: network(given["x"], given["y"]))
 
 
 def test_the_full_network_has_the_published_names_and_shapes(shared: Path):
     with torch.device("meta"):
         network = RefineNet(torch.empty(232))
     assert sum(p.numel() for p in network.parameters()) == 29_694_082
-    known = json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())["lidargen"]
-    assert {name: list(value.shape) for name, value in network.state_dict().items()} == dict(known["names"])
+    assert shapes_of(network) == published_names(shared, "lidargen")
 
 
 def test_instance_norm_plus_gives_channels_their_means_back():
