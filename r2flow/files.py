@@ -4,9 +4,6 @@ import errno
 import json
 import os
 import secrets
-import shutil
-import stat
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,14 +19,19 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file that replaces `path` when the block ends without an error.
 
     It is flushed to the disk before the rename and the folder after it: a reader, or a power cut, finds the old file or
-    the whole new one. A link stays, and its target is replaced. A device or a pipe is written into.
+    the whole new one. A link stays, and its target is replaced.
     """
     path = Path(path)
-    is_stream = _is_stream(path)
+    if path.is_symlink() and not path.exists():
+        raise InputError(
+            f"{path} is a link to {path.readlink()}, which does not exist; remove the link or name another file."
+        )
+    if path.exists() and not path.is_file():  # the rename would replace a device or a pipe
+        kind = "a folder" if path.is_dir() else "not a regular file"
+        raise InputError(f"{path} is {kind}; name a file to write to.")
     path.parent.mkdir(parents=True, exist_ok=True)
     target = Path(os.path.realpath(path))
-    folder = Path(tempfile.gettempdir()) if is_stream else target.parent
-    temporary = folder / f".{target.name}.{secrets.token_hex(4)}.part"
+    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
     # Texts may contain file names that are not UTF-8.
     encoding, errors = (None, None) if "b" in mode else ("utf-8", "backslashreplace")
     try:
@@ -37,12 +39,8 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        if is_stream:
-            with open(temporary, "rb") as whole, open(path, "wb") as stream:
-                shutil.copyfileobj(whole, stream)
-        else:
-            os.replace(temporary, target)
-            _sync_folder(folder)
+        os.replace(temporary, target)
+        _sync_folder(target.parent)
     except OSError as error:
         if error.errno is None:  # numpy's error of an incomplete write
             error = OSError(errno.ENOSPC, f"cannot be written whole, is there room? ({error})")
@@ -118,21 +116,6 @@ def refuse_unreadable(path: Path, largest: int, what: str = "file", least: int =
     else:
         return
     raise InputError(f"{path} {problem}")
-
-
-def _is_stream(path: Path) -> bool:
-    """Whether a path is a character device or a pipe, which is written to directly."""
-    if path.is_symlink() and not path.exists():
-        raise InputError(
-            f"{path} is a link to {path.readlink()}, which does not exist; remove the link or name another file."
-        )
-    if not path.exists():
-        return False
-    mode = path.stat().st_mode
-    others = {stat.S_IFDIR: "folder", stat.S_IFSOCK: "socket", stat.S_IFBLK: "block device"}
-    if what := others.get(stat.S_IFMT(mode)):
-        raise InputError(f"{path} is a {what}; name a file to write to.")
-    return not stat.S_ISREG(mode)
 
 
 def _sync_folder(folder: Path) -> None:
