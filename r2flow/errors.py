@@ -6,11 +6,9 @@ import logging
 import os
 import sys
 import unicodedata
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
@@ -56,26 +54,14 @@ def naming(path: str | Path) -> Iterator[None]:
         raise type(error)(f"{path}: {error}") from None
 
 
-# Odd values of scan files, logged once per folder: (folder, kind) -> file -> number of odd values.
-_odd: defaultdict[tuple[Path, str], dict[Path, int]] = defaultdict(dict)
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_odd.clear)
+_warned: set[tuple[Path, str]] = set()  # folders and kinds of odd values
 
 
-def note_odd(path: Path, kind: str, count: int) -> None:
-    """Count odd values of a file, to be logged by `tell_odd`, at the latest at the end of the process."""
-    if not _odd:
-        Finalize(None, tell_odd, exitpriority=0)  # unlike atexit, also in workers
-    _odd[path.parent, kind][path] = count
-
-
-def tell_odd() -> None:
-    """Log the counts of `note_odd` as warnings, one per folder and kind."""
-    for (folder, kind), files in _odd.items():
-        worst = max(files, key=files.__getitem__)
-        number = f"{len(files)} file{'s' * (len(files) > 1)}"
-        log.warning("%s: %s; %s, most in %s (%d)", folder, kind, number, worst.name, files[worst])
-    _odd.clear()
+def warn_odd(path: Path, kind: str, count: int) -> None:
+    """Warn about odd values of a file, once per folder and kind in a process."""
+    if (path.parent, kind) not in _warned:
+        _warned.add((path.parent, kind))
+        log.warning("%s: %s (%d here; the folder's other files are not reported)", path, kind, count)
 
 
 def explain_mistake(error: InputError | OSError) -> str:

@@ -86,7 +86,7 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 @pytest.fixture(autouse=True)
 def _from_the_start() -> None:
     torch.manual_seed(0)
-    errors._odd.clear()
+    errors._warned.clear()
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import typer
 from r2flow import __version__
 from r2flow.cli import data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
 from r2flow.cli.app import app
-from r2flow.errors import InputError, PlainFormatter, check, explain_mistake, one_line, open_streams, tell_odd
+from r2flow.errors import InputError, PlainFormatter, check, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import Stopped, listening, stop_at_once
 
@@ -79,8 +79,6 @@ def _run() -> None:
     except USAGE_ERROR as error:
         print(f"error: {_usage(error.format_message())} See --help.", file=sys.stderr)
         sys.exit(2)
-    finally:
-        tell_odd()
     sys.exit(code if isinstance(code, int) else 0)
 
 

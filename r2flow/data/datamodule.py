@@ -22,7 +22,7 @@ from r2flow.data.pairs import PairDataset, PairSource, PairStore
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
-from r2flow.errors import InputError, check, tell_odd
+from r2flow.errors import InputError, check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.progress import track
@@ -176,7 +176,6 @@ class ScanDataModule(L.LightningDataModule):
                 for number in track(range(len(part)), f"reading {what}", least=16):
                     images[number] = part[number]
                 parts[i] = InMemory(images, part.names)
-        tell_odd()
         return _joined(parts)
 
     def _ranks(self) -> tuple[int, int]:

@@ -24,7 +24,7 @@ from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_imag
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, warn_of_other_sensor
-from r2flow.errors import InputError, check, tell_odd
+from r2flow.errors import InputError, check
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -226,7 +226,6 @@ def read(path: str | Path, sensor: Sensor | str | None = None) -> Tensor:
     """`r2flow.read`."""
     reading = replace(reading_for([path], sensor=sensor), on_bad_scan="error", within_limits=True)
     image = torch.from_numpy(open_scans(path, reading).source[0])
-    tell_odd()
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from r2flow.errors import InputError, naming, note_odd
+from r2flow.errors import InputError, naming, warn_odd
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
@@ -94,7 +94,7 @@ def read_projected(path: str | Path, reading: Reading) -> Projected:
 def _projected(path: str | Path, reading: Reading) -> Projected:
     points, sensor = read_points(path, reading.columns), reading.sensor
     if points.dropped:
-        note_odd(Path(path), f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped", points.dropped)
+        warn_odd(Path(path), f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped", points.dropped)
     if reading.projection == "unfolding":
         points = points.with_lost_rays()
     scaled = scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.errors import InputError, check, note_odd
+from r2flow.errors import InputError, check, warn_odd
 from r2flow.files import atomic_write, reading
 from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
 from r2flow.lidar.scan_files.points import NoPointsError, Points, check_columns, check_xyz, column_points
@@ -94,12 +94,12 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     path = Path(path)
     check_columns(columns)
     ending = _ending(path)
+    if ending == ".pcd.bin" and columns is None:
+        columns = ("x", "y", "z", "intensity", "ring")
     raw = ending in (".bin", ".pcd.bin")
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
         names, arrays = _READERS[ending](path, columns)
         check(names is None or columns is None, "it names its columns: leave --columns (data.reading.columns) out.")
-        if names is None and columns is None and ending == ".pcd.bin":
-            columns = ("x", "y", "z", "intensity", "ring")
         return column_points(names or usual_names(len(arrays), columns), arrays, raw)
 
 
@@ -124,7 +124,7 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
                 "or a scan in model space? Give metres."
             )
         kind = f"ranges below 0 or above {FARTHEST_RAY:g} m are taken as no return; ranges are metres"
-        note_odd(Path(path), kind, int(wrong.sum()))
+        warn_odd(Path(path), kind, int(wrong.sum()))
         image[:, wrong] = 0
     return image
 

@@ -19,16 +19,15 @@ TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar",
 
 
 def read_rows(path: Path, columns: Sequence[str] | None) -> Table:
-    """Rows of little-endian float32: 4 of KITTI, 5 of nuScenes, or as many as `columns`."""
+    """Rows of little-endian float32: as many as `columns`, or 4 of KITTI."""
     content = path.read_bytes()
     head = content[:64]
     text = (head and all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head)) or head.startswith(b"\x93NUMPY")
     check(not text, f"it is not rows of float32: it begins with {head[:16]!r}, as text or another format.")
-    usual = 5 if path.name.lower().endswith(".pcd.bin") else 4
-    width = usual if columns is None else len(columns)
+    width = 4 if columns is None else len(columns)
     rows, rest = divmod(len(content), 4 * width)
-    other = ", but of the 5 of nuScenes (.pcd.bin)" if len(content) % 20 == 0 else ""
-    other = ", but of the 4 of KITTI (.bin)" if usual == 5 and len(content) % 16 == 0 else other
+    known = {4: "the 4 of KITTI (.bin)", 5: "the 5 of nuScenes (.pcd.bin)"}
+    other = next((f", but of {words}" for count, words in known.items() if len(content) % (4 * count) == 0), "")
     check(rest == 0, f"it is not made of rows of {width} float32{other}: {rest} bytes are left. Is it cut short?")
     return None, list(np.frombuffer(content, "<f4").reshape(rows, width).T)
 
