@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
-from r2flow.errors import InputError, require
+from r2flow.errors import require
 from r2flow.registry import Registry
 
 PROJECT = "r2flow"
@@ -66,8 +66,6 @@ ELSEWHERE = (WandbLogger, MLFlowLogger)  # may be viewed without access to the r
 
 def build_loggers(names: Sequence[str] | None, run_dir: Path) -> list[Logger]:
     """Build the loggers of a run."""
-    if isinstance(names, str):
-        raise InputError(f"loggers must be a list, found {names!r}; write loggers=[{names}].")
     return [LOGGERS[name](run_dir) for name in names or []]
 
 

@@ -17,10 +17,6 @@ class Mixture(ScanSource):
         self.starts = np.cumsum([0, *(len(part) for part in parts)])
 
     @property
-    def measured(self) -> bool:  # type: ignore[override]
-        return all(part.measured for part in self.parts)
-
-    @property
     def names(self) -> list[str]:
         return [name for part in self.parts for name in part.names]
 
@@ -37,10 +33,6 @@ class Mixture(ScanSource):
     def __getitem__(self, index: int) -> np.ndarray:
         part, number = self.locate(index)
         return self.parts[part][number]
-
-    def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        part, number = self.locate(index)
-        return self.parts[part].with_points(number)
 
     def subset(self, indices: Sequence[int]) -> "Mixture":
         """Some of the scans, by ascending numbers, as a mixture of the same parts."""

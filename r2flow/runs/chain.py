@@ -96,7 +96,7 @@ def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]
             if code != 2:  # a user error, already printed
                 print(f"the chain stopped in {link.name}; the same command resumes there", file=sys.stderr, flush=True)
             return code, True
-        _note(link.run_dir, _record(link))
+        note(link.run_dir, link)
     return 0, not skipping
 
 
@@ -108,35 +108,27 @@ def has_ended(run: Path) -> bool:
 
 def is_finished(link: Link) -> bool:
     """Whether a link was finished by the same command and still has its checkpoint."""
-    return _is_noted(link.run_dir, _record(link)) and has_ended(link.run_dir)
+    return is_noted(link.run_dir, link) and has_ended(link.run_dir)
 
 
-def record_report(links: Sequence[Link], out: Path) -> None:
-    """Record the links of a report next to it."""
-    _note(out, [_record(link) for link in links])
+def note(folder: Path, *links: Link) -> None:
+    """Record in a folder the finished links that it holds or, for a report, compares."""
+    with atomic_write(folder / RECORD, "w") as file:
+        json.dump([_record(link) for link in links], file, indent=2)
 
 
-def is_reported(links: Sequence[Link], out: Path) -> bool:
-    """Whether the report on exactly these links exists."""
-    return _is_noted(out, [_record(link) for link in links])
+def is_noted(folder: Path, *links: Link) -> bool:
+    """Whether the folder has the record of exactly these links, as they are now."""
+    try:
+        return bool(read_json(folder / RECORD) == [_record(link) for link in links])
+    except (OSError, ValueError):
+        return False
 
 
 def _record(link: Link) -> dict[str, Any]:
     """Record of a finished link: its command line, and its last checkpoint's name and size."""
     last = next(iter(checkpoints_of(link.run_dir)), None)
     return {"overrides": list(link.overrides), "checkpoint": last and [last.name, last.stat().st_size]}
-
-
-def _note(folder: Path, record: Any) -> None:
-    with atomic_write(folder / RECORD, "w") as file:
-        json.dump(record, file, indent=2)
-
-
-def _is_noted(folder: Path, record: Any) -> bool:
-    try:
-        return bool(read_json(folder / RECORD) == record)
-    except (OSError, ValueError):
-        return False
 
 
 def run_process(command: Sequence[str]) -> int:

@@ -81,7 +81,7 @@ class Keys:
     few: Mapping[str, Any] | None = None
     chain: Mapping[str, Any] | None = None
     preview: str | None = None
-    loggers: Sequence[str] | str | None = None  # `build_loggers` refuses a str
+    loggers: Sequence[str] | None = None
     plugins: Sequence[str] = ()
     parent: Mapping[str, Any] | None = None
     scans: Any = None

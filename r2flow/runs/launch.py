@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from r2flow import __version__
 from r2flow.config import key_of, override
-from r2flow.errors import InputError, explain_mistake, one_line, open_streams, tell_odd
+from r2flow.errors import InputError, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.runs.composing import (
     CONF,
@@ -104,8 +104,6 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     except (InputError, OSError) as error:
         print(f"error: {explain_mistake(error)}", file=sys.stderr)
         return 2
-    finally:
-        tell_odd()
     return 0
 
 
@@ -241,7 +239,7 @@ def _fit(settings: dict[str, Any], given: Sequence[str]) -> int:
 
 def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str]) -> int:
     """Run the links of a config's `chain`, then the report on them."""
-    from r2flow.runs.chain import is_finished, is_reported, links_of, record_report, run_chain
+    from r2flow.runs.chain import is_finished, is_noted, links_of, note, run_chain
 
     if settings["trainer"]["fast_dev_run"]:
         raise InputError("a chain's links start from earlier runs, and trainer.fast_dev_run leaves none.")
@@ -255,7 +253,7 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     if code:
         return code
     out = folder / "report"
-    if not ran and is_reported(links, out):
+    if not ran and is_noted(out, *links):
         print(f"report: finished before, {out / 'chain.md'}")
         return 0
     import torch
@@ -266,7 +264,7 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     if torch.cuda.is_available() and settings["trainer"]["accelerator"] != "cpu":
         device = f"cuda:{cards[0]}" if isinstance(cards, list) else "cuda"
     report({link.name: link.run_dir for link in links}, out, device=device, command=" ".join(["python", *sys.argv]))
-    record_report(links, out)
+    note(out, *links)
     return 0
 
 
