@@ -1,7 +1,6 @@
 import json
 import math
 import pickle
-import random
 import resource
 import subprocess
 import sys
@@ -82,25 +81,6 @@ def test_what_is_no_checkpoint_says_so(tmp_path: Path, content: bytes):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"thing.ckpt is not a checkpoint, or a damaged one"):
         load_checkpoint(path)
-
-
-def test_a_flipped_bit_of_a_safetensors_is_refused(saved, tmp_path: Path):
-    path, original = tmp_path / "model.safetensors", load_checkpoint(saved[0])
-    save_checkpoint(original, path)
-    whole, draw, refused = path.read_bytes(), random.Random(0), 0
-    for _ in range(200):
-        place = draw.randrange(len(whole))
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << draw.randrange(8)]) + whole[place + 1 :])
-        try:
-            loaded = load_checkpoint(path)
-        except InputError:
-            refused += 1
-            continue
-        assert loaded.config == original.config
-        assert loaded.generator.sampler == original.generator.sampler
-        for name, value in loaded.generator.state_dict().items():
-            assert torch.equal(value, original.generator.state_dict()[name]), f"bit of byte {place}"
-    assert refused > 150
 
 
 def test_compressed_tensors_are_refused_before_they_are_unpacked(saved):

@@ -110,28 +110,14 @@ def _cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
 
 
-def _flip_a_value(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[-33] ^= 4
-    path.write_bytes(data)
-
-
-def _flip_a_flag(path: Path) -> None:
-    data = path.read_bytes()
-    assert data.count(rb"\"usable\": [1, ") == 1
-    path.write_bytes(data.replace(rb"\"usable\": [1, ", rb"\"usable\": [0, "))
-
-
-@pytest.mark.parametrize("harm", [_cut, _flip_a_value, _flip_a_flag, Path.unlink])
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, harm, ranks: int, caplog):
+def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, ranks: int, caplog):
     make_pairs(store_in(tmp_path), grow)
     before = files(tmp_path)
-    harm(tmp_path / "pairs-000001.safetensors")
-    made = sum(make_pairs(store_in(tmp_path), grow, rank, ranks).pairs for rank in range(ranks))
-    assert made == 12
+    _cut(tmp_path / "pairs-000001.safetensors")
+    assert sum(make_pairs(store_in(tmp_path), grow, rank, ranks).pairs for rank in range(ranks)) == 12
     assert files(tmp_path) == before
-    assert harm is Path.unlink or "pairs-000001.safetensors is damaged" in caplog.text
+    assert "pairs-000001.safetensors is damaged" in caplog.text
 
 
 @pytest.mark.parametrize(

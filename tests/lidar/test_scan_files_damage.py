@@ -11,11 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.reading import read_scan
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.scan_files.clouds import decompress_lzf
-from r2flow.lidar.sensors import SENSORS
 
 # A reader that warns has met something it was not made for.
 pytestmark = pytest.mark.filterwarnings("error")
@@ -154,40 +152,9 @@ def test_flipped_bits_in_the_body_cost_their_own_points_at_most(tmp_path, origin
     points = read_bytes(tmp_path, name, bytes(damaged))
     if points is not None and not name.endswith("compressed"):  # a damaged copy repeats itself
         assert len(points.xyz) + points.dropped == COUNT
+        assert np.abs(points.xyz).max() <= 1e4  # what no LiDAR measures costs its own point
         known = {tuple(row) for row in XYZ.tolist()}
         assert sum(tuple(row) not in known for row in points.xyz.tolist()) <= 2
-
-
-@pytest.mark.parametrize(("name", "columns"), [("bin", 4), ("pcd.bin", 5)])
-def test_a_flipped_bit_leaves_only_values_that_lidars_measure(tmp_path, originals, name, columns):
-    # These formats have no checksum: a coordinate that becomes another coordinate cannot be told from the right one.
-    # What no LiDAR measures can, and costs its own point or the file.
-    whole = originals[name]
-    dropped = refused = changed = 0
-    for bit in range(0, 8 * len(whole), 53):  # 53 has no factor in common with 32: bits of all places in turn
-        damaged = bytearray(whole)
-        damaged[bit // 8] ^= 1 << bit % 8
-        points = read_bytes(tmp_path, name, bytes(damaged))
-        row, column = divmod(bit // 32, columns)
-        value = np.frombuffer(bytes(damaged), "<f4")[bit // 32]
-        if points is None:
-            refused += 1
-            assert column == 4
-        elif points.dropped:
-            dropped += 1
-            assert not abs(value) <= 1e4
-            np.testing.assert_array_equal(points.xyz, np.delete(XYZ, row, 0))
-            np.testing.assert_array_equal(points.kept, np.delete(np.arange(COUNT), row))
-        elif column < 3:
-            changed += 1
-            assert abs(value) <= 1e4
-            np.testing.assert_array_equal(np.delete(points.xyz, row, 0), np.delete(XYZ, row, 0))
-        elif column == 3 and not 0 <= value <= 1.001:  # what means full reflectance is known to who asks for it
-            (tmp_path / "damaged").mkdir(exist_ok=True)
-            with pytest.raises(InputError, match="reflectance must lie in"):
-                read_scan(tmp_path / f"damaged.{name}", SENSORS["hdl64e"].resized(8, 32))
-    assert min(dropped, changed) > 5
-    assert (refused > 10) == (name == "pcd.bin")  # a ring that is none
 
 
 @pytest.mark.parametrize("name", FORMATS[2:])
@@ -207,6 +174,7 @@ def layouts() -> dict[str, bytes]:
         "millimetres in int32": (TABLE * 1000).astype("<i4").tobytes(),
         "centimetres in int16": (TABLE * 100).astype("<i2").tobytes(),
         "rows of 3": XYZ.tobytes(),
+        "one byte aside": b"\n" + TABLE.tobytes()[:-1],
         "rows of 5": np.column_stack([TABLE, RING]).tobytes(),
         "rows of 6": np.column_stack([TABLE, RING, RING]).tobytes(),
         "noise": noise(1024),
@@ -365,18 +333,6 @@ def test_a_file_too_large_for_one_scan_is_not_loaded(tmp_path):
         with (tmp_path / name).open("wb") as file:
             file.truncate(1 << 40)  # sparse: takes no disk
         assert read(tmp_path / name) is None
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_a_real_scan_in_a_wrong_layout_is_refused(shared, tmp_path, seed):
-    paths = sorted((shared / "real").rglob("*.bin"))
-    rows = read_points(paths[seed * len(paths) // 10])
-    table = np.column_stack([rows.xyz, rows.reflectance])
-    table = table[: len(table) // 4 * 4]
-    assert read_bytes(tmp_path, "bin", table.astype(">f4").tobytes()) is None
-    assert read_bytes(tmp_path, "bin", table.astype("<f8").tobytes()) is None
-    assert read_bytes(tmp_path, "bin", table[:, :3].tobytes()) is None
-    assert read_bytes(tmp_path, "bin", b"\n" + table[:-1].tobytes() + bytes(15)) is None
 
 
 # Instructions by hand: 3 literals; a copy of 3 from 3 back; a copy of 7 + 2 + 3 = 12 from 1 back, which

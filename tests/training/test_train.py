@@ -144,21 +144,15 @@ def test_a_run_goes_on_with_other_workers_and_threads(
         assert all(torch.allclose(a[name], b[name], rtol=1e-4, atol=1e-6) for name in a)
 
 
-def test_a_damaged_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, str], copied: Path):
-    newest = checkpoints_of(copied)[0]
-    newest.write_bytes(newest.read_bytes()[:1000])
-    done = train("name=copied")
-    assert "Passing it over" in done.stdout + done.stderr
-    assert_bit_equal(alone[0], copied)
-
-
-@pytest.mark.parametrize("odd", ["empty", "weights alone", "other shapes", "other names", "a pipe", "a folder"])
+@pytest.mark.parametrize("odd", ["cut", "empty", "weights alone", "other shapes", "other names", "a pipe", "a folder"])
 def test_an_odd_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, str], copied: Path, odd: str):
     newest, older = checkpoints_of(copied)
-    content = torch.load(newest, weights_only=True)
+    whole, content = newest.read_bytes(), torch.load(newest, weights_only=True)
     newest.unlink()
     name, value = next(item for item in content["state_dict"].items() if item[1].ndim > 1)
-    if odd == "a pipe":
+    if odd == "cut":
+        newest.write_bytes(whole[:1000])
+    elif odd == "a pipe":
         os.mkfifo(newest.with_name("step-00000011.ckpt"))
     elif odd == "a folder":
         newest.with_name("step-00000011.ckpt").mkdir()
