@@ -1,4 +1,4 @@
-"""Callbacks and loggers of a run, as part of the package r2flow."""
+"""Callbacks of a run, as part of the package r2flow."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,7 +14,6 @@ from r2flow.runs.lineage import drawn_by
 from .curvature import Curvature
 from .ema import EMA, HalfLifeEMA
 from .guard import Guard
-from .loggers import LOGGERS, build_loggers, log_config, log_figures
 from .pictures import SamplePictures
 from .progress import Progress
 from .reflow_pairs import ReflowPairs
@@ -88,24 +87,6 @@ CALLBACKS = Registry(
     checkpoint=Entry(keep_checkpoints, lambda config: (Path(config["run_dir"], FOLDER),)),
     progress=Entry(Progress),
 )
-
-
-__all__ = [
-    "EMA",
-    "LOGGERS",
-    "Curvature",
-    "Guard",
-    "HalfLifeEMA",
-    "Progress",
-    "ReflowPairs",
-    "SamplePictures",
-    "Stopping",
-    "build_callbacks",
-    "build_loggers",
-    "keep_checkpoints",
-    "log_config",
-    "log_figures",
-]
 
 if __name__ != "r2flow.callbacks":  # callbacks look up each other by class, and a second copy has other classes
     raise ImportError("import r2flow.callbacks, not callbacks: the folder is part of the package r2flow.")

@@ -21,7 +21,8 @@ import lightning as L
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
-from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_figures
+from r2flow.callbacks import build_callbacks
+from r2flow.callbacks.loggers import build_loggers, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule

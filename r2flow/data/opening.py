@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -196,7 +195,7 @@ def reading_for(
     kind = SOURCES[parse(specs[0])[0].name if specs else FOLDER]
     reading = _reading_of(model) if model else stored or Reading(SENSORS[kind.sensor])
     chosen = named_sensor(sensor or reading.sensor, size)
-    if model is not None and (chosen.shape != model.sensor.shape or chosen.elevations != model.sensor.elevations):
+    if model is not None and not chosen.same_image(model.sensor):
         expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
         raise InputError(f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out.")
     reading = replace(reading, sensor=reading.sensor if model else chosen)
@@ -265,15 +264,12 @@ def drawn_recipe(folder: Path) -> dict[str, Any] | None:
 def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
     """Refuse a folder whose manifest has another sensor or size."""
     recipe = drawn_recipe(folder)
-    if recipe is None:
-        return
-    stored = Reading.of(recipe["reading"])
-    if stored.sensor.shape == sensor.shape and np.allclose(stored.sensor.elevations, sensor.elevations):
-        return
-    theirs, ours = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (stored.sensor, sensor))
-    raise InputError(
+    stored = Reading.of(recipe["reading"]).sensor if recipe else sensor
+    theirs, ours = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (stored, sensor))
+    check(
+        stored.same_image(sensor),
         f"{folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: give no other --sensor or --size, "
-        "no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, .bin)."
+        "no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, .bin).",
     )
 
 

@@ -115,7 +115,10 @@ def _files(
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         if not source and not doubt and target.name in SENSORS and SENSORS[target.name].shape[0] < target.shape[0]:
             source = SENSORS[target.name]  # fewer beams than rows of the completions
-        same = _same_view(source, target) if source else doubt is None
+        rows = target.shape[0]
+        same = doubt is None
+        if source:
+            same = source.shape[0] >= rows and source.resized(rows, target.columns).same_image(target)
         try:
             fired = sensor_of(scans, source or (target if same else None))
         except InputError as error:
@@ -134,7 +137,7 @@ def _files(
             lines.append(_described(spec, replace(fired, name=name), target, turns=True))
         if scale is None and full == estimated and full not in FULL_REFLECTANCE:
             log.warning("%s: reflectance is divided by %g, its largest; --reflectance-scale names another", spec, full)
-    elif source and not _same_image(source, target):
+    elif source and not source.same_image(target):
         lines.append(_described(spec, source, target))
 
     def opened(path: Path) -> PartialScan:
@@ -160,8 +163,7 @@ def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None
         content = name.encode if simulated else lambda: scans[number].tobytes()
         return PartialScan(name, ".npy", lambda: _seen(scans[number], stored.sensor, target), content)
 
-    same = _same_image(stored.sensor, target)
-    lines = [] if same else [_described(spec, stored.sensor, target)]
+    lines = [] if stored.sensor.same_image(target) else [_described(spec, stored.sensor, target)]
     return [opened(number) for number in spread(len(scans), most or len(scans))], lines
 
 
@@ -226,16 +228,7 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
 
 
 def _seen(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:
-    return image_of_same(image, target) if _same_image(source, target) else image_through(image, source, target)
-
-
-def _same_view(source: Sensor, target: Sensor) -> bool:
-    rows = target.shape[0]
-    return source.shape[0] >= rows and np.allclose(source.resized(rows).elevations, target.elevations, atol=1e-3)
-
-
-def _same_image(source: Sensor, target: Sensor) -> bool:
-    return source.shape == target.shape and np.allclose(source.elevations, target.elevations, atol=1e-3)
+    return image_of_same(image, target) if source.same_image(target) else image_through(image, source, target)
 
 
 def _strength(path: Path, points: Points, scale: float, strict: bool) -> np.ndarray | None:

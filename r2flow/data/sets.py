@@ -1,7 +1,7 @@
 """A set of scans for commands and reports: numbered range images with their metadata."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
 
@@ -69,19 +69,12 @@ class ScanSet:
             return self
         return self.part(spread(len(self), most), f"{most} of {len(self)}, evenly spread")
 
-    def batches(self, numbers: Sequence[int], batch_size: int, workers: int = 0) -> Iterator[Tensor]:
-        """Batches, (B, 2 or 1, H, W), of these scans in order, read by `workers` further processes."""
-        return self._read(self.source.batch, numbers, batch_size, workers)
-
-    def batches_with_points(
-        self, numbers: Sequence[int], batch_size: int, workers: int = 0
-    ) -> Iterator[tuple[Tensor, Tensor]]:
-        """As `batches`, with the measured points of the pixels, (B, 3, H, W) (`ScanSource.with_points`)."""
-        return self._read(partial(_with_points, self.source), numbers, batch_size, workers)
-
-    def _read(
-        self, read: Callable[[list[int]], Any], numbers: Sequence[int], batch_size: int, workers: int
+    def batches(
+        self, numbers: Sequence[int], batch_size: int, workers: int = 0, with_points: bool = False
     ) -> Iterator[Any]:
+        """Batches of these scans in order, read by `workers` further processes: images, (B, 2 or 1, H, W), or pairs of
+        images and the measured points of the pixels, (B, 3, H, W) (`ScanSource.with_points`)."""
+        read = partial(_with_points, self.source) if with_points else self.source.batch
         chunks: Any = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
         # Processes take seconds to start; samples are drawn in the process of the network.
         workers = 0 if self.source.drawn or len(chunks) < 8 else workers

@@ -178,7 +178,7 @@ def _update(
     shared = [number for start in starts for number in numbers[start : start + work.batch_size]]
     batches: Iterable[tuple[torch.Tensor, torch.Tensor | None]]
     if real and protocol.real == "measured":
-        batches = scans.batches_with_points(shared, work.batch_size, work.workers)
+        batches = scans.batches(shared, work.batch_size, work.workers, with_points=True)
     else:
         batches = ((images, None) for images in scans.batches(shared, work.batch_size, work.workers))
     names, side = scans.source.names, "real" if real else "generated"

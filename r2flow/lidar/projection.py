@@ -94,7 +94,7 @@ def project_indices(
     else:
         # Omitted points share an extra pixel after the last: faster than removing them from every array.
         pixel[(row < 0) | (row >= rows) | ~within] = rows * columns
-        hit, chosen = _nearest(pixel, r, rows * columns)
+        hit, chosen = nearest(pixel, r, rows * columns)
     return hit, chosen, r[chosen]
 
 
@@ -127,7 +127,7 @@ def _columns(xyz: np.ndarray, columns: int) -> np.ndarray:
     return column
 
 
-def _nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
+def nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
     """The occupied pixels below `pixels`, and the index of the nearest point in each; of equals, the first."""
     # Positive float32 values order like their bits: with (bits of r, index) in one integer, the nearest point is the
     # minimum, found in one pass without sorting 120,000 points.
@@ -142,7 +142,7 @@ def _nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray,
 
 
 def _nearest_by_sorting(pixel: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `_nearest`, but like the reference: points are written from far to near, the nearest last."""
+    """As `nearest`, but like the reference: points are written from far to near, the nearest last."""
     # Under 1 % of KITTI's pixels have two points of equal range, in millimetres. The reference's choice depends on
     # NumPy's unstable sort, so the same sort is used.
     order = np.argsort(-r)

@@ -60,6 +60,10 @@ class Sensor:
         """Image size (H, W)."""
         return len(self.elevations), self.columns
 
+    def same_image(self, other: "Sensor") -> bool:
+        """Whether images of the two sensors have the same pixels: one size, elevations within 0.001 degrees."""
+        return self.shape == other.shape and np.allclose(self.elevations, other.elevations, atol=1e-3)
+
     @property
     def row_edges(self) -> np.ndarray:
         """Elevations in degrees of the edges of the rows, (H + 1,), decreasing; float64.

@@ -12,7 +12,7 @@ import numpy as np
 from r2flow.errors import InputError
 from r2flow.lidar.beams import estimate_sensor, steps_of_a_turn
 from r2flow.lidar.known import Ray
-from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
+from r2flow.lidar.projection import Convention, Projection, nearest, project_indices, scatter
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.scan_files.points import NEAREST
 from r2flow.lidar.sensors import Sensor
@@ -136,12 +136,8 @@ def _cast(
     """
     r = np.linalg.norm(xyz, axis=1).astype(np.float32)
     near, far = r < target.min_range, r > target.max_range
-    order = np.flatnonzero(~near & ~far)
-    order = order[np.argsort(-r[order], kind="stable")]  # the nearest is written last
-    owner = np.full(math.prod(target.shape), -1)
-    owner[pixel[order]] = order
-    hit = np.flatnonzero(owner >= 0)
-    chosen = owner[hit]
+    pixels = math.prod(target.shape)
+    hit, chosen = nearest(np.where(near | far, pixels, pixel), r, pixels)
     state = np.where(empty, int(Ray.EMPTY), int(Ray.UNKNOWN)).astype(np.uint8).ravel()
     state[pixel[far]] = Ray.EMPTY
     state[pixel[near]] = Ray.UNKNOWN

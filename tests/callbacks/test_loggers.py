@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.callbacks import build_loggers
-from r2flow.callbacks.loggers import log_config, log_figures, log_picture
+from r2flow.callbacks.loggers import build_loggers, log_config, log_figures, log_picture
 from r2flow.errors import InputError
 
 PIXELS = np.arange(8 * 16 * 3, dtype=np.uint8).reshape(8, 16, 3)
