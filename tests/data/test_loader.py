@@ -124,17 +124,6 @@ def test_weights_are_the_shares_of_the_images():
     assert [order[k] for k in (7999, 3)] == [MixedOrder(SIZES, WEIGHTS, seed=1)[k] for k in (7999, 3)]
 
 
-def test_resume_and_ranks_change_nothing():
-    def keys(rank=0, ranks=1, first=0):
-        sampler = RunSampler(MixedOrder(SIZES, WEIGHTS, seed=1), 4, 30, rank, ranks)
-        sampler.first_batch = first
-        return list(sampler)
-
-    assert keys(first=11) == keys()[11:]
-    for whole, *shares in zip(keys(), keys(0, 2), keys(1, 2), strict=True):
-        assert sorted(key for share in shares for key in share) == sorted(whole)
-
-
 def test_what_cannot_be_mixed_is_refused():
     with pytest.raises(InputError, match="no scan left"):
         MixedOrder([1, 0], [1.0, 1.0], 0)

@@ -343,15 +343,6 @@ def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_pa
 # Damage
 
 
-def wrong_type(path: Path) -> None:
-    from safetensors import safe_open
-    from safetensors.numpy import load_file, save_file
-
-    with safe_open(path, framework="numpy") as file:
-        notes = file.metadata()
-    save_file({**(tensors := load_file(path)), "range": tensors["range"].astype(np.int16)}, path, notes)
-
-
 def swapped(path: Path) -> None:
     other = path.with_name("scans-000002.safetensors")
     data = other.read_bytes()
@@ -366,9 +357,6 @@ GONE = {
 }
 DAMAGES = {
     "cut": lambda path: path.write_bytes(path.read_bytes()[:-100]),
-    "huge": lambda path: os.truncate(path, 1 << 40),
-    "text": lambda path: path.write_text("no shard\n" * 300),
-    "wrong type": wrong_type,
     "swapped": swapped,
     **GONE,
 }
@@ -393,9 +381,8 @@ def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_pat
     whole, path = files(tmp_path), tmp_path / "scans-000001.safetensors"
     DAMAGES[damage](path)
     assert path in damaged(tmp_path)
-    if damage != "wrong type":  # of which the head says nothing
-        with pytest.raises(InputError, match="is not finished" if damage in GONE else "scans-000001.safetensors is da"):
-            prepared_in(tmp_path)
+    with pytest.raises(InputError, match="is not finished" if damage in GONE else "scans-000001.safetensors is da"):
+        prepared_in(tmp_path)
     if damage == "folder":
         path.rmdir()
     made = []
@@ -476,10 +463,6 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):
         ("evaluate", wide, scan, "--size", "4x16", "--metrics", "jsd"),
     ):
         assert r2flow(*verb, *columns)[0] == 0
-    for wrong in ("x,y", "x,y,z,x", "x,y,z,intensity,i"):
-        code, _, error = r2flow("show", scan, "--columns", wrong, "--out", tmp_path / "v")
-        assert (code, error.count("\n")) == (2, 1)
-        assert "columns must name x, y and z" in error
 
 
 def test_a_run_is_told_the_columns_too(numbered, tmp_path):

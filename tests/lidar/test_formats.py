@@ -77,10 +77,9 @@ def test_columns_are_named_where_the_file_does_not(tmp_path: Path):
     for name in ("a.bin", "a.npy", "a.txt", "a.npz"):
         same(read_points(tmp_path / name, NAMES), RING)
         same(read_points(tmp_path / name, ("_", "z", "x", "y", "_", "_")), intensity=None)
-        with pytest.raises(InputError, match="columns must name x, y and z"):
-            read_points(tmp_path / name, ("x", "y"))
-        with pytest.raises(InputError, match="columns must name x, y and z"):
-            read_points(tmp_path / name, ("x", "y", "z", "x"))
+        for wrong in (("x", "y"), ("x", "y", "z", "x"), ("x", "y", "z", "intensity", "i")):
+            with pytest.raises(InputError, match="columns must name x, y and z"):
+                read_points(tmp_path / name, wrong)
     for name in ("a.npy", "a.txt", "a.npz"):
         with pytest.raises(InputError, match=r"6 columns without names.*--columns x,y,z,intensity,_,_ "):
             read_points(tmp_path / name)

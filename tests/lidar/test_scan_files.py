@@ -232,12 +232,6 @@ def test_a_refused_write_leaves_the_old_file(tmp_path, name, change, word):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_writing_over_a_folder_is_an_input_error(tmp_path):
-    (tmp_path / "a.ply").mkdir()
-    with pytest.raises(InputError, match="is a folder"):
-        write_points(tmp_path / "a.ply", np.array(XYZ))
-
-
 # --- real sensors ---
 
 OTHER = {  # points, ring count, whether there is a reflectance: from the sensors' own file sizes

@@ -168,20 +168,11 @@ def test_a_written_sensor_is_read_back(sensor, tmp_path):
     assert read_sensor(tmp_path / "mine.yaml", 8, 64) == mine.resized(8, 64)
 
 
-def test_name_and_elevations_are_enough(tmp_path):
-    assert read_sensor(written(tmp_path, MINE)) == Sensor("mine", (10.0, 4.5, -3.0, -20.0))
-
-
 def test_every_option_can_be_given(tmp_path):
     text = MINE + "rays: centre\nrows: 2\ncolumns: 64\nmin_range: 1\nmax_range: 50\nheight: 2\nfiring: [3, 1, 2, 0]\n"
     sensor = read_sensor(written(tmp_path, text))
     assert sensor == Sensor("mine", sensor.elevations, 64, 1.0, 50.0, 2.0)
     assert sensor.shape == (2, 64)
-
-
-def test_the_configs_of_built_in_sensors_are_sensor_files():
-    conf = Path(__file__).resolve().parents[2] / "conf" / "sensor"
-    assert read_sensor(conf / "vlp32c.yaml") == SENSORS["vlp32c"]
 
 
 @pytest.mark.parametrize(
