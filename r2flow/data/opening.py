@@ -241,9 +241,13 @@ def own_reading(spec: str | Path) -> Reading | None:
 
 def usual_scale(spec: str | Path, sensor: Sensor) -> float:
     """Default value of full reflectance in the files of a set of scans; 1 in files that r2flow wrote."""
-    options = parse(str(spec))[0]
+    return scale_of(parse(str(spec))[0], sensor.reflectance_scale)
+
+
+def scale_of(options: SourceOptions, of_sensor: float | None) -> float:
+    """As `usual_scale`; `of_sensor` is the value in files of the sensor, if known."""
     if options.name == FOLDER:
-        return 1.0 if made_here(options.folder) else sensor.reflectance_scale or 1.0
+        return 1.0 if made_here(options.folder) else of_sensor or 1.0
     return SOURCES[options.name].reflectance_scale
 
 
@@ -255,16 +259,11 @@ def _manifest(folder: Path) -> dict[str, Any]:
         return {}
 
 
-def drawn_recipe(folder: Path) -> dict[str, Any] | None:
-    """The recipe of a folder of samples or completed scans; None for other folders."""
-    manifest = _manifest(folder)
-    return manifest["recipe"] if manifest.get("format") in ("r2flow samples", "r2flow answers") else None
-
-
 def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
-    """Refuse a folder whose manifest has another sensor or size."""
-    recipe = drawn_recipe(folder)
-    stored = Reading.of(recipe["reading"]).sensor if recipe else sensor
+    """Refuse a folder of samples or completed scans of another sensor or size."""
+    manifest, stored = _manifest(folder), sensor
+    if manifest.get("format") in ("r2flow samples", "r2flow answers"):
+        stored = Reading.of(manifest["recipe"]["reading"]).sensor
     theirs, ours = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (stored, sensor))
     check(
         stored.same_image(sensor),
@@ -276,7 +275,7 @@ def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
 def refuse_parts(spec: str | Path) -> None:
     """Refuse samples of a region of the image: metrics would treat the rest of the image as missing returns."""
     options, _ = parse(str(spec))
-    if options.name == FOLDER and (drawn_recipe(Path(options.folder)) or {}).get("region"):
+    if options.name == FOLDER and _manifest(Path(options.folder)).get("recipe", {}).get("region"):
         raise InputError(
             f"{spec} holds a part of each scan alone (see its {MANIFEST}) and cannot be compared with whole scans: "
             "sample without --sector and --rows."

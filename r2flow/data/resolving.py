@@ -4,7 +4,7 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-from r2flow.data.opening import SOURCES
+from r2flow.data.opening import SOURCES, scale_of
 from r2flow.data.options import FOLDER, MIXED, PAIRS, SIMULATED, Data, DataOptions, PartOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.sources import made_here
@@ -52,14 +52,10 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
 
 def _whole_reading(options: SourceOptions, usual: Mapping[str, Any], scale: float | None) -> Data:
     """All fields of `ReadingOptions`: of a set of scans, else of `usual`, else the defaults of its kind."""
-    name, of_kind = options.name, 1.0
-    if name == FOLDER:
-        of_kind = scale or 1.0
-    elif name in SOURCES:
-        of_kind = SOURCES[name].reflectance_scale
     reading: Data = {"projection": "spherical", "convention": "centre", "columns": None, "on_bad_scan": "error"}
-    reading |= {"reflectance_scale": of_kind, **usual, **options.chosen}
-    written = name == FOLDER and options.root is not None and made_here(str(options.root))
+    reading["reflectance_scale"] = scale_of(options, scale) if options.name in SOURCES else 1.0
+    reading |= {**usual, **options.chosen}
+    written = options.name == FOLDER and made_here(options.folder)
     return {**reading, "reflectance_scale": 1.0} if written else reading
 
 
