@@ -6,7 +6,7 @@ import torch
 
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset
-from r2flow.data.sources import ScanSource
+from r2flow.data.sources import InMemory
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.sensors import SENSORS
@@ -15,23 +15,9 @@ SENSOR = SENSORS["hdl64e"].resized(8, 32)
 KINDS = {"flip": True, "roll": True, "beam_dropout": 0.25, "ray_dropout": 0.25}
 
 
-class Slope(ScanSource):
-    """Every pixel has a range of its own, so that it can be found again."""
-
-    names = ("slope",)
-
-    def subset(self, indices):
-        raise NotImplementedError
-
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        r = np.linspace(2, 70, 8 * 32, dtype=np.float32).reshape(8, 32)
-        return np.stack([r, r / 100])
-
-
-IMAGE = Slope()[0]
+# Every pixel has a range of its own, so that it can be found again.
+IMAGE = np.linspace(2, 70, 8 * 32, dtype=np.float32).reshape(8, 32) * np.array([[[1]], [[0.01]]], np.float32)
+SLOPE = InMemory(IMAGE[None], ["slope"])
 
 
 def test_half_of_the_scans_are_mirrored():
@@ -80,8 +66,8 @@ def test_dropped_beams_are_whole_rows_and_dropped_rays_single_returns():
 @pytest.mark.parametrize("kind", KINDS)
 def test_switching_one_on_changes_no_other_draw(kind: str):
     encoding = Encoding(SENSOR)
-    plain = FlowDataset(Slope(), encoding, 0, "training")[(7, 0)]
-    changed = FlowDataset(Slope(), encoding, 0, "training", Augmentation(**{kind: KINDS[kind]}))[(7, 0)]
+    plain = FlowDataset(SLOPE, encoding, 0, "training")[(7, 0)]
+    changed = FlowDataset(SLOPE, encoding, 0, "training", Augmentation(**{kind: KINDS[kind]}))[(7, 0)]
     assert torch.equal(plain["x_0"], changed["x_0"])
     assert torch.equal(plain["u"], changed["u"])
     # All of them together are this one, then the others, each with the draws that it has alone.

@@ -6,7 +6,7 @@ import torch
 
 from r2flow.data.loader import FlowDataset, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.mixture import MixedOrder, Mixture
-from r2flow.data.sources import ScanSource
+from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
@@ -14,17 +14,13 @@ from r2flow.lidar.sensors import SENSORS
 SENSOR = SENSORS["hdl64e"].resized(4, 8)
 
 
-class Scans(ScanSource):
-    names = tuple(str(number) for number in range(10))
+def numbers(*values: float, size: tuple[int, int] = (1, 1)) -> InMemory:
+    """Scans whose ranges are these numbers, and whose reflectances a hundredth of them."""
+    images = np.array(values, np.float32)[:, None, None, None] * np.array([1, 0.01], np.float32)[:, None, None]
+    return InMemory(np.broadcast_to(images, (len(values), 2, *size)).copy(), [str(value) for value in values])
 
-    def subset(self, indices):
-        raise NotImplementedError
 
-    def __len__(self):
-        return 10
-
-    def __getitem__(self, index):
-        return np.full((2, 4, 8), 2.0 + index, np.float32) * [[[1.0]], [[0.01]]]
+SCANS = numbers(*range(2, 12), size=SENSOR.shape)
 
 
 def keys(**options) -> list[list[tuple[int, int]]]:
@@ -53,7 +49,7 @@ def test_ranks_share_every_global_batch(ranks):
 
 
 def test_an_item_depends_on_its_number_alone():
-    dataset = FlowDataset(Scans(), Encoding(SENSOR), 0, "training")
+    dataset = FlowDataset(SCANS, Encoding(SENSOR), 0, "training")
     first = dataset[(17, 3)]
     dataset[(18, 3)]
     again = dataset[(17, 3)]
@@ -64,7 +60,7 @@ def test_an_item_depends_on_its_number_alone():
 
 def test_workers_change_nothing():
     def batches(workers):
-        dataset = FlowDataset(Scans(), Encoding(SENSOR), 0, "training")
+        dataset = FlowDataset(SCANS, Encoding(SENSOR), 0, "training")
         return list(RunLoader(dataset, batch_sampler=RunSampler(Permutations(10, 3), 4, 5), num_workers=workers))
 
     for a, b in zip(batches(0), batches(2), strict=True):
@@ -79,29 +75,12 @@ def test_validation_covers_every_scan_once_over_the_ranks():
 SIZES, WEIGHTS = [5, 40, 3], [3.0, 1.0, 4.0]
 
 
-class Numbers:
-    """A source whose scans are numbers."""
-
-    def __init__(self, values) -> None:
-        self.values = list(values)
-        self.names = [str(value) for value in self.values]
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        return np.full((2, 1, 1), self.values[index], np.float32)
-
-    def subset(self, indices) -> "Numbers":
-        return Numbers(self.values[i] for i in indices)
-
-
 def values(source) -> list[int]:
     return [int(source[i][0, 0, 0]) for i in range(len(source))]
 
 
 def test_parts_lie_end_to_end():
-    mixture = Mixture([Numbers([1, 2]), Numbers([]), Numbers([7, 8, 9])])
+    mixture = Mixture([numbers(1, 2), numbers(), numbers(7, 8, 9)])
     assert values(mixture) == [1, 2, 7, 8, 9]
     assert mixture.names == ["1", "2", "7", "8", "9"]
     some = mixture.subset([1, 2, 4])
