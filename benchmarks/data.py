@@ -17,7 +17,8 @@ import numpy as np
 import torch
 
 from r2flow.data.loader import FlowDataset
-from r2flow.data.opening import find_drives, open_prepared
+from r2flow.data.opening import SOURCES, find_drives
+from r2flow.data.options import SourceOptions
 from r2flow.data.prepared import plan_files, prepare
 from r2flow.data.reading import Reading, read_scan
 from r2flow.data.sources import spread
@@ -98,7 +99,8 @@ def measure_shards(paths: Sequence[Path], folder: Path, times: int) -> None:
     for number, path in enumerate(paths):
         (chosen / f"{number:06d}.bin").symlink_to(path.resolve())
     prepare(folder / "prepared", plan_files("folder", chosen, find_drives("folder", chosen), Reading(HDL64E)))
-    prepared = open_prepared(folder / "prepared", Reading(HDL64E, reflectance=True))
+    options = SourceOptions("prepared", str(folder / "prepared"))
+    prepared = SOURCES["prepared"].open(options, Reading(HDL64E, reflectance=True))
     arrays = [folder / f"{i}.npy" for i in range(len(paths))]
     for number, path in enumerate(arrays):
         np.save(path, prepared[number])

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.data.opening import open_prepared, own_reading
+from r2flow.data.opening import SOURCES, own_reading
+from r2flow.data.options import SourceOptions
 from r2flow.data.pairs import PairRecipe, PairStore
+from r2flow.data.prepared import PreparedScans
 from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.labels import read_labels
@@ -48,7 +50,8 @@ def in_folder(name: str) -> Callable[[Path], Path]:
 
 def prepared(path: Path) -> bytes:
     folder = in_folder("prepared")(path)
-    source = open_prepared(folder, Reading(SENSOR, reflectance=True))
+    source = SOURCES["prepared"].open(SourceOptions("prepared", str(folder)), Reading(SENSOR, reflectance=True))
+    assert isinstance(source, PreparedScans)
     for shard in source.rows[:, 1]:
         try:
             source.store.read(int(shard))

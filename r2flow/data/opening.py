@@ -49,7 +49,19 @@ class Prepared(SourceKind):
     """Shards of `r2flow prepare`."""
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        return open_prepared(options.folder, reading, options.split, options.drives)
+        folder, split, drives = Path(options.folder).expanduser(), options.split, options.drives
+        recipe, stored = read_prepared(folder)
+        refuse_other_images(folder, recipe, reading)
+        kind = SOURCES[recipe["layout"] if recipe["layout"] in SOURCES else FOLDER]
+        if split is None and drives is None:
+            parts = sorted({part for drive in stored if (part := kind.split_of(drive.name))})
+            if len(parts) > 1:
+                log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(parts))
+        spans = dict(zip(map(id, stored), spans_of(stored), strict=True))
+        numbers = [number for drive in kind.chosen(stored, split, drives) for number in spans[id(drive)]]
+        scans = PreparedScans(folder, numbers, bool(reading.reflectance))
+        check(len(scans), f"{folder} holds no usable scan of split={split!r}, drives={drives}.")
+        return scans
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         return f"the scans in {options.folder} have no reflectance" if self.levels_of(options) is None else None
@@ -280,25 +292,3 @@ def refuse_parts(spec: str | Path) -> None:
             f"{spec} holds a part of each scan alone (see its {MANIFEST}) and cannot be compared with whole scans: "
             "sample without --sector and --rows."
         )
-
-
-# Prepared scans
-
-
-def open_prepared(
-    root: str | Path, reading: Reading, split: str | None = None, drives: Sequence[str | int] | None = None
-) -> PreparedScans:
-    """Open a folder of `r2flow prepare`, by the split and the drives of its data set."""
-    folder = Path(root).expanduser()
-    recipe, stored = read_prepared(folder)
-    refuse_other_images(folder, recipe, reading)
-    kind = SOURCES[recipe["layout"] if recipe["layout"] in SOURCES else FOLDER]
-    if split is None and drives is None:
-        parts = sorted({part for drive in stored if (part := kind.split_of(drive.name))})
-        if len(parts) > 1:
-            log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(parts))
-    spans = dict(zip(map(id, stored), spans_of(stored), strict=True))
-    numbers = [number for drive in kind.chosen(stored, split, drives) for number in spans[id(drive)]]
-    scans = PreparedScans(folder, numbers, bool(reading.reflectance))
-    check(len(scans), f"{folder} holds no usable scan of split={split!r}, drives={drives}.")
-    return scans

@@ -54,7 +54,7 @@ class Plan:
 
     @property
     def shards(self) -> range:
-        return range(-(-self.recipe["scans"] // self.recipe["shard_scans"]))
+        return range(len(shards_of(self.recipe)))
 
 
 def plan_files(
@@ -106,7 +106,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
 
 def _make_shard(store: Store, source: ScanSource, skip: bool, shard: int) -> None:
     """Project and encode the scans of a shard."""
-    recipe, numbers, left_out, errors = store.described, _numbers_of(store.described, shard), [], [0.0, 0.0]
+    recipe, numbers, left_out, errors = store.described, shards_of(store.described)[shard], [], [0.0, 0.0]
     coders = dict(zip(CHANNELS, codes_of(recipe), strict=False))
     shape = (len(numbers), *Reading.of(recipe["reading"]).sensor.shape)
     tensors = {name: np.empty(shape, coder.dtype) for name, coder in coders.items()}
@@ -156,10 +156,10 @@ def prepare(
     return notes
 
 
-def _numbers_of(recipe: Mapping[str, Any], shard: int) -> range:
-    """The numbers of the scans of a shard."""
-    size = recipe["shard_scans"]
-    return range(recipe["scans"])[shard * size : (shard + 1) * size]
+def shards_of(recipe: Mapping[str, Any]) -> list[range]:
+    """The numbers of each shard's scans."""
+    scans, size = range(recipe["scans"]), recipe["shard_scans"]
+    return [scans[first : first + size] for first in scans[::size]]
 
 
 def codes_of(recipe: Mapping[str, Any]) -> list[RangeCodes | ReflectanceCodes]:
@@ -208,18 +208,17 @@ class PreparedScans(ScanSource):
     def __init__(self, folder: Path, numbers: Sequence[int] | None = None, reflectance: bool = True) -> None:
         self.folder, self.reflectance = folder, reflectance
         self.recipe, self._drives = read_prepared(folder)
-        plan = Plan(self.recipe, tuple(self._drives), self)
-        self.store, entries = plan.store(folder), []
+        self.store, entries = Store(folder, KIND, self.recipe), []
         if reflectance and self.recipe["levels"] is None:
             raise InputError(f"{folder} holds scans without reflectance. Set encoding.reflectance=false.")
-        for shard in plan.shards:
+        for shard, numbers_of_shard in enumerate(shards_of(self.recipe)):
             try:
                 left_out = set(self.store.head(shard)["left_out"])
             except FileNotFoundError:
                 raise InputError(f"{folder} is not finished: the same r2flow prepare command resumes.") from None
             except Damaged as error:
                 raise self._damaged(shard, error) from None
-            rows = [number for number in _numbers_of(self.recipe, shard) if number not in left_out]
+            rows = [number for number in numbers_of_shard if number not in left_out]
             entries += [(number, shard, row) for row, number in enumerate(rows)]
         #: Rows of (number in the data set, shard, row of the shard).
         self.rows = np.array(entries, dtype=np.int64).reshape(-1, 3)

@@ -14,7 +14,8 @@ import torch
 import yaml
 
 from r2flow.data.layouts import Drive
-from r2flow.data.opening import SOURCES, find_drives, open_prepared
+from r2flow.data.opening import SOURCES, find_drives
+from r2flow.data.options import SourceOptions
 from r2flow.data.prepared import Plan, plan_files, prepare, read_prepared
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.reading import Reading, read_scan
@@ -60,7 +61,8 @@ def make(folder: Path, plan: Plan, **options) -> Path:
 
 
 def prepared_in(folder: Path, sensor: Sensor = SMALL, split=None, drives=None, reflectance=True, **how):
-    return open_prepared(folder, Reading(sensor, reflectance=reflectance, **how), split, drives)
+    options = SourceOptions("prepared", str(folder), split, drives)
+    return SOURCES["prepared"].open(options, Reading(sensor, reflectance=reflectance, **how))
 
 
 def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options) -> ScanFiles:
@@ -411,7 +413,7 @@ def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
     assert code == 0
     assert f"{out}: 6 scans in 2 shards, 0.0 MiB; range within" in said
     assert "reflectance as n/256, exactly" in said
-    source = open_prepared(out, Reading(SMALL, reflectance=True))
+    source = prepared_in(out)
     assert len(source) == 6
     raw = read_scan(kitti_360 / source.names[5], SMALL)
     assert np.abs(source[5] - raw).max() <= 1e-3
@@ -429,7 +431,7 @@ def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):
     recipe = read_manifest(tmp_path / "out")["recipe"]["reading"]
     assert {"override /sensor@_global_.sensor": recipe["sensor"]["name"]} in config["defaults"]
     assert recipe["reflectance_scale"] == SOURCES["nuscenes"].reflectance_scale
-    image = open_prepared(tmp_path / "out", Reading(SENSORS["hdl32e"], reflectance=True))[0]
+    image = prepared_in(tmp_path / "out", SENSORS["hdl32e"])[0]
     assert np.count_nonzero(image[0]) == 3
     assert np.array_equal(np.unique(image[1]), np.array([0, 100 / 255, 1], np.float32))
 
@@ -445,11 +447,7 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):
     for out, given in (("one", (numbered,)), ("two", (wide, *columns))):
         code, _, error = r2flow("prepare", *given, *small, "--out", tmp_path / out)
         assert (code, error) == (0, "")
-    for one, two in zip(
-        open_prepared(tmp_path / "one", Reading(SMALL, reflectance=True)),
-        open_prepared(tmp_path / "two", Reading(SMALL, reflectance=True)),
-        strict=False,
-    ):
+    for one, two in zip(prepared_in(tmp_path / "one"), prepared_in(tmp_path / "two"), strict=False):
         assert np.array_equal(one, two)
     assert read_manifest(tmp_path / "one")["recipe"]["reading"]["columns"] is None
     code, _, error = r2flow("prepare", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two")
