@@ -229,7 +229,7 @@ def _assembled(config: dict[str, Any], generator: Generator) -> Run:
     stage = build_stage(config, generator)
     data.further = stage.further
     trainer = _build_trainer(config, stage)
-    data.check_run(trainer.world_size, trainer.accumulate_grad_batches, trainer.max_steps)
+    data.check_run(trainer.world_size, trainer.accumulate_grad_batches)
     return Run(config, stage, data, trainer)
 
 

@@ -22,7 +22,7 @@ from r2flow.data.pairs import PairDataset, PairSource, PairStore
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
-from r2flow.errors import InputError, check
+from r2flow.errors import check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.progress import track
@@ -72,7 +72,6 @@ class ScanDataModule(L.LightningDataModule):
         check_options("data.pairs", PairOptions, options)
         check(not self.augment, "data.augment changes scans, and an augmented pair is not a flow's pair; leave it out.")
         check(self.validation.data is None, "data.validation.data cannot be held out from pairs; leave it out.")
-        check(self.options.root is not None, "data=pairs needs the flow that draws them: stage.init=RUN.")
         return PairOptions(**options)
 
     @property
@@ -181,14 +180,13 @@ class ScanDataModule(L.LightningDataModule):
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
-    def check_run(self, ranks: int, accumulated: int, max_steps: int) -> None:
-        """Refuse a run whose global batch cannot be divided among devices, or that has no steps."""
-        if self.batch_size % (ranks * accumulated):
-            raise InputError(
-                f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
-                f"{accumulated} accumulated batches; give a multiple of {ranks * accumulated}."
-            )
-        check(max_steps >= 1, f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run.")
+    def check_run(self, ranks: int, accumulated: int) -> None:
+        """Refuse a run whose global batch cannot be divided among devices."""
+        check(
+            self.batch_size % (ranks * accumulated) == 0,
+            f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
+            f"{accumulated} accumulated batches; give a multiple of {ranks * accumulated}.",
+        )
 
     def train_dataloader(self) -> RunLoader:
         """Batches from the trainer's current step to max_steps."""
@@ -197,7 +195,8 @@ class ScanDataModule(L.LightningDataModule):
         assert self.trainer is not None
         rank, ranks = self._ranks()
         accumulated = self.trainer.accumulate_grad_batches
-        self.check_run(ranks, accumulated, self.trainer.max_steps)
+        self.check_run(ranks, accumulated)
+        check(self.trainer.max_steps >= 1, "trainer.max_steps must be at least 1: it is the length of a run.")
         order, batches = self._order(self.training_source), self.trainer.max_steps * accumulated
         sampler = RunSampler(order, self.batch_size // accumulated, batches, rank, ranks)
         sampler.first_batch = self.trainer.global_step * accumulated
