@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.metadata
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from r2flow.runs.folder import read_config, write_config
 from r2flow.stages import STAGES
 from r2flow.training import build
 from tests.training.conftest import Run, in_process, tiny
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "street"
 
 STAGE = '''
 from r2flow.stages import STAGES
@@ -170,3 +173,16 @@ def test_what_is_in_a_registry_without_a_yaml_file_becomes_a_choice(group: str, 
     config = compose([f"{group}=somebodys"])
     assert config[group]["name"] == "somebodys"
     assert set(choices(group)) >= {"somebodys"}
+
+
+LINKS = sorted({file.stem for file in (EXAMPLE / "experiment").glob("*.yaml")} - {"street"})  # street is a chain
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_an_example_lacks_its_files_alone(tmp_path: Path, name: str):
+    of_links = () if name in ("street_1rf", "street_full") else ("stage.init=street",)
+    root = ("data.root=runs/street/scenes",) if name == "finetune_map" else ()
+    command = ["--plugin", str(EXAMPLE / "street_stage.py"), "--config-dir", str(EXAMPLE), f"experiment={name}"]
+    done = in_process(tmp_path, [*command, *of_links, *root], check=False)
+    assert done.returncode == 2
+    assert re.search(r"runs/street/(scenes|grown)", done.stderr)
