@@ -40,20 +40,24 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
     return load_checkpoint(name, choose_device(str(device), "device"))
 
 
-def read(path: "str | Path", sensor: "Sensor | str | None" = None) -> "torch.Tensor":
+def read(
+    path: "str | Path", sensor: "Sensor | str | None" = None, reflectance_scale: float | None = None
+) -> "torch.Tensor":
     """Read a scan from a file: range in metres and reflectance, (2, H, W) float32, 0 for rays without a return.
 
     Args:
         path: A scan file, or a range image (.npy).
         sensor: Sensor of the image, or its name or YAML file. Default: the sensor in the manifest of a folder that
             r2flow wrote, else hdl64e.
+        reflectance_scale: Value of full reflectance in the file. Default: the sensor's, else 1, 255 or the largest
+            value of the file, whichever is the first that no value exceeds.
 
     Raises:
         InputError: the file cannot be read, or no point is in the sensor's field of view.
     """
     from r2flow.data.opening import read
 
-    return read(path, sensor)
+    return read(path, sensor, reflectance_scale)
 
 
 def __dir__() -> list[str]:

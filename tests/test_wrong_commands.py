@@ -109,6 +109,7 @@ interpolate scans/000000.bin bad.bin -c run -o out
 interpolate scans scans -c run -o out # scan
 show scans # Missing
 show file.txt -o out
+show scans -o out.png
 show scans -o out --size ²x²
 show scans -o out --projection unfolding
 show run -o out # a run without samples

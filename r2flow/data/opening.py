@@ -233,9 +233,12 @@ def _reading_of(model: Model) -> Reading:
     return Reading(model.sensor, **{key: value for key, value in agreed.items() if value is not None})
 
 
-def read(path: str | Path, sensor: Sensor | str | None = None) -> Tensor:
+def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale: float | None = None) -> Tensor:
     """`r2flow.read`."""
-    reading = replace(reading_for([path], sensor=sensor), on_bad_scan="error", within_limits=True)
+    reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale)
+    if reflectance_scale is None and own_reading(path) is None:
+        reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)  # None: estimated
+    reading = replace(reading, on_bad_scan="error", within_limits=True)
     image = torch.from_numpy(open_scans(path, reading).source[0])
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
+from matplotlib import colormaps, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap, hsv_to_rgb, to_hex, to_rgb
 from matplotlib.figure import Figure
@@ -140,7 +140,7 @@ def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
 def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Draw the square root of reflectance in [0, 1] from blue to yellow, dropped rays black."""
     shown = np.ma.masked_where(image[0] <= 0, np.sqrt(np.clip(image[1], 0, 1)))
-    _show(axes, shown, "reflectance" if label else "", colours("reflectance"), {0: 0.0, 0.2: 0.2**0.5, 0.81: 0.9})
+    _show(axes, shown, "reflectance" if label else "", colours("reflectance"), {0: 0.0, 0.2: 0.2**0.5, 0.8: 0.8**0.5})
 
 
 def _show(axes: Any, values: np.ndarray, title: str, cmap: Any, ticks: Mapping[float, float]) -> None:
@@ -228,7 +228,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 300, **notes: str) 
     """Write a PNG or PDF with notes, as PDF knows them, atomically."""
     path = Path(path)
     take_names_as_they_are(figure)
-    with atomic_write(path) as file:
+    with atomic_write(path) as file, rc_context({"pdf.fonttype": 42}):  # TrueType: publishers refuse Type 3
         figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata=notes)
     return path
 

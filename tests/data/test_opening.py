@@ -158,6 +158,11 @@ class TestWhatR2FlowWrote:
             assert scan[0].max() == 10
             assert not scan[1].any()
 
+    def test_reflectance_in_bytes_is_scaled_and_in_another_scale_too(self, tmp_path: Path):
+        write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32), np.array([51], np.float32))
+        for scale, value in ((None, 0.2), (102, 0.5)):  # 51 / 255
+            assert float(r2flow.read(tmp_path / "a.ply", "vlp16", scale)[1].max()) == pytest.approx(value, abs=1e-6)
+
     def test_the_front_door_shows_what_a_user_may_use(self):
         assert dir(r2flow) == ["__version__", "load", "read"]
 

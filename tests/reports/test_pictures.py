@@ -48,7 +48,9 @@ def test_a_picture_is_as_wide_as_a_page_and_white(tmp_path):
     figure = scan_figure(image(np.full_like(E, 10.0)), SENSOR.rays())
     assert figure.get_figwidth() == pytest.approx(7.16)
     assert (figure_pixels(figure)[[0, -1]] == 255).all()
-    assert save_figure(figure, tmp_path / "scan.pdf").read_bytes().startswith(b"%PDF")
+    pdf = save_figure(figure, tmp_path / "scan.pdf").read_bytes()
+    assert pdf.startswith(b"%PDF")
+    assert b"/Type3" not in pdf
 
 
 def test_near_and_far_look_different_and_dropped_rays_are_black():
