@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from typer.testing import CliRunner
 
+from r2flow.cli.verbs import app
 from r2flow.errors import InputError
 from r2flow.reports.compare import (
     cell,
@@ -217,3 +219,11 @@ def test_a_folder_that_is_no_run_is_named(tmp_path, content, words):
 def test_losses_have_a_logarithmic_axis_where_it_has_labels(values, scale):
     figure = curves_figure([("run", {"train/loss": (np.array([1, 2]), np.array(values))})])
     assert figure.axes[0].get_yscale() == scale
+
+
+@pytest.mark.parametrize("steps", [(40, 40), (40, 20)])
+def test_the_verb_tells_runs_of_different_lengths(tmp_path, steps):
+    for name, step in zip("ab", steps, strict=True):
+        make_run(tmp_path / name, checkpoint=step)
+    done = CliRunner().invoke(app, ["compare", str(tmp_path / "a"), str(tmp_path / "b")])
+    assert ("different numbers of images" in done.output) == (steps[0] != steps[1])
