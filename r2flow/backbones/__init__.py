@@ -36,8 +36,12 @@ def build_backbone(
         out_channels: Channels of the output; None: `in_channels`.
         second_time: Whether the network takes a second time s.
     """
-    common = {"in_channels": in_channels, "out_channels": out_channels, "second_time": second_time}
-    return BACKBONES.build({**options, **common}, rays)
+    arguments: dict[str, Any] = {"in_channels": in_channels}
+    if out_channels is not None:
+        arguments["out_channels"] = out_channels
+    if second_time:
+        arguments["second_time"] = True
+    return BACKBONES.build({**options, **arguments}, rays)
 
 
 def configurations() -> Registry[dict[str, Any]]:

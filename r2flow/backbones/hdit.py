@@ -27,6 +27,7 @@ from r2flow.backbones.layers import (
     unshuffle,
     zero_initialised,
 )
+from r2flow.errors import InputError
 from r2flow.registry import Bound, Count, Portion
 
 
@@ -143,8 +144,8 @@ class HDiT(Backbone):
     def follow_rays(self) -> None:
         for level in range(self.levels):
             rays = mean_rays(self.coords, (self.patch[0] << level, self.patch[1] << level))
-            rotation = self._blocks(level)[0].residual_attn.rope  # equal in all blocks of a level
-            self.register_buffer(f"table_{level}", rotation.table(rays), persistent=False)
+            table = _shared_rotation(level, self._blocks(level)).table(rays)
+            self.register_buffer(f"table_{level}", table, persistent=False)
         if isinstance(self.spatial_pe, FeaturePosition):
             self.spatial_pe.follow(mean_rays(self.coords, self.patch))
 
@@ -174,6 +175,15 @@ def time_embedding(channels: int, dropout: float) -> nn.Sequential:
 
 def _level(side: nn.ModuleDict, level: int) -> Iterable["Block"]:
     return cast(Iterable[Block], side[f"level_{level}"])
+
+
+def _shared_rotation(level: int, blocks: Sequence["Block"]) -> Rotary:
+    """The rotation of all blocks of a level, which share a table: their loaded frequencies must be equal."""
+    first, *others = (block.residual_attn.rope for block in blocks)
+    for name, buffer in first.named_buffers():
+        if not buffer.is_meta and any(not torch.equal(buffer, other.get_buffer(name)) for other in others):
+            raise InputError(f"the blocks of hdit level {level} differ in their rotary {name}; they must not.")
+    return first
 
 
 class LearnablePosition(nn.Module):

@@ -16,7 +16,7 @@ from r2flow.backbones.layers import ExactLinear, zero_initialised
 from r2flow.errors import InputError, check
 from r2flow.registry import Bound, Positive
 
-ANY_SIZE = 2, 6720, 6720  # shape of rays, to build a network on the meta device and read its unit
+ANY_SIZE = 2, 256, 1024  # shape of rays, to build a network and read its unit
 
 
 class Pyramid(Backbone):
@@ -71,11 +71,16 @@ class Pyramid(Backbone):
         check(rows * columns > 1, "backbone.factor must be of more than one pixel, such as [2, 4]; found [1, 1].")
         channels = common.get("in_channels", 2)
         out_channels = common.get("out_channels") or channels
-        with torch.device("meta"):  # the unit of the inner network decides which sizes are possible
-            unit = build_backbone(inner, torch.zeros(ANY_SIZE), channels, out_channels).unit
-        super().__init__(rays, (rows * unit[0], columns * unit[1]), **common)
-        coarse_rays = mean_rays(rays[None], (rows, columns))[0]
-        small = build_backbone(inner, coarse_rays, channels, out_channels)
+        whole = rays.shape[-2] % rows == 0 and rays.shape[-1] % columns == 0
+        coarse_rays = mean_rays(rays[None], (rows, columns))[0] if whole else rays.new_zeros(ANY_SIZE)
+        try:
+            small = build_backbone(inner, coarse_rays, channels, out_channels)
+        except InputError as error:
+            try:
+                small = build_backbone(inner, rays.new_zeros(ANY_SIZE), channels, out_channels)
+            except InputError:  # the size is not the cause
+                raise error from None
+        super().__init__(rays, (rows * small.unit[0], columns * small.unit[1]), **common)
         self.factor, self.below_std, self.inner = (rows, columns), below_std, small
         blocks, width = integers("coarse", coarse, 2)
         self.timestep_pe = time_embedding(time_channels, dropout=0.0)

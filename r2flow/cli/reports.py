@@ -262,7 +262,7 @@ def compare(
     for title, (cells, headings) in tables(groups).items():
         print_table(cells, headings, title)
         print()
-    if len({run.values["images"] for run in compared}) > 1:
+    if len({run.values["images"] for run in compared} - {None}) > 1:
         print("the runs have seen different numbers of images: compare their curves at equal steps")
     if out is not None:
         for path in write_page(compare_page(groups, command()), out):

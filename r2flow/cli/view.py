@@ -54,7 +54,7 @@ def show(
     from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure
 
-    if out.suffix in (".png", ".pdf", ".npy"):
+    if out.suffix.lower() in (".png", ".pdf", ".npy"):
         raise InputError(f"--out must be a folder, for a file per scan, found {out}.")
     names: list[str] = []
     for caption, (image,), rays, classes in (panel for spec in scans for panel in panels_of(spec, how, most, labels)):

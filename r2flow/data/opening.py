@@ -8,6 +8,7 @@ scan files listed by `find_mine(root)`, or a subclass of `SourceKind`.
 """
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -236,7 +237,11 @@ def _reading_of(model: Model) -> Reading:
 def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale: float | None = None) -> Tensor:
     """`r2flow.read`."""
     reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale)
-    if reflectance_scale is None and own_reading(path) is None:
+    check(
+        reflectance_scale is None or 0 < reflectance_scale < math.inf,
+        f"reflectance_scale must be a positive number, found {reflectance_scale}.",
+    )
+    if reflectance_scale is None and parse(str(path))[0].name == FOLDER and own_reading(path) is None:
         reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)  # None: estimated
     reading = replace(reading, on_bad_scan="error", within_limits=True)
     image = torch.from_numpy(open_scans(path, reading).source[0])

@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 
+from r2flow.errors import check
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.condition import condition_of
 from r2flow.generators.flow import USUAL, Flow, RectifiedFlow, as_flow
@@ -37,6 +38,7 @@ def build_generator(config: Mapping[str, Any]) -> Generator:
     """Build the generator of a config: keys `sensor`, `encoding`, `backbone`, `generator` (default: rectified flow)."""
     with torch.device("cpu"):  # geometry needs real values, even if the weights are on the meta device
         space = build_space(config)
+    check("backbone" in config, "the config has no 'backbone'.")
     generator: Generator = GENERATORS.build(
         config.get("generator") or {"name": "rectified_flow"}, space, config["backbone"]
     )

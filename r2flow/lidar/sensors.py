@@ -192,7 +192,10 @@ def build_sensor(
     if elevations is not None and name in SENSORS:
         raise InputError(f"{name!r} is the name of a built-in sensor; give your own sensor another one.")
     limits = {"min_range": min_range, "max_range": max_range, "height": height, "reflectance_scale": reflectance_scale}
-    given = {key: float(value) for key, value in limits.items() if value is not None}
-    sensor = SENSORS[name] if elevations is None else Sensor(name, tuple(map(float, elevations)))
-    sensor = sensor if firing is None else replace(sensor, firing=tuple(firing))
+    try:
+        given = {key: float(value) for key, value in limits.items() if value is not None}
+        sensor = SENSORS[name] if elevations is None else Sensor(name, tuple(e + 0.0 for e in elevations))
+        sensor = sensor if firing is None else replace(sensor, firing=tuple(firing))
+    except (OverflowError, TypeError) as error:  # YAML integers can have any number of digits, lists any values
+        raise InputError(f"sensor {name!r}: elevations, firing and limits must be numbers; {error}.") from None
     return replace(sensor.resized(rows, columns), **given)  # type: ignore[arg-type]

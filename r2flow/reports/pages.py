@@ -68,7 +68,7 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
     # Figures carry their provenance; PNG notes only support Latin-1.
     note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
     written = [
-        save_figure(figure, out / f"{name}.{ending}", Title=page.title, Subject=note)
+        save_figure(figure, out / f"{name}.{ending}", title=page.title, about=note)
         for name, figure in page.figures.items()
         for ending in ("png", "pdf")
     ]

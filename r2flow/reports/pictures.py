@@ -77,7 +77,9 @@ def completed_figure(
         spread: Standard deviation of the range in metres and share of answers with a return, (2, H, W).
         truth: The whole scan, (2 or 1, H, W).
     """
-    channels = max(len(image) for _, image in rows)  # answers may have reflectance where the scan has none
+    channels = max(
+        len(image) for image in (*(image for _, image in rows), *(() if truth is None else (truth,)))
+    )  # answers may have reflectance where the scan has none
     errors = [None, *(None if truth is None else _error(image, truth, unknown) for _, image in rows[1:])]
     shown = [(name, image, error) for (name, image), error in zip(rows, errors, strict=True)]
     shown += [] if truth is None else [("truth", truth, None)]
@@ -164,7 +166,8 @@ def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
     _strip(axes, "labels")
     x = 0.07
     for name, colour in list(entries.items())[:9]:  # as many as fit, most frequent first
-        axes.text(x, 1.03, name, transform=axes.transAxes, color=colour, fontsize=7, va="bottom")
+        axes.text(x, 1.03, name, transform=axes.transAxes, color=colour, fontsize=7, va="bottom",
+                  bbox={"facecolor": "0.25", "edgecolor": "none", "pad": 0.8})  # fmt: skip
         x += 0.012 + 0.0082 * len(name)
 
 
@@ -224,12 +227,13 @@ def take_names_as_they_are(figure: Figure) -> None:
             text.set_parse_math(False)
 
 
-def save_figure(figure: Figure, path: str | Path, dpi: int = 300, **notes: str) -> Path:
-    """Write a PNG or PDF with notes, as PDF knows them, atomically."""
+def save_figure(figure: Figure, path: str | Path, dpi: int = 300, title: str = "", about: str = "") -> Path:
+    """Write a PNG or PDF with its title and what it is about, atomically; equal figures have equal files."""
     path = Path(path)
+    notes = {"Subject": about, "CreationDate": None} if path.suffix == ".pdf" else {"Description": about}
     take_names_as_they_are(figure)
     with atomic_write(path) as file, rc_context({"pdf.fonttype": 42}):  # TrueType: publishers refuse Type 3
-        figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata=notes)
+        figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata={"Title": title, **notes})
     return path
 
 

@@ -146,3 +146,11 @@ def test_autocast_does_not_round_the_image_at_the_ends():
 def test_options_that_cannot_work_say_why(options, message):
     with pytest.raises(InputError, match=message):
         small(**options)
+
+
+def test_levels_that_rotate_differently_are_refused():
+    model = small()
+    state = model.state_dict()
+    state["up_levels.level_0.0.residual_attn.rope.freqs_w"] += 1
+    with pytest.raises(InputError, match="level 0 differ in their rotary freqs_w"):
+        model.load_state_dict(state)

@@ -84,7 +84,7 @@ def test_jumps_move_the_means_as_the_inner_network_does():
     ({"factor": [2]}, "factor must be 2 integers"),
     ({"inner": {"name": "hdi"}}, "hdit"),
     ({"inner": {"depths": [1]}}, "needs a 'name'"),
-    ({"inner": {"name": "hdit", "patch": [3, 4]}}, "height 16 cannot be used by Pyramid"),
+    ({"inner": {"name": "hdit", "patch": [3, 4]}}, "height 16 cannot be used by HDiT"),
     ({"data_std": 0.5}, "leave backbone.data_std out"),
 ])  # fmt: skip
 def test_what_cannot_be_built(options, message):

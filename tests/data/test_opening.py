@@ -163,6 +163,12 @@ class TestWhatR2FlowWrote:
         for scale, value in ((None, 0.2), (102, 0.5)):  # 51 / 255
             assert float(r2flow.read(tmp_path / "a.ply", "vlp16", scale)[1].max()) == pytest.approx(value, abs=1e-6)
 
+    @pytest.mark.parametrize("scale", [0, -1.0, float("inf"), float("nan")])
+    def test_a_reflectance_scale_is_a_positive_number(self, tmp_path: Path, scale: float):
+        write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32), np.array([51], np.float32))
+        with pytest.raises(InputError, match="reflectance_scale must be"):
+            r2flow.read(tmp_path / "a.ply", "vlp16", scale)
+
     def test_the_front_door_shows_what_a_user_may_use(self):
         assert dir(r2flow) == ["__version__", "load", "read"]
 
