@@ -301,16 +301,16 @@ FEW = "the halves of your 24 real scans have 12 or more and the set has 18"
     [
         ("kid_x", 200, 200, 9.0, 99.0, "not distinguishable"),
         ("kid_x", 200, 200, 11.0, 1.0, "not distinguishable"),  # within the margin
-        ("kid_x", 200, 200, 13.0, 1.0, "farther from the real scans than these are"),
-        ("kid_x", 200, 200, 50.0, 1.0, "no nearer to the real scans than a baseline"),
+        ("kid_x", 200, 200, 13.0, 1.0, "higher than between the real halves"),
+        ("kid_x", 200, 200, 50.0, 1.0, "no lower than a baseline"),
         ("kid_x", 200, 20, 9.0, None, "not above the real halves, below the baselines: an indication"),
         ("panel", 24, 18, 9.0, 11.0, f"above the real halves, below the baselines: an indication, as {FEW}: give 200"),
         ("panel", 24, 18, 60.0, 9.5, f"not above the real halves, not below the baselines: an indication, as {FEW}"),
         ("panel", 24, 18, 9.0, None, f"an indication, as {FEW}"),
         ("panel", 200, 200, 9.0, None, "give 100 generated"),  # the halves' distance is larger since they are fewer
         ("panel", 200, 200, 9.0, 9.5, "not distinguishable"),
-        ("panel", 200, 200, 9.0, 13.0, "farther from the real scans than these are"),
-        ("panel", 200, 200, 13.0, None, "farther from the real scans than these are"),
+        ("panel", 200, 200, 9.0, 13.0, "higher than between the real halves"),
+        ("panel", 200, 200, 13.0, None, "higher than between the real halves"),
     ],
 )
 def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, value, equal, words):
@@ -328,7 +328,7 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
     first, _ = verdict(comparisons)
     same = f"in as many scans as the halves {equal:g}, " if metric == "panel" and equal is not None else ""
     known = f"{same}reference: real halves 10, baseline: noise 50"
-    assert first.startswith(f"a: nearest, {metric} {value:g} ({known}): ")
+    assert first.startswith(f"a: lowest, {metric} {value:g} ({known}): ")
     assert words in first
 
 

@@ -6,7 +6,6 @@ import sys
 import webbrowser
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
@@ -29,12 +28,12 @@ MOST = 256  # largest number of each per page
 
 def panels_of(spec: str, how: ReadingOptions, most: int, labelled: bool = True) -> "Iterator[Panel]":
     """At most `most` scans of a set as panels."""
-    from r2flow.data.opening import own_reading
+    from r2flow.data.opening import estimating_scale
     from r2flow.reports.view.panels import scan_panels
 
     reading = how.reading([spec])
-    if how.reflectance_scale is None and own_reading(spec) is None:  # do not guess it from the values
-        reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
+    if how.reflectance_scale is None:
+        reading = estimating_scale(reading, spec)
     return scan_panels(spec, reading, most, labelled)
 
 

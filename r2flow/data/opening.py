@@ -236,16 +236,22 @@ def _reading_of(model: Model) -> Reading:
 
 def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale: float | None = None) -> Tensor:
     """`r2flow.read`."""
-    reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale)
     check(
         reflectance_scale is None or 0 < reflectance_scale < math.inf,
         f"reflectance_scale must be a positive number, found {reflectance_scale}.",
     )
-    if reflectance_scale is None and parse(str(path))[0].name == FOLDER and own_reading(path) is None:
-        reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)  # None: estimated
-    reading = replace(reading, on_bad_scan="error", within_limits=True)
-    image = torch.from_numpy(open_scans(path, reading).source[0])
+    reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale)
+    if reflectance_scale is None:
+        reading = estimating_scale(reading, path)
+    image = torch.from_numpy(open_scans(path, replace(reading, on_bad_scan="error", within_limits=True)).source[0])
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
+
+
+def estimating_scale(reading: Reading, spec: str | Path) -> Reading:
+    """Estimate full reflectance from each file of others whose sensor does not tell it."""
+    if own_reading(spec) is not None or parse(str(spec))[0].name != FOLDER:
+        return reading
+    return replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
 
 
 def own_reading(spec: str | Path) -> Reading | None:

@@ -109,19 +109,19 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
                 f"{len(comparison.generated)}: give {2 * ENOUGH} real and {ENOUGH} generated scans for a verdict"
             )
         elif value >= best:
-            judgement = "no nearer to the real scans than a baseline"
+            judgement = "no lower than a baseline"
         elif reference >= best:
             judgement = "undecided, as the real halves are above a baseline"
         elif not unbiased and (scans < of_half if farther else scans > of_half):
             judgement = f"undecided, as the halves have other numbers of scans: give {of_half} generated scans"
         elif farther:
-            judgement = "farther from the real scans than these are from each other"
+            judgement = "higher than between the real halves"
         else:
             judgement = "not distinguishable from real scans by this figure"
         bounds = [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
         if as_many:
             bounds.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
-        first = "nearest, " if equal and comparison is judged[0][1] else ""
+        first = "lowest, " if equal and comparison is judged[0][1] else ""
         lines.append(f"{comparison.name}: {first}{title} {value * factor:.3g} ({', '.join(bounds)}): {judgement}.")
     return lines
 

@@ -99,7 +99,7 @@ def _chosen(checkpoint: Checkpoint, formats: Sequence[str] | None) -> Sequence[s
     fitting = formats_of(checkpoint)
     formats = fitting if formats is None else formats
     if other := [name for name in formats if name not in fitting]:
-        raise InputError(f"--format {','.join(other)} is none of {','.join(fitting)}, which can hold these scans.")
+        raise InputError(f"--format {','.join(other)} cannot hold these scans; give some of {','.join(fitting)}.")
     if {"ply", "bin"} & set(formats) and not torch.equal(checkpoint.generator.space.rays, checkpoint.sensor.rays()):
         log.warning(
             "the model uses rays through the corners of bins (rays=reference); points are written along rays through "

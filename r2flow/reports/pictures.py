@@ -77,12 +77,11 @@ def completed_figure(
         spread: Standard deviation of the range in metres and share of answers with a return, (2, H, W).
         truth: The whole scan, (2 or 1, H, W).
     """
-    channels = max(
-        len(image) for image in (*(image for _, image in rows), *(() if truth is None else (truth,)))
-    )  # answers may have reflectance where the scan has none
-    errors = [None, *(None if truth is None else _error(image, truth, unknown) for _, image in rows[1:])]
-    shown = [(name, image, error) for (name, image), error in zip(rows, errors, strict=True)]
-    shown += [] if truth is None else [("truth", truth, None)]
+    shown: list[tuple[str, np.ndarray, np.ndarray | None]] = [(name, image, None) for name, image in rows]
+    if truth is not None:
+        answers = [(name, image, _error(image, truth, unknown)) for name, image in rows[1:]]
+        shown = [shown[0], *answers, ("truth", truth, None)]
+    channels = max(len(image) for _, image, _ in shown)  # answers may have reflectance where the scan has none
     heights = [0.58 * (channels + (error is not None)) for *_, error in shown] + [0.62] * (spread is not None)
     figure, grid = _sheet(heights, space=0.2, top=0.34)
     for row, (name, image, error) in enumerate(shown):
