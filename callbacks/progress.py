@@ -67,3 +67,9 @@ class Progress(RichProgressBar):
             f"  {rate * self._scans_per_step(trainer):.1f} scans/s  {duration(left)} left",
             flush=True,
         )
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        super().on_validation_end(trainer, pl_module)
+        loss = trainer.callback_metrics.get("val/loss")
+        if not self._watched and trainer.is_global_zero and loss is not None:
+            print(f"step {trainer.global_step}/{trainer.max_steps}  val/loss {float(loss):.4f}", flush=True)

@@ -249,6 +249,10 @@ def test_a_killed_sweep_takes_its_job_with_it(scans: Path, tmp_path: Path):
         time.sleep(0.01)
 
 
+def test_a_run_shorter_than_the_interval_is_validated_at_its_end(train: Run):
+    assert "val/loss" in train("trainer.max_steps=1", "samples.num=0").stdout
+
+
 def test_mixed_precision_trains(train: Run, tmp_path: Path):
     train("trainer.precision=bf16-mixed", "trainer.max_steps=4", "name=half")
     assert all(v.dtype == torch.float32 for v in weights(tmp_path / "runs" / "half")[1].values())
