@@ -142,6 +142,11 @@ def numbers(source: Sequence[np.ndarray]) -> list[int]:
     return [round(float(source[i][0].max())) - 5 for i in range(len(source))]
 
 
+def files(folder: Path) -> dict[str, bytes]:
+    """What lies in a folder, by name, but for hidden files."""
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("[!.]*")) if path.is_file()}
+
+
 @pytest.fixture
 def kitti_360(tmp_path: Path) -> Path:
     for drive in (0, 2, 3, 4, 10):

@@ -36,7 +36,6 @@ def test_a_mirrored_image_is_the_image_of_the_mirrored_scan():
     xyz, reflectance = image_to_points(IMAGE, rays)
     mirrored = project(xyz * np.float32([1, -1, 1]), reflectance, SENSOR)
     np.testing.assert_allclose(mirrored, IMAGE[..., ::-1], rtol=1e-5)
-    assert any(np.array_equal(Augmentation(flip=True)(IMAGE, 0, k), IMAGE[..., ::-1]) for k in range(20))
 
 
 def test_a_rolled_image_is_the_image_of_the_turned_scan():

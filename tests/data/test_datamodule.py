@@ -24,12 +24,6 @@ def module(encoding: Encoding | None = None, **options) -> ScanDataModule:
     return data
 
 
-def test_the_last_share_is_held_out(numbered: Path):
-    data = module(name="folder", root=str(numbered), validation={"share": 0.25})
-    assert numbers(data.training_source) == list(range(9))
-    assert numbers(data.validation_source) == [9, 10, 11]
-
-
 def test_another_data_set_can_be_held_out(numbered: Path, tmp_path: Path):
     for number in (20, 21):
         write_scan(tmp_path / "other/sequences/08/velodyne" / f"{number:06d}.bin", number)
@@ -48,25 +42,12 @@ def test_scans_too_many_for_memory_are_read_when_needed(numbered: Path):
 
 def test_validation_batches_are_the_same_every_time(numbered: Path):
     data = module(name="folder", root=str(numbered), validation={"share": 0.5}, batch_size=4)
+    assert numbers(data.training_source) == list(range(6))
+    assert numbers(data.validation_source) == list(range(6, 12))
     first, second = list(data.val_dataloader()), list(data.val_dataloader())
     assert [len(batch["k"]) for batch in first] == [4, 2]
     for a, b in zip(first, second, strict=True):
         assert all(torch.equal(a[name], b[name]) for name in a)
-
-
-def test_what_cannot_be_is_refused(numbered: Path):
-    with pytest.raises(InputError, match="batch_size"):
-        module(batch_size=0)
-    with pytest.raises(InputError, match=r"no option 'shar'.*Did you mean 'share'"):
-        module(validation={"shar": 0.1})
-    with pytest.raises(InputError, match="data.root=FOLDER"):
-        module(name="kitti_360")
-    with pytest.raises(InputError, match="no standard split"):
-        module(name="folder", root=str(numbered), split="train")
-    with pytest.raises(InputError, match="data.parts needs data=mixed"):
-        module(name="folder", root=str(numbered), parts=[{"name": "folder", "root": str(numbered)}])
-    with pytest.raises(InputError, match="on_bad_scan"):
-        module(name="folder", root=str(numbered), reading={"on_bad_scan": "ignore"})
 
 
 def folder_of(folder: Path, first: int, count: int) -> Path:
@@ -124,28 +105,47 @@ def test_the_fingerprint_does_not_know_how_the_root_was_written(numbered: Path, 
     assert len(prints) == 1
 
 
+FOLDER = {"name": "folder", "root": "x"}
+DRIVES = {"name": "kitti_360", "root": "x"}
+
+
 @pytest.mark.parametrize(
-    ("parts", "word"),
+    ("options", "word"),
     [
-        (None, "data=mixed needs its parts"),
-        ([{"root": "x"}], r"data.parts\[0\] needs the name"),
-        ([{"name": "folder", "rot": "x"}], r"data.parts\[0\] has no option 'rot'.*Did you mean 'root'"),
-        ([{"name": "kitti_360", "root": "x"}], "has a standard split: give split, one of train, test, or null"),
-        ([{"name": "folder", "root": "x", "weight": 1}, {"name": "folder", "root": "y"}], "every part a weight"),
-        ([{"name": "simulated", "sensor": {"name": "vlp"}}], "no sensor named .vlp"),
-        ([{"name": "folder"}], "data.root=FOLDER"),
-        ([{"name": "folder", "root": "x", "weight": 0}], "weight must be a finite number above 0 or null, found 0"),
-        (["folder"], "a list, each a group of keys"),
-        ([{"name": "simulated", "scenes": 0}], "scenes must be a whole number from 1 to 10,000,000, found 0"),
-        (
-            [{"name": "simulated", "scenes": 2**31}],
-            "scenes must be a whole number from 1 to 10,000,000, found 2147483648",
-        ),
+        ({"batch_size": 0}, "batch_size"),
+        ({"validation": {"shar": 0.1}}, r"no option 'shar'.*Did you mean 'share'"),
+        ({"name": "kitti_360"}, "data.root=FOLDER"),
+        ({**FOLDER, "split": "train"}, "no standard split"),
+        ({**FOLDER, "parts": [FOLDER]}, "data.parts needs data=mixed"),
+        ({**FOLDER, "reading": {"on_bad_scan": "ignore"}}, "on_bad_scan"),
+        ({"name": "pairs", "root": "x", "scans": DRIVES}, r"data\.scans: kitti_360 has a standard split: give split"),
+        ({"name": "pairs", "root": "x", "scans": {**DRIVES, "split": None}}, "x is not a folder"),
+        ({"name": "mixed"}, "data=mixed needs its parts"),
     ],
 )
-def test_parts_that_cannot_be_are_refused(parts, word: str):
+def test_what_cannot_be_is_refused(options: dict, word: str):
     with pytest.raises(InputError, match=word):
-        module(name="mixed", parts=parts)
+        module(**options)
+
+
+@pytest.mark.parametrize(
+    ("part", "word"),
+    [
+        ({"root": "x"}, r"data.parts\[0\] needs the name"),
+        ({"name": "folder", "rot": "x"}, r"data.parts\[0\] has no option 'rot'.*Did you mean 'root'"),
+        (DRIVES, "has a standard split: give split, one of train, test, or null"),
+        ({**FOLDER, "weight": 1}, "every part a weight"),
+        ({"name": "simulated", "sensor": {"name": "vlp"}}, "no sensor named .vlp"),
+        ({"name": "folder"}, "data.root=FOLDER"),
+        ({**FOLDER, "weight": 0}, "weight must be a finite number above 0 or null, found 0"),
+        ("folder", "a list, each a group of keys"),
+        ({"name": "simulated", "scenes": 0}, "scenes must be a whole number from 1 to 10,000,000"),
+        ({"name": "simulated", "scenes": 2**31}, "scenes must be a whole number from 1 to 10,000,000"),
+    ],
+)
+def test_a_part_that_cannot_be_is_refused(part, word: str):
+    with pytest.raises(InputError, match=word):
+        module(name="mixed", parts=[part, FOLDER])
 
 
 def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_path: Path, caplog):
@@ -161,19 +161,6 @@ def test_validation_is_never_augmented(numbered: Path):
     plain = next(iter(module(**options).val_dataloader()))
     augmented = next(iter(module(**options, augment={"ray_dropout": 0.9, "flip": True}).val_dataloader()))
     assert torch.equal(plain["x_1"], augmented["x_1"])
-
-
-@pytest.mark.parametrize(
-    ("split", "said"),
-    [
-        ({}, r"data\.scans: kitti_360 has a standard split: give split, one of "),
-        ({"split": "train"}, "x is not a folder"),
-        ({"split": None}, "x is not a folder"),
-    ],
-)
-def test_of_scans_beside_pairs_it_is_said_whether_test_drives_are_meant(split: dict, said: str):
-    with pytest.raises(InputError, match=said):
-        module(name="pairs", root="x", scans={"name": "kitti_360", "root": "x", **split})
 
 
 class TestReflectance:

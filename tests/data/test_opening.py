@@ -10,12 +10,7 @@ import torch
 import r2flow
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive, Layout, SourceKind
-from r2flow.data.opening import (
-    SOURCES,
-    open_scans,
-    own_reading,
-    reading_for,
-)
+from r2flow.data.opening import SOURCES, open_scans, own_reading, reading_for
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairSource, PairStore, make_pairs, pair_noise
 from r2flow.data.reading import Reading
@@ -58,9 +53,6 @@ class TestNames:
         assert numbers(open_scans(numbered / "000003.bin", READING)) == [3]
         assert numbers(open_scans(numbered, READING)) == list(range(12))
         assert open_scans(numbered, READING).spread(3).source.names == ["000002.bin", "000006.bin", "000010.bin"]
-
-    def test_a_data_set_with_its_root(self, kitti_360: Path):
-        assert numbers(open_scans(f"kitti_360:{kitti_360}", READING, "test")) == [0, 1, 2, 6, 7, 8]
 
     def test_simulated_scenes(self):
         scans = open_scans("simulated:4", READING, num=2)
@@ -162,12 +154,9 @@ class TestWhatR2FlowWrote:
         write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32), np.array([51], np.float32))
         for scale, value in ((None, 0.2), (102, 0.5)):  # 51 / 255
             assert float(r2flow.read(tmp_path / "a.ply", "vlp16", scale)[1].max()) == pytest.approx(value, abs=1e-6)
-
-    @pytest.mark.parametrize("scale", [0, -1.0, float("inf"), float("nan")])
-    def test_a_reflectance_scale_is_a_positive_number(self, tmp_path: Path, scale: float):
-        write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32), np.array([51], np.float32))
-        with pytest.raises(InputError, match="reflectance_scale must be"):
-            r2flow.read(tmp_path / "a.ply", "vlp16", scale)
+        for wrong in (0, -1.0, float("inf"), float("nan")):
+            with pytest.raises(InputError, match="reflectance_scale must be"):
+                r2flow.read(tmp_path / "a.ply", "vlp16", wrong)
 
     def test_the_front_door_shows_what_a_user_may_use(self):
         assert dir(r2flow) == ["__version__", "load", "read"]
@@ -279,7 +268,7 @@ def test_scans_that_are_no_files_are_a_kind_of_their_own():
 # The noise of a run
 
 
-@pytest.mark.parametrize("shape", [None, (5,), (2, 8, 32)])
+@pytest.mark.parametrize("shape", [None, (5,)])
 def test_noise_has_the_shape_that_the_module_is_told(numbered: Path, shape):
     data = ScanDataModule(
         SENSOR, Encoding(SENSOR), 7, shape, name="folder", root=str(numbered), validation={"share": 0.25}
