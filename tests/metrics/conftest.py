@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.metrics import METRICS
+from r2flow.metrics.base import ScanMetric
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
@@ -56,17 +57,24 @@ def one_of_each_class() -> list[str]:
         return list({type(build()): name for name, build in METRICS.items()}.values())
 
 
+def random_scans(n: int, seed: int = 0, scale: float = 40.0, sensor: Sensor = SMALL) -> Scans:
+    """Random scans, (n, 2, H, W): as far as `scale` metres, decided by a seed."""
+    g = torch.Generator().manual_seed(seed)
+    r = 4 + scale * torch.rand(n, 1, *sensor.shape, generator=g) * torch.rand(n, 1, 1, 1, generator=g)
+    r = r * (torch.rand(n, 1, *sensor.shape, generator=g) < 0.8)
+    return Scans(torch.cat([r, torch.rand(r.shape, generator=g) * (r > 0)], 1), sensor)
+
+
 @pytest.fixture
 def scans_of() -> Callable[..., Scans]:
-    """Random scans of the small sensor, (n, 2, 8, 32): as far as `scale` metres, decided by a seed."""
+    return random_scans
 
-    def make(n: int, seed: int = 0, scale: float = 40.0) -> Scans:
-        g = torch.Generator().manual_seed(seed)
-        r = 4 + scale * torch.rand(n, 1, *SMALL.shape, generator=g) * torch.rand(n, 1, 1, 1, generator=g)
-        r = r * (torch.rand(n, 1, *SMALL.shape, generator=g) < 0.8)
-        return Scans(torch.cat([r, torch.rand(r.shape, generator=g) * (r > 0)], 1), SMALL)
 
-    return make
+def measured(metric: ScanMetric, real: Scans, generated: Scans) -> ScanMetric:
+    """The metric, of both sets."""
+    metric.update(real, real=True)
+    metric.update(generated, real=False)
+    return metric
 
 
 @pytest.fixture

@@ -10,8 +10,9 @@ import torch
 from r2flow.metrics import jsd_mmd, lidm
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.jsd_mmd import JSD, MMD, MMDUnbiased
-from r2flow.metrics.lidm import JSDLiDM, MMDLiDM, squared_distance_map
+from r2flow.metrics.lidm import JSDLiDM, MMDLiDM
 from r2flow.metrics.scans import Scans
+from tests.metrics.conftest import measured
 
 
 class Seen(Scans):
@@ -24,21 +25,17 @@ class Seen(Scans):
         return len(self.birds_eye)
 
 
-def figure(metric, real, generated):
-    metric.update(real, real=True)
-    metric.update(generated, real=False)
-    return metric.compute()
-
-
 def test_reference_figures(shared):
     case = torch.load(shared / "oracle" / "bev_metrics.pt", weights_only=True)
     seen = np.stack([birds_eye_histogram(points.numpy()) for points in case["point_clouds"]])
     np.testing.assert_array_equal(seen, case["hists"])
     real, generated = Seen(seen[:12]), Seen(seen[12:])
-    assert figure(JSD(), real, generated)["jsd"] == pytest.approx(case["jsd"], rel=1e-7)  # made of float32 histograms
-    assert figure(MMD(), real, generated)["mmd"] == pytest.approx(case["mmd_float64"], rel=1e-10)
-    assert figure(JSD(), real, real)["jsd"] == case["jsd_same"]
-    assert figure(MMD(), real, real)["mmd"] == pytest.approx(case["mmd_same"], abs=1e-15)
+    assert measured(JSD(), real, generated).compute()["jsd"] == pytest.approx(
+        case["jsd"], rel=1e-7
+    )  # made of float32 histograms
+    assert measured(MMD(), real, generated).compute()["mmd"] == pytest.approx(case["mmd_float64"], rel=1e-10)
+    assert measured(JSD(), real, real).compute()["jsd"] == case["jsd_same"]
+    assert measured(MMD(), real, real).compute()["mmd"] == pytest.approx(case["mmd_same"], abs=1e-15)
 
 
 def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
@@ -57,16 +54,16 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
     for block in (3, 1000):
         monkeypatch.setattr(jsd_mmd, "BLOCK", block)
         sets = Seen(counts[:10]), Seen(counts[10:])
-        assert figure(MMD(), *sets)["mmd"] == pytest.approx(expected, rel=1e-9)
-        assert figure(MMDUnbiased(), *sets)["mmd_unbiased"] == pytest.approx(unbiased, rel=1e-9)
+        assert measured(MMD(), *sets).compute()["mmd"] == pytest.approx(expected, rel=1e-9)
+        assert measured(MMDUnbiased(), *sets).compute()["mmd_unbiased"] == pytest.approx(unbiased, rel=1e-9)
 
 
 def test_disjoint_sets_have_the_largest_distance(scans_of):
     near, far = scans_of(3, scale=0.0), scans_of(3)
     far.images[:, 0] = torch.where(far.returned[:, 0], 45.0, 0.0)
     near.images[:, 0] = torch.where(near.returned[:, 0], 4.0, 0.0)
-    assert figure(JSD(), near, far)["jsd"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
-    assert figure(JSDLiDM(), near, far)["jsd_lidm"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
+    assert measured(JSD(), near, far).compute()["jsd"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
+    assert measured(JSDLiDM(), near, far).compute()["jsd_lidm"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
 
 
 def cells(points, size, depth=(1.0, 56.0)):
@@ -90,7 +87,7 @@ def test_jsd_of_the_other_toolbox_counts_scans_that_hold_a_cell(scans_of):
     for a, b in ((p, q), (q, p)):
         divergence += sum(x * math.log(2 * x / (x + b.get(cell, 0))) for cell, x in a.items()) / 2
     assert 0.01 < divergence < 0.69
-    assert figure(JSDLiDM(), real, generated)["jsd_lidm"] == pytest.approx(math.sqrt(divergence), rel=1e-9)
+    assert measured(JSDLiDM(), real, generated).compute()["jsd_lidm"] == pytest.approx(math.sqrt(divergence), rel=1e-9)
 
 
 def test_mmd_of_the_other_toolbox_is_the_mean_distance_to_the_best_match(scans_of, monkeypatch):
@@ -103,22 +100,11 @@ def test_mmd_of_the_other_toolbox_is_the_mean_distance_to_the_best_match(scans_o
 
     sets = [[np.array(sorted(cells(p.numpy(), 0.5))) / 200 for p in side.points] for side in (real, generated)]
     expected = np.mean([min(chamfer(a, b) for b in sets[1]) for a in sets[0]])
-    assert figure(MMDLiDM(), real, generated)["mmd_lidm"] == pytest.approx(expected, rel=1e-6)
-    assert figure(MMDLiDM(), real, real)["mmd_lidm"] == 0
-
-
-def test_a_distance_map_is_that_of_the_nearest_held_cell():
-    held = np.random.default_rng(0).random((13, 9)) < 0.1
-    every = np.argwhere(np.ones_like(held))
-    expected = ((every[:, None] - np.argwhere(held)) ** 2).sum(-1).min(1).reshape(13, 9)
-    np.testing.assert_array_equal(squared_distance_map(held), expected)
-    assert np.isnan(squared_distance_map(held & False)).all()
+    assert measured(MMDLiDM(), real, generated).compute()["mmd_lidm"] == pytest.approx(expected, rel=1e-6)
+    assert measured(MMDLiDM(), real, real).compute()["mmd_lidm"] == 0
 
 
 def test_js_distance_of_known_histograms():
-    p = np.array([1.0, 1.0, 0.0, 0.0])
-    assert js_distance(p, p * 7) == 0
-    assert js_distance(p, p[::-1]) == pytest.approx(math.sqrt(math.log(2)))
     # p = (1, 0), q = (1/2, 1/2), m = (3/4, 1/4), by hand.
     expected = math.sqrt((math.log(4 / 3) + 0.5 * math.log(2 / 3) + 0.5 * math.log(2)) / 2)
     assert js_distance(np.array([5, 0]), np.array([3, 3])) == pytest.approx(expected)

@@ -10,7 +10,7 @@ from r2flow.metrics import METRICS
 from r2flow.metrics.bootstrap import bootstrap
 from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
-from tests.metrics.conftest import one_of_each_class
+from tests.metrics.conftest import measured, one_of_each_class
 
 EXACT = ["frechet_handcrafted", "jsd", "mmd"]  # where a scan of weight 2 is one that is there twice
 
@@ -21,15 +21,11 @@ def test_a_weight_is_how_often_a_scan_is_there(name, many, scans_of, summary):
     sets = {"real": scans_of(15 if many else 5, 1), "generated": scans_of(14 if many else 6, 2)}
     draw = np.random.default_rng(0)
     copies = {side: torch.from_numpy(draw.integers(0, 3, (2, len(scans)))) for side, scans in sets.items()}
-    metric = METRICS[name](keep=True)
-    for side, scans in sets.items():
-        metric.update(scans, side == "real")
+    metric = measured(METRICS[name](keep=True), *sets.values())
     found = metric.resampled({side: weights.double() for side, weights in copies.items()})
     for r in range(2):
-        again = METRICS[name]()
-        for side, scans in sets.items():
-            again.update(Scans(scans.images.repeat_interleave(copies[side][r], 0), scans.sensor), side == "real")
-        expected = again.compute()
+        repeated = (Scans(x.images.repeat_interleave(copies[side][r], 0), x.sensor) for side, x in sets.items())
+        expected = measured(METRICS[name](), *repeated).compute()
         assert {figure: float(values[r]) for figure, values in found.items()} == pytest.approx(
             {figure: expected[figure] for figure in found}, rel=1e-9
         )
@@ -68,9 +64,7 @@ def test_intervals_are_as_wide_as_statistics_say_near_equal_sets_too(apart):
 
 def test_every_metric_has_an_interval_around_its_figure_or_says_that_it_has_none(scans_of, summary, coarse):
     for name in one_of_each_class():
-        metric = METRICS[name](keep=True)
-        metric.update(scans_of(20, 1), real=True)
-        metric.update(scans_of(20, 2, scale=25), real=False)
+        metric = measured(METRICS[name](keep=True), scans_of(20, 1), scans_of(20, 2, scale=25))
         found = bootstrap(metric, draws=20)
         expected = set(metric.compute()) if metric.resamples and metric.fewest <= 20 else set()
         assert set(found) == expected, name
@@ -80,9 +74,7 @@ def test_every_metric_has_an_interval_around_its_figure_or_says_that_it_has_none
 
 def test_draws_depend_on_the_seed_only(scans_of):
     def intervals(**options):
-        metric = METRICS["jsd"](keep=True)
-        metric.update(scans_of(9, 1), real=True)
-        metric.update(scans_of(9, 2), real=False)
+        metric = measured(METRICS["jsd"](keep=True), scans_of(9, 1), scans_of(9, 2))
         return bootstrap(metric, draws=26, **options)
 
     counted = []

@@ -29,7 +29,7 @@ def test_every_figure_of_a_case_worked_out_by_hand():
     # By 10 m and rays 90 degrees and 14 degrees apart, five points agree and two differ on either side.
     assert found["iou"] == pytest.approx(5 / 9)
     apart = 2 * 10 * math.sin(math.radians(14) / 2)  # of two rows at 10 m
-    theirs = (2 + apart) / 7  # truth's (0, 2) is 2 m from the answer's, its (1, 2) a row or the moved point away
+    # Truth's (0, 2) is 2 m from the answer's, its (1, 2) a row or the moved point away.
     moved = math.sqrt(10**2 + 12**2 - 2 * 10 * 12 * math.cos(math.radians(14)))
     theirs = (2 + min(moved, 10 * math.sqrt(2))) / 7
     ours = (2 + apart) / 7  # the answer's (0, 2) is 2 m away, its (1, 1) a row from truth's (0, 1)

@@ -46,20 +46,15 @@ def by_hand(x: np.ndarray, training: np.ndarray) -> np.ndarray:
     return ((log_range(x) - np.stack(y)) ** 2).mean((1, 2)).reshape(2 * 64, len(training)).min(0)
 
 
-def test_each_is_beside_its_nearest_over_turns_and_mirror(sets, made):
+def test_each_has_its_nearest_over_turns_and_mirror_and_copies_are_found(sets, made):
     found = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work(2))
     for name, one in found.items():
         for i, image in enumerate(made[name]):
             d = by_hand(image, made["training"])
             assert int(one.neighbours[i]) == d.argmin()
             assert one.distances[i] == pytest.approx(math.sqrt(d.min()), abs=1e-3)
-
-
-def test_copies_are_found_with_their_turn(sets, made):
-    found = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work())
     one, real = found["generated"], found["held"]
     assert set(np.argsort(one.distances)[:3]) == {3, 4, 5}
-    assert one.neighbours[3:].tolist() == [5, 6, 7]
     assert (one.turns[3:] < 0).tolist() == [False, False, True]
     for place in (3, 4, 5):  # the figure draws the training scan as the sample shows it
         np.testing.assert_array_equal(one.match(place, sets["training"])[0], made["generated"][place][0])

@@ -42,35 +42,24 @@ def test_features_are_of_each_scan_alone(name):
         torch.testing.assert_close(network.features(Scans(images[:, :1], SMALL)), features, equal_nan=True)
 
 
-@pytest.fixture(scope="module")
-def pointnet_of_small():
-    return untrained(PointNet)
-
-
 @torch.inference_mode()
 def test_pointnet_is_the_reference(shared, monkeypatch):
     case = load_case(shared, "feat_pointnet.pt")
-    pointnet_of_small = PointNet(case["cfg"]["k"]).eval()
-    pointnet_of_small.load_state_dict(case["state_dict"], strict=True)
-    torch.testing.assert_close(pointnet_of_small(case["x"]), case["output"], rtol=1e-4, atol=1e-4)
+    network = PointNet(case["cfg"]["k"]).eval()
+    network.load_state_dict(case["state_dict"], strict=True)
+    torch.testing.assert_close(network(case["x"]), case["output"], rtol=1e-4, atol=1e-4)
     monkeypatch.setattr(pointnet, "CHUNK", 2 * 300)  # points in parts: 300 of each scan, and a rest
-    torch.testing.assert_close(pointnet_of_small(case["x"]), case["output"], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(network(case["x"]), case["output"], rtol=1e-4, atol=1e-4)
 
 
-def test_a_dropped_ray_is_the_origin_in_units_of_80_m(pointnet_of_small):
+def test_a_dropped_ray_is_the_origin_in_units_of_80_m():
+    network = untrained(PointNet)
     images = torch.rand(1, 1, *SMALL.shape) * 50 + 1
     images[0, 0, :, ::3] = 0
     batch = Scans(images, SMALL)
     points = torch.cat([batch.points[0], torch.zeros(1, 3)]).T[None] / 80
     order = torch.randperm(points.shape[2])
-    torch.testing.assert_close(
-        pointnet_of_small.features(batch), pointnet_of_small(points[:, :, order]), rtol=1e-5, atol=1e-5
-    )
-
-
-@pytest.fixture(scope="module")
-def case(shared):
-    return load_case(shared, "feat_rangenet21.pt")
+    torch.testing.assert_close(network.features(batch), network(points[:, :, order]), rtol=1e-5, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -78,14 +67,9 @@ def network():
     return untrained(RangeNet21)
 
 
-def scans(num: int = 3, channels: int = 2) -> Scans:
-    images = torch.rand(num, channels, *SMALL.shape)
-    images[:, 0] = images[:, 0] * 50 + 1
-    return Scans(images * (torch.rand(num, 1, *SMALL.shape) > 0.2), SMALL)
-
-
 @torch.inference_mode()
-def test_rangenet21_is_the_reference(case):
+def test_rangenet21_is_the_reference(shared):
+    case = load_case(shared, "feat_rangenet21.pt")
     network = RangeNet21(
         num_classes=case["cfg"]["num_classes"], mean=tuple(case["mean"]), std=tuple(case["std"])
     ).eval()
@@ -172,21 +156,14 @@ def test_sizes_that_the_network_cannot_take_name_the_option(network, size):
         network.features(Scans(torch.ones(1, 1, *size), SENSORS["hdl64e"].resized(*size)))
 
 
-@pytest.fixture(scope="module")
-def voxels(shared):
-    return torch.load(shared / "oracle" / "voxel_prepost.pt", weights_only=True)
-
-
-def test_voxels_are_the_reference_s(voxels):
-    coords, features = voxelise(voxels["points"])
-    torch.testing.assert_close(coords, voxels["voxel_coords"], rtol=0, atol=0)
-    torch.testing.assert_close(features, voxels["voxel_feats"], rtol=1e-4, atol=1e-4)
-
-
-def test_pooling_is_the_reference_s(voxels):
-    features, coords = voxels["post_features_in"], voxels["voxel_coords"]
-    torch.testing.assert_close(mean_by_distance(features, coords)[None], voxels["post_depth"], rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(features.mean(0)[None], voxels["post_global"], rtol=1e-4, atol=1e-4)
+def test_voxels_and_their_pooling_are_the_reference_s(shared):
+    case = torch.load(shared / "oracle" / "voxel_prepost.pt", weights_only=True)
+    coords, features = voxelise(case["points"])
+    torch.testing.assert_close(coords, case["voxel_coords"], rtol=0, atol=0)
+    torch.testing.assert_close(features, case["voxel_feats"], rtol=1e-4, atol=1e-4)
+    features = case["post_features_in"]
+    torch.testing.assert_close(mean_by_distance(features, coords)[None], case["post_depth"], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(features.mean(0)[None], case["post_global"], rtol=1e-4, atol=1e-4)
 
 
 def test_voxels_by_hand():
@@ -220,14 +197,3 @@ def test_sizes_are_read_off_the_weights(cls):
         cls.from_tensors(saved, {})
     with pytest.raises(InputError, match="not the weights of"):
         cls.from_tensors({"stem.0.kernel": torch.zeros(2)}, {})
-
-
-def test_distance_sectors_do_not_see_azimuth():
-    # x -> y, y -> -x carries voxels onto voxels, and each onto one as far from the centroid.
-    points = torch.randint(-400, 400, (500, 3)).float() * 0.05
-    coords, _ = voxelise(points)
-    turned, _ = voxelise(points @ torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
-    assert torch.equal(turned[:, 0], coords[:, 1].max() - coords[:, 1])
-    features = torch.randn(len(coords), 2)
-    found = mean_by_distance(features, turned)
-    torch.testing.assert_close(found, mean_by_distance(features, coords), rtol=1e-5, atol=1e-5)

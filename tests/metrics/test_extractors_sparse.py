@@ -5,16 +5,14 @@ from torch.nn import functional as F
 
 from r2flow.metrics.extractors.minkowski import MinkowskiNet
 from r2flow.metrics.extractors.sparse import Sparse, SparseConv3d, VoxelGrid, offsets
-from r2flow.metrics.extractors.spvcnn import SPVCNN, Corners
-
-TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
+from r2flow.metrics.extractors.spvcnn import SPVCNN
 
 
-def occupied(size: int, share: float, scans: int = 2, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
+def occupied(size: int, share: float, scans: int = 2) -> tuple[torch.Tensor, ...]:
     """Voxels of `scans` random cubes in a random order, (N, 4), and whether each place is one, (B, 1, size^3)."""
     mask = torch.rand(scans, size, size, size) < share
     coords = mask.nonzero()
-    return coords[torch.randperm(len(coords))], mask[:, None].to(dtype)
+    return coords[torch.randperm(len(coords))], mask[:, None].double()
 
 
 def to_dense(features: torch.Tensor, coords: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
@@ -35,27 +33,25 @@ def at(dense: torch.Tensor, coords: torch.Tensor) -> torch.Tensor:
     return dense[b, :, x, y, z]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [1, 3, 5])
-def test_stride_1_is_a_dense_convolution_at_the_voxels(dtype, size):
-    coords, mask = occupied(7, 0.3, dtype=dtype)
-    x = torch.randn(len(coords), 3, dtype=dtype)
-    convolution = SparseConv3d(3, 4, size).to(dtype)
+def test_stride_1_is_a_dense_convolution_at_the_voxels(size):
+    coords, mask = occupied(7, 0.3)
+    x = torch.randn(len(coords), 3).double()
+    convolution = SparseConv3d(3, 4, size).double()
     y = convolution(Sparse(x, VoxelGrid(coords)))
     weight = dense_kernel(convolution.kernel.view(size**3, 3, 4), size)
     expected = F.conv3d(to_dense(x, coords, mask.shape), weight, padding=size // 2)
-    torch.testing.assert_close(y.features, at(expected, coords), rtol=0, atol=TOLERANCE[dtype])
+    torch.testing.assert_close(y.features, at(expected, coords), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_stride_and_its_undoing_are_dense_ones(dtype):
-    coords, mask = occupied(6, 0.1, dtype=dtype)
-    x = torch.randn(len(coords), 3, dtype=dtype)
-    down = SparseConv3d(3, 4, 2, 2).to(dtype)
-    up = SparseConv3d(4, 5, 2, 2, transposed=True).to(dtype)
+def test_a_stride_and_its_undoing_are_dense_ones():
+    coords, mask = occupied(6, 0.1)
+    x = torch.randn(len(coords), 3).double()
+    down = SparseConv3d(3, 4, 2, 2).double()
+    up = SparseConv3d(4, 5, 2, 2, transposed=True).double()
     below = down(Sparse(x, VoxelGrid(coords)))
     dense = F.conv3d(to_dense(x, coords, mask.shape), dense_kernel(down.kernel, 2), stride=2)
-    torch.testing.assert_close(below.features, at(dense, below.grid.coords), rtol=0, atol=TOLERANCE[dtype])
+    torch.testing.assert_close(below.features, at(dense, below.grid.coords), rtol=0, atol=1e-12)
     assert len(below.grid) == F.max_pool3d(mask, 2).sum()  # each larger voxel with one in it, and no other
 
     above = up(below)
@@ -63,7 +59,7 @@ def test_a_stride_and_its_undoing_are_dense_ones(dtype):
     # stored ones alone are.
     expected = F.conv_transpose3d(dense, dense_kernel(up.kernel, 2).transpose(0, 1), stride=2)
     assert above.grid.coords is coords
-    torch.testing.assert_close(above.features, at(expected, coords), rtol=0, atol=TOLERANCE[dtype])
+    torch.testing.assert_close(above.features, at(expected, coords), rtol=0, atol=1e-12)
 
 
 def test_the_order_of_the_weights_is_torchsparse_s():
@@ -197,15 +193,6 @@ def test_spvcnn_is_its_dense_self():
     expected = at(y, coords) + network.point_transforms[2](points)
     # 1e-8 is added to the sum of the eight weights, as torchsparse does, and weights are float32 there.
     torch.testing.assert_close(network(coords, x), expected, rtol=0, atol=1e-6)
-
-
-def test_interpolation_is_exact_for_what_is_linear():
-    cube = torch.cartesian_prod(torch.zeros(1, dtype=torch.int64), *[torch.arange(5)] * 3)
-    points = torch.cartesian_prod(torch.zeros(1, dtype=torch.int64), *[torch.arange(0, 16, 3)] * 3)
-    linear = torch.tensor([[1.0, -2.0], [0.5, 3.0], [2.0, 0.25]])
-    corners = Corners(points, VoxelGrid(cube), 4)
-    expected = points[:, 1:].float() / 4 @ linear + 7
-    torch.testing.assert_close(corners.to_points(cube[:, 1:].float() @ linear + 7), expected, rtol=1e-6, atol=1e-5)
 
 
 def test_parameters_have_torchsparse_s_names_and_shapes():

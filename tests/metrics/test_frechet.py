@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from r2flow.metrics.frechet import FrechetDistance, add_moments, frechet_distance, merge_moments, moments
+from tests.metrics.conftest import measured
 
 
 def zeros(d):
@@ -92,10 +93,8 @@ def test_empty_parts_change_nothing():
 
 
 def test_fewer_scans_than_dimensions_is_exact_and_said(scans_of, summary):
-    metric = FrechetDistance(summary)
     real, generated = scans_of(4, 1), scans_of(5, 2)
-    metric.update(real, real=True)
-    metric.update(generated, real=False)
+    metric = measured(FrechetDistance(summary), real, generated)
     # tr (S_1 S_2)^(1/2) is the nuclear norm of the centred features' product: no covariance is made.
     x, y = (summary.features(s).double().numpy() for s in (real, generated))
     a, b = (z - z.mean(0) for z in (x, y))

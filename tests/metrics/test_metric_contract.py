@@ -148,14 +148,9 @@ def test_in_a_collection_every_metric_has_its_own_figures(summary, sets):
     collection = MetricCollection({name: METRICS[name]() for name in names})
     assert collection(sets["real"], real=True) == {}  # a batch has no distance of its own
     collection.reset()
-    alone = {}
-    for one in (collection, *(METRICS[name]() for name in names)):
-        for side, scans in sets.items():
-            for first in (0, 4, 8):
-                one.update(part(scans, slice(first, first + 4)), real=side == "real", first=first)
-        if one is not collection:
-            alone.update(one.compute())
-    assert {key.split("/")[-1]: value for key, value in collection.compute().items()} == pytest.approx(alone, rel=1e-10)
+    together = {key.split("/")[-1]: value for key, value in give(collection, sets).compute().items()}
+    alone = {key: value for name in names for key, value in give(METRICS[name](), sets).compute().items()}
+    assert together == pytest.approx(alone, rel=1e-10)
 
 
 def test_a_network_runs_once_for_all_metrics_of_it(summary, sets, monkeypatch):
@@ -200,15 +195,6 @@ def told(metric, sets, size=4):
         for batch in scans.images.split(size):
             metric.update(batch, real=side == "real")
     return metric
-
-
-def test_images_are_given_as_tensors_in_batches_without_numbers(build, sets):
-    expected = give(build(), sets).compute()
-    metric = told(build(sensor=SMALL, keep=True), sets, size=5)
-    assert metric.compute() == pytest.approx(expected, rel=1e-12)
-    assert metric(sets["real"].images, real=True) == {}
-    metric.reset()
-    assert told(metric, sets).compute() == pytest.approx(expected, rel=1e-12)
 
 
 def test_merged_states_are_those_of_all_scans(build, sets):
