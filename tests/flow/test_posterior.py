@@ -205,19 +205,6 @@ def test_with_nothing_measured_it_draws_from_the_prior(method):
 
 
 @pytest.mark.parametrize("method", ALL)
-def test_a_rolled_scan_gives_a_rolled_answer(method):
-    prior = gaussian()  # as much the same in all directions as a network without absolute positions
-    y, known, shift = randn(2, WIDTH), torch.rand(2, WIDTH, generator=draws(1)) < 0.3, 5
-
-    def answer(by: int) -> Tensor:
-        noise = numbered((2, WIDTH))
-        x_0, part, mask = (value.roll(by, 1) for value in (noise(0), y, known))
-        return sample_posterior(velocity_of(prior), x_0, part, mask, method, times(6), lambda j: noise(j).roll(by, 1))
-
-    torch.testing.assert_close(answer(shift), answer(0).roll(shift, 1), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("method", ALL)
 def test_a_scan_s_answer_does_not_depend_on_its_batch(method):
     flow, y = Field(gaussian(), (WIDTH,)), randn(4, WIDTH).float()
     known = (torch.rand(4, WIDTH, generator=draws(1)) < 0.4).float()

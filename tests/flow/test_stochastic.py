@@ -123,10 +123,9 @@ def test_what_needs_the_ode_says_so():
         flow(x_0, sampler=build_sampler("sde", steps=2))
     with pytest.raises(InputError, match="paths"):
         flow.solve(x_0, sampler=build_sampler("sde", churn=2, steps=2))
-    with pytest.raises(InputError, match="cannot be exported"):
-        tableau(flow, build_sampler("sde", steps=2))
-    with pytest.raises(InputError, match="cannot be exported"):
-        tableau(flow, build_sampler("mmps", steps=2))
+    for method in ("sde", "mmps"):
+        with pytest.raises(InputError, match="cannot be exported"):
+            tableau(flow, build_sampler(method, steps=2))
 
 
 def test_another_sampler_has_its_own_defaults_and_the_number_of_steps():

@@ -38,9 +38,6 @@ def test_the_discrete_density_takes_each_of_its_times_equally_often():
         values, counts = Discrete(k)(U).unique(return_counts=True)
         assert values.tolist() == [i / k for i in range(k)]
         assert (counts / N - 1 / k).abs().max() < 1e-5
-
-
-def test_the_discrete_density_knows_where_steps_fall():
     assert Discrete(4, "power:2")(U).unique().tolist() == pytest.approx([0, 7 / 16, 12 / 16, 15 / 16])
 
 

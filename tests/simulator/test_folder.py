@@ -12,6 +12,7 @@ from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
+from tests.conftest import files
 
 SMALL = SENSORS["hdl64e"].resized(16, 128)
 
@@ -23,15 +24,11 @@ def write_folder(folder: SimulatedFolder, items, workers: int) -> int:
     return len(missing)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.glob("[!.]*"))}
-
-
 def test_files_hold_what_the_simulator_draws(tmp_path):
     folder = SimulatedFolder(tmp_path / "a", SMALL, 3, ("bin", "npy"), labels=True)
     assert write_folder(folder, range(5, 7), workers=1) == 2
     names = {f"{index:06d}.{ending}" for index in (5, 6) for ending in ("bin", "npy", "label")}
-    assert set(contents(folder.folder)) == {*names, "manifest.json"}
+    assert set(files(folder.folder)) == {*names, "manifest.json"}
     scan = simulate(SMALL, 3, 6)
     np.testing.assert_array_equal(np.load(folder.folder / "000006.npy"), scan.image)
     points = read_points(folder.folder / "000006.bin")
@@ -45,10 +42,10 @@ def test_files_hold_what_the_simulator_draws(tmp_path):
 def test_files_that_exist_are_kept_and_missing_ones_are_made(tmp_path):
     folder = SimulatedFolder(tmp_path, SMALL, 0)
     write_folder(folder, range(4), workers=1)
-    whole, kept = contents(tmp_path), (tmp_path / "000001.bin").stat().st_mtime_ns
+    whole, kept = files(tmp_path), (tmp_path / "000001.bin").stat().st_mtime_ns
     (tmp_path / "000002.bin").unlink()
     assert write_folder(folder, range(4), workers=1) == 1
-    assert contents(tmp_path) == whole
+    assert files(tmp_path) == whole
     assert (tmp_path / "000001.bin").stat().st_mtime_ns == kept
 
 
@@ -62,10 +59,10 @@ def test_files_that_exist_are_kept_and_missing_ones_are_made(tmp_path):
 )
 def test_a_folder_of_another_seed_or_sensor_is_refused(tmp_path, other, words):
     write_folder(SimulatedFolder(tmp_path, SMALL, 0), range(1), workers=1)
-    before = contents(tmp_path)
+    before = files(tmp_path)
     with pytest.raises(InputError, match=words):
         write_folder(SimulatedFolder(tmp_path, other.sensor, other.seed), range(2), workers=1)
-    assert contents(tmp_path) == before
+    assert files(tmp_path) == before
 
 
 def test_the_verb_writes_the_scans_of_any_sensor(r2flow, tmp_path, sensor):

@@ -13,6 +13,7 @@ from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
 from r2flow.simulator.shapes import Boxes
+from tests.conftest import ROOT
 
 HDL64E = SENSORS["hdl64e"]
 SMALL = HDL64E.resized(32, 256)
@@ -33,49 +34,42 @@ def test_no_hedge_stands_on_a_carriageway(seed, index):
             assert scene.ground.off_street(float(solid.x[k]), float(solid.y[k])) > 0
 
 
-def fingerprint(scan) -> int:
-    return hash((scan.image.tobytes(), scan.labels.tobytes()))
+def digests() -> list[str]:
+    """Of scans of three sensors."""
+    views = [(HDL64E.resized(32, 512), 4), (SENSORS["os1_64"].resized(32, 256), 3), (SENSORS["vlp16"], 3)]
+    return [digest(sensor, 7, k) for sensor, count in views for k in range(count)]
+
+
+def digest(sensor: Sensor, seed: int, index: int) -> str:
+    scan = simulate(sensor, seed, index)
+    return hashlib.sha256(scan.image.tobytes() + scan.labels.tobytes()).hexdigest()
 
 
 def test_the_same_seed_and_index_give_the_same_scan_in_any_order():
-    first = [fingerprint(simulate(SMALL, 7, index)) for index in range(4)]
-    again = [fingerprint(simulate(SMALL, 7, index)) for index in reversed(range(4))]
+    first = [digest(SMALL, 7, index) for index in range(4)]
+    again = [digest(SMALL, 7, index) for index in reversed(range(4))]
     assert first == again[::-1]
-    assert len(set(first)) == 4
-    assert fingerprint(simulate(SMALL, 8, 0)) != first[0]
+    assert len({*first, digest(SMALL, 8, 0)}) == 5
 
 
 def test_other_instructions_and_threads_draw_the_same_scans():
     # numpy and the C library choose among implementations of sine and its like by what the processor can do; with all
     # that is newer than the least forbidden, this machine stands for an old one.
     core = (np._core if hasattr(np, "_core") else np.core)._multiarray_umath
-    views = [(HDL64E.resized(32, 512), 4), (SENSORS["os1_64"].resized(32, 256), 3), (SENSORS["vlp16"], 3)]
-    code = (
-        "import hashlib; from r2flow.lidar.sensors import SENSORS; from r2flow.simulator import simulate\n"
-        "views = [(SENSORS['hdl64e'].resized(32, 512), 4), (SENSORS['os1_64'].resized(32, 256), 3), "
-        "(SENSORS['vlp16'], 3)]\n"
-        "scans = [simulate(sensor, 7, k) for sensor, count in views for k in range(count)]\n"
-        "print(*[hashlib.sha256(s.image.tobytes() + s.labels.tobytes()).hexdigest() for s in scans])"
-    )
     newer = [name for name in core.__cpu_dispatch__ if core.__cpu_features__.get(name)]
     there = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True, text=True, check=True,
+        [sys.executable, "-c", "from tests.simulator.test_simulate import digests; print(*digests())"],
+        capture_output=True, text=True, check=True, cwd=ROOT,
         env={
             **os.environ, "NPY_DISABLE_CPU_FEATURES": " ".join(newer), "OMP_NUM_THREADS": "4",
             "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4,-AVX512F",
         },
     )  # fmt: skip
-    scans = [simulate(sensor, 7, k) for sensor, count in views for k in range(count)]
-    here = [hashlib.sha256(scan.image.tobytes() + scan.labels.tobytes()).hexdigest() for scan in scans]
-    assert there.stdout.split() == here
+    assert there.stdout.split() == digests()
 
 
 def test_the_scene_is_drawn_before_anything_of_the_sensor():
-    one, two = (draw_scene(generator(5, "simulator", 2)) for _ in range(2))
-    for (a, _), (b, _) in zip(one.tables, two.tables, strict=True):
-        np.testing.assert_array_equal(np.stack(a), np.stack(b))
-    # and so an image of a quarter of the columns shows the same large things at the same places
+    # An image of a quarter of the columns shows the same large things at the same places.
     fine, coarse = simulate(HDL64E, 5, 2), simulate(HDL64E.resized(64, 256), 5, 2)
     for row in range(20, 44, 4):
         block = fine.image[0, row].reshape(256, 4)
