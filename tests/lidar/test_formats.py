@@ -10,6 +10,7 @@ import pytest
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import ELSEWHERE, NoPointsError, read_points, write_points
+from tests.lidar.conftest import assert_points
 
 DRAW = np.random.default_rng(3)
 XYZ = np.round(DRAW.standard_normal((500, 3)) * [20, 20, 2], 3)
@@ -19,15 +20,7 @@ F4 = XYZ.astype(np.float32)
 
 
 def same(points, ring=None, intensity=INTENSITY, xyz=F4) -> None:
-    np.testing.assert_array_equal(points.xyz, xyz)
-    if intensity is None:
-        assert points.reflectance is None
-    else:
-        np.testing.assert_array_equal(points.reflectance, intensity.astype(np.float32))
-    if ring is None:
-        assert points.ring is None
-    else:
-        np.testing.assert_array_equal(points.ring, ring)
+    assert_points(points, xyz, intensity, ring)
 
 
 TABLE = np.column_stack([XYZ, INTENSITY])

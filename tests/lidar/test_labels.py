@@ -39,6 +39,7 @@ def label(scan: Path) -> Path:
 
 def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Path, tmp_path: Path):
     assert labels_beside(scan) is None
+    assert read_labelled_scan(scan, Reading(SENSOR, reflectance=False))[1] is None
     beside = scan.with_name("000000.label")
     beside.symlink_to("gone")  # a link to nothing was meant to be a file
     assert labels_beside(scan) == beside
@@ -73,12 +74,6 @@ def test_labels_of_dropped_rows_are_dropped(scan: Path, label: Path):
     rows[17, 0], rows[90, 2] = np.nan, 1e30
     rows.tofile(scan)
     np.testing.assert_array_equal(read_labels(label, scan), np.delete(IDS, [17, 90]))
-
-
-def test_a_scan_without_a_label_file_has_no_labels(scan: Path):
-    image, labels = read_labelled_scan(scan, Reading(SENSOR, reflectance=False))
-    assert image.shape == (1, 8, 16)
-    assert labels is None
 
 
 def refused(label: Path, scan: Path) -> None:

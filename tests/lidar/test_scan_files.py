@@ -8,6 +8,7 @@ import pytest
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_points, write_points
+from tests.lidar.conftest import assert_points
 
 # Three points with values that float32 holds exactly, a reflectance each, and a ring.
 ROWS = [(1.5, -2.0, 0.25, 0.5, 3), (-10.0, 20.0, -1.75, 0.0, 0), (0.0, 0.0, 7.0, 1.0, 31)]
@@ -33,19 +34,8 @@ def pcd_header(fields: str, size: str, kind: str, data: str, count: int = 3) -> 
 
 
 def expect_rows(points, reflectance=REFLECTANCE, ring=None):
-    assert points.xyz.dtype == np.float32
-    np.testing.assert_array_equal(points.xyz, XYZ)
+    assert_points(points, XYZ, reflectance, ring)
     assert points.dropped == 0
-    if reflectance is None:
-        assert points.reflectance is None
-    else:
-        assert points.reflectance.dtype == np.float32
-        np.testing.assert_array_equal(points.reflectance, reflectance)
-    if ring is None:
-        assert points.ring is None
-    else:
-        assert points.ring.dtype == np.uint16
-        np.testing.assert_array_equal(points.ring, ring)
 
 
 # --- what each format says, by hand ---
@@ -93,12 +83,6 @@ def test_pcd_without_count_and_points_lines_and_without_reflectance(tmp_path):
     expect_rows(read_points(saved(tmp_path, "a.pcd", text)), reflectance=None)
 
 
-def test_intensity_is_preferred_where_an_ouster_writes_reflectivity_too(tmp_path):
-    text = pcd_header("x y z reflectivity intensity", "4 4 4 2 4", "F F F U F", "ascii")
-    text += "".join(f"{x} {y} {z} 200 {i}\n" for x, y, z, i, _ in ROWS)
-    expect_rows(read_points(saved(tmp_path, "a.pcd", text)))
-
-
 PLY_ASCII = """ply
 format ascii 1.0
 comment by hand
@@ -129,27 +113,16 @@ def test_ply_ascii_among_other_elements(tmp_path):
 
 
 @pytest.mark.parametrize(("order", "name"), [("<", "little"), (">", "big")])
-def test_ply_binary_in_both_byte_orders(tmp_path, order, name):
+def test_ply_binary_in_both_byte_orders_among_other_elements(tmp_path, order, name):
     header = (
         f"ply\nformat binary_{name}_endian 1.0\nelement pose 2\nproperty short p\nelement vertex 3\n"
         "property uchar red\nproperty float x\nproperty double y\nproperty float32 z\nproperty ushort ring\n"
-        "property uint8 reflectance\nend_header\n"
+        "property uint8 reflectance\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
     )
     rows = [struct.pack(order + "BfdfHB", 9, *row[:3], row[4], int(row[3] * 2)) for row in ROWS]
-    body = struct.pack(order + "hh", 1, 2) + b"".join(rows)
+    body = struct.pack(order + "hh", 1, 2) + b"".join(rows) + struct.pack(order + "B3i", 3, 0, 1, 2)
     points = read_points(saved(tmp_path, "a.ply", header.encode() + body))
     expect_rows(points, reflectance=[1, 0, 2], ring=RING)
-
-
-@pytest.mark.parametrize(("order", "name"), [("<", "little"), (">", "big")])
-def test_ply_binary_with_faces_behind_the_points(tmp_path, order, name):
-    header = (
-        f"ply\nformat binary_{name}_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
-        "property float z\nproperty float intensity\n"
-        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    body = b"".join(struct.pack(f"{order}4f", *row[:4]) for row in ROWS) + struct.pack(order + "B3i", 3, 0, 1, 2)
-    expect_rows(read_points(saved(tmp_path, "a.ply", header.encode() + body)))
 
 
 @pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8", ">f8"])
@@ -166,19 +139,11 @@ def test_npy_of_any_float_type_and_order(tmp_path, dtype):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("column", range(4))
 def test_a_row_that_is_not_finite_is_dropped_and_counted(tmp_path, bad, column):
-    rows = np.array([row[:4] for row in ROWS], dtype=np.float32)
-    rows[1, column] = bad
-    points = read_points(saved(tmp_path, "a.bin", rows.tobytes()))
-    assert points.dropped == 1
-    np.testing.assert_array_equal(points.xyz, [XYZ[0], XYZ[2]])
-    np.testing.assert_array_equal(points.reflectance, [REFLECTANCE[0], REFLECTANCE[2]])
-
-
-def test_rings_follow_their_points_when_rows_are_dropped(tmp_path):
     rows = np.array(ROWS, dtype=np.float32)
-    rows[0, 2] = np.nan
+    rows[1, column] = bad
     points = read_points(saved(tmp_path, "a.pcd.bin", rows.tobytes()))
-    np.testing.assert_array_equal(points.ring, RING[1:])
+    assert points.dropped == 1
+    assert_points(points, XYZ[::2], REFLECTANCE[::2], RING[::2])
 
 
 def test_an_organised_pcd_may_be_mostly_nan(tmp_path):
@@ -208,8 +173,7 @@ def test_written_scans_are_read_back_bit_for_bit(tmp_path, ending):
     path = tmp_path / "new folder" / f"a.{ending}"
     write_points(path, xyz, reflectance)
     points = read_points(path)
-    np.testing.assert_array_equal(points.xyz, xyz)
-    np.testing.assert_array_equal(points.reflectance, reflectance)
+    assert_points(points, xyz, reflectance)
     assert points.dropped == 0
     assert [file.name for file in path.parent.iterdir()] == [path.name]  # no temporary file stays
     assert points.xyz.flags.c_contiguous

@@ -7,7 +7,6 @@ import torch
 import yaml
 
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensor_files import read_sensor, write_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.lidar.space import build_space
@@ -85,14 +84,6 @@ def test_fields_of_view_are_the_manuals(name, beams, top, bottom, finest):
     assert -np.diff(e).max() == pytest.approx(finest, abs=0.01)
 
 
-def test_the_beams_of_a_vlp_32c_are_those_of_a_real_one(shared):
-    (path,) = (shared / "real" / "other_sensors" / "rellis_vlp32c").glob("*.bin")
-    xyz = read_points(path).xyz.astype(np.float64)
-    e = np.rad2deg(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
-    measured, count = np.unique(e.round(3), return_counts=True)
-    np.testing.assert_allclose(measured[count > 100][::-1], SENSORS["vlp32c"].elevations, atol=0.0015)
-
-
 def test_every_sensor_has_a_config_and_every_config_builds():
     built = []
     for path in CONF.glob("*.yaml"):
@@ -134,7 +125,6 @@ def test_a_user_s_own_sensor_is_built():
         ({"elevations": [2, 1], "firing": [0, 1.0]}, "each a whole number"),
         ({"elevations": [2, 1], "height": math.inf}, "height must be a finite number"),
         ({"elevations": [2, 1], "height": 0}, "height must be metres above the ground"),
-        ({"elevations": [2, 1], "max_range": math.nan}, "max_range must be a finite number"),
         ({"name": "vlp16", "elevations": [2, 1]}, "another one"),
         ({"elevations": [1, 0], "min_range": 5, "max_range": 4}, "min_range < max_range"),
         ({"elevations": [1, 0], "columns": 0}, "columns"),
@@ -188,9 +178,7 @@ def test_every_option_can_be_given(tmp_path):
         ("name: 0b_", "not a readable .yaml file"),
         ("elevations: [2, 1]", "needs the option 'name'"),
         (MINE + "colums: 3", "Did you mean 'columns'?"),
-        (MINE + "firing: [0, 1]", "firing must name"),
         ("name: mine\nelevations: 5", "elevations must be a list"),
-        ("name: mine", "no sensor named 'mine'"),
     ],
 )
 def test_a_wrong_file_is_one_line_with_its_name(tmp_path, text, words):
