@@ -3,7 +3,10 @@
 import os
 import signal
 import time
+import traceback
 from collections.abc import Callable
+
+import torch
 
 # The n-th rename, and whether the process dies before it or after it.
 MOMENTS = [(1, True), (1, False), (2, True), (1, False), (1, True), (2, True), (1, False), (2, False)]
@@ -23,6 +26,20 @@ def die_at(rename: int, before: bool) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
     os.replace = dying
+
+
+def in_child(work: Callable[[], object]) -> int:
+    """Begin work in a child process: its process id."""
+    child = os.fork()
+    if child == 0:
+        try:
+            torch.set_num_threads(1)
+            work()
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
+    return child
 
 
 def was_killed(child: int) -> bool:

@@ -24,15 +24,6 @@ def module(encoding: Encoding | None = None, **options) -> ScanDataModule:
     return data
 
 
-def test_another_data_set_can_be_held_out(numbered: Path, tmp_path: Path):
-    for number in (20, 21):
-        write_scan(tmp_path / "other/sequences/08/velodyne" / f"{number:06d}.bin", number)
-    other = {"name": "odometry", "root": str(tmp_path / "other"), "split": "validation"}
-    data = module(name="folder", root=str(numbered), validation={"data": other})
-    assert numbers(data.training_source) == list(range(12))
-    assert numbers(data.validation_source) == [20, 21]
-
-
 def test_scans_too_many_for_memory_are_read_when_needed(numbered: Path):
     lazy = module(name="folder", root=str(numbered), memory_gib=0)
     kept = module(name="folder", root=str(numbered))
@@ -166,13 +157,9 @@ def test_validation_is_never_augmented(numbered: Path):
 class TestReflectance:
     """encoding.reflectance=auto: what the scans do not have is not asked for."""
 
-    @staticmethod
-    def ply(path: Path) -> Path:
-        write_points(path, np.array([[10, 0, -1]], np.float32))
-        return path.parent
-
     def test_one_part_without_it_is_enough(self, numbered: Path, tmp_path: Path):
-        root = self.ply(tmp_path / "other" / "scan.ply")
+        root = tmp_path / "other"
+        write_points(root / "scan.ply", np.array([[10, 0, -1]], np.float32))
         parts = [{"name": "folder", "root": str(numbered)}, {"name": "folder", "root": str(root)}]
         assert not resolve_reflectance("auto", {"name": "mixed", "parts": parts})
         held = {"validation": {"data": {"name": "folder", "root": str(root)}}}

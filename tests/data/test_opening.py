@@ -54,11 +54,6 @@ class TestNames:
         assert numbers(open_scans(numbered, READING)) == list(range(12))
         assert open_scans(numbered, READING).spread(3).source.names == ["000002.bin", "000006.bin", "000010.bin"]
 
-    def test_simulated_scenes(self):
-        scans = open_scans("simulated:4", READING, num=2)
-        assert scans.source.names == ["scene 0", "scene 1"]
-        assert scans.source[1][0].any()
-
     def test_one_file_of_each_scan_is_taken(self, tmp_path: Path):
         write_scan(tmp_path / "a.bin", 1)
         write_image(tmp_path / "a.npy", 2)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-import traceback
 from pathlib import Path
 
 import pytest
@@ -27,6 +26,7 @@ from r2flow.samplers import build_sampler
 from r2flow.store import Store
 from tests.conftest import files
 from tests.fields import Field
+from tests.killing import in_child
 
 SHAPE = (2, 4, 8)
 OPTIONS = {
@@ -58,14 +58,6 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
         torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)
         assert x_1.dtype == torch.float32
     assert x_1.abs().max() > 1  # nothing is clamped
-
-
-@pytest.mark.parametrize("ranks", [2, 3])
-def test_any_number_of_processes_writes_the_same_bytes(tmp_path: Path, ranks: int):
-    make_pairs(store_in(tmp_path / "one"), grow)
-    for rank in reversed(range(ranks)):
-        make_pairs(store_in(tmp_path / "many"), grow, rank, ranks)
-    assert files(tmp_path / "one") == files(tmp_path / "many")
 
 
 def test_more_pairs_later_are_those_of_one_command_and_none_is_made_twice(tmp_path: Path):
@@ -138,7 +130,6 @@ def test_a_distilled_flow_draws_pairs_by_its_own_steps_alone(tmp_path: Path):
 
 
 def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
-    torch.set_num_threads(1)
     begun = tmp_path / "begun"
 
     def slow(t, x):
@@ -148,17 +139,9 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
         time.sleep(2e-3)
         return x
 
-    children = []
-    for _ in range(2):
-        child = os.fork()
-        if child == 0:
-            try:
-                make_pairs(store_in(tmp_path / "pairs", num=200), Field(slow, SHAPE))
-                os._exit(0)
-            except BaseException:
-                traceback.print_exc()
-                os._exit(1)
-        children.append(child)
+    children = [
+        in_child(lambda: make_pairs(store_in(tmp_path / "pairs", num=200), Field(slow, SHAPE))) for _ in range(2)
+    ]
     assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
     assert begun.stat().st_size == 50  # batches, each by one of the two
     assert len(PairSource(store_in(tmp_path / "pairs", num=200))) == 200
@@ -226,12 +209,11 @@ def test_pairs_are_not_kept_among_scans_or_in_another_store(tmp_path: Path):
 
 
 def test_who_waits_says_for_whom_and_who_does_not_leaves_the_rest(tmp_path: Path, monkeypatch, caplog):
-    torch.set_num_threads(1)
     monkeypatch.setattr("r2flow.store.QUIET", 0.1)
     store, (read, write) = store_in(tmp_path), os.pipe()
-    child = os.fork()
-    if child == 0:
-        store.attempt(1, lambda item: (os.write(write, b"1"), os.kill(os.getpid(), signal.SIGSTOP)))
+    child = in_child(
+        lambda: store.attempt(1, lambda item: (os.write(write, b"1"), os.kill(os.getpid(), signal.SIGSTOP)))
+    )
     os.read(read, 1)
     made = make_pairs(store, grow, wait=False)
     assert (made.pairs, store.missing(store.shards)) == (10 * 4, [1])

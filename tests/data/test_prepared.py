@@ -1,7 +1,6 @@
 """Prepared scans: their codes, their making and their reading."""
 
 import errno
-import os
 import pickle
 import shutil
 from dataclasses import replace
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import yaml
 
 from r2flow.data.layouts import Drive
@@ -24,7 +22,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST, read_manifest
 from tests.conftest import ROOT, files
-from tests.killing import MOMENTS, die_at, was_killed
+from tests.killing import MOMENTS, die_at, in_child, was_killed
 from tests.training.conftest import TINY, in_process
 
 SMALL = SENSORS["hdl64e"].resized(4, 16)
@@ -303,21 +301,6 @@ def test_no_usable_scan_at_all(tmp_path: Path):
 # At any number of attempts, by any number of processes; test_pairs.py has stores that several commands share
 
 
-def in_child(folder: Path, plan: Plan, dies: tuple[int, bool]) -> int:
-    """`make` in a child of its own, which dies at a moment: its process id."""
-    child = os.fork()
-    if child == 0:
-        try:
-            torch.set_num_threads(1)
-            die_at(*dies)
-            make(folder, plan)
-        except BaseException as error:
-            print(repr(error))
-            os._exit(1)
-        os._exit(0)
-    return child
-
-
 def test_worker_processes_make_the_same_bytes(clouds: Path, tmp_path: Path):
     one = make(tmp_path / "one", plan_of(clouds))
     assert files(make(tmp_path / "two", plan_of(clouds), workers=2)) == files(one)
@@ -328,7 +311,7 @@ def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_pa
     one = files(make(tmp_path / "one", plan))
     folder, kept = tmp_path / "killed", []
     for dies in MOMENTS:
-        assert was_killed(in_child(folder, plan, dies))
+        assert was_killed(in_child(lambda: (die_at(*dies), make(folder, plan))))  # noqa: B023
         kept.append(len(list(folder.glob("scans-*"))))
     assert kept == sorted(kept)  # what was whole stays
     assert files(make(folder, plan)) == one
