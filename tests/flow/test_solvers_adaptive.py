@@ -63,7 +63,6 @@ def test_a_mixed_batch_takes_six_tenths_of_the_evaluations_of_one_common_step(to
         theirs.append((evaluations, worst(end, exact)))
     share = sum(n for n, _ in ours) / sum(n for n, _ in theirs)
     hardest = [statistics.median(error for _, error in found) for found in (ours, theirs)]
-    print(f"tolerance {tolerance:g}: {share:.2f} of the evaluations, hardest scene {hardest[0]:.1e} / {hardest[1]:.1e}")
     assert share <= 0.6
     if tolerance == 1e-3:
         assert hardest[0] < hardest[1]
@@ -173,7 +172,6 @@ def test_jumps_in_time_are_located(tolerance):
     jumps = Mixed([Discontinuous(jump, where) for where, jump in drawn])
     x_0 = noise(60, 16).double()
     error = in_tolerances(solve(jumps, x_0, method="dopri5", tolerance=tolerance), jumps.solution(x_0, 1.0), tolerance)
-    print(f"dopri5 at {tolerance:g}: median {error.median():.2g}, at most {error.max():.2g} tolerances")
     assert error.median() < 2
     assert error.max() < 30
 
@@ -222,7 +220,6 @@ def test_looking_for_pulses_and_jumps_costs_at_most_a_twentieth():
             found = solve(PROBLEMS[name](), noise(8, 64).double(), method="dopri5", tolerance=tolerance)
             looked += found.evaluations.sum().item()
             stepped += (2 + 6 * (found.accepted + found.rejected)).sum().item()
-    print(f"{looked / stepped:.3f}")
     assert looked < 1.05 * stepped
 
 

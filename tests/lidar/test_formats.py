@@ -247,7 +247,7 @@ def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):
 
 
 def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Path):
-    kinds = [(name, "f4") for name in ("x", "y", "z", "intensity", "reflectivity")]
+    kinds = [(name, "f4") for name in ("x", "y", "z", "reflectivity", "intensity")]
     table = np.zeros(500, kinds)
     for name, column in zip("xyz", F4.T, strict=True):
         table[name] = column

@@ -100,18 +100,6 @@ def test_every_sensor_has_a_config_and_every_config_builds():
     assert set(SENSORS) <= set(built)  # beside those of the table, a file may describe a sensor of its own
 
 
-def test_a_user_s_own_sensor_is_built():
-    mine = build_sensor("mine", elevations=[2, 1.5, -1, -8], firing=[3, 1, 0, 2], columns=64, max_range=30, height=1)
-    assert mine == Sensor("mine", (2.0, 1.5, -1.0, -8.0), 64, max_range=30.0, height=1.0, firing=(3, 1, 0, 2))
-    assert build_sensor("mine", elevations=[2, 1.5, -1, -8], columns=64).rays()[0, :, 0].rad2deg().tolist() == (
-        pytest.approx([2, 1.5, -1, -8])
-    )
-    smaller = build_sensor("mine", rows=2, columns=32, elevations=[2, 1, 0, -1], firing=[3, 1, 0, 2])
-    assert smaller.elevations == (1.5, -0.5)  # two rows of two beams each
-    assert smaller.shape == (2, 32)
-    assert smaller.firing is None
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -158,11 +146,15 @@ def test_a_written_sensor_is_read_back(sensor, tmp_path):
     assert read_sensor(tmp_path / "mine.yaml", 8, 64) == mine.resized(8, 64)
 
 
-def test_every_option_can_be_given(tmp_path):
-    text = MINE + "rays: centre\nrows: 2\ncolumns: 64\nmin_range: 1\nmax_range: 50\nheight: 2\nfiring: [3, 1, 2, 0]\n"
-    sensor = read_sensor(written(tmp_path, text))
-    assert sensor == Sensor("mine", sensor.elevations, 64, 1.0, 50.0, 2.0)
-    assert sensor.shape == (2, 64)
+def test_a_sensor_of_one_s_own_has_every_option(tmp_path):
+    text = "name: mine\nelevations: [2, 1, 0, -1]\nfiring: [3, 1, 0, 2]\nrays: centre\n"
+    text += "columns: 64\nmin_range: 1\nmax_range: 50\nheight: 2\n"
+    mine = read_sensor(written(tmp_path, text))
+    assert mine == Sensor("mine", (2.0, 1.0, 0.0, -1.0), 64, 1.0, 50.0, 2.0, firing=(3, 1, 0, 2))
+    assert mine.rays()[0, :, 0].rad2deg().tolist() == pytest.approx([2, 1, 0, -1], abs=1e-6)
+    smaller = read_sensor(written(tmp_path, text + "rows: 2\n"))
+    assert smaller.elevations == (1.5, -0.5)  # two rows of two beams each
+    assert (smaller.shape, smaller.firing) == ((2, 64), None)
 
 
 @pytest.mark.parametrize(

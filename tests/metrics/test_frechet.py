@@ -29,14 +29,6 @@ def test_commuting_covariances_differ_by_the_roots_of_their_eigenvalues():
     assert value == pytest.approx(float(30 * 4 + (a.sqrt() - b.sqrt()).square().sum()), abs=1e-9)
 
 
-def test_two_by_two_has_a_closed_form():
-    # tr M^(1/2) = sqrt(tr M + 2 sqrt(det M)) for a 2 x 2 matrix M without negative eigenvalues.
-    s_1, s_2, zero = positive(2, 1), positive(2, 2), torch.zeros(2, dtype=torch.float64)
-    m = s_1 @ s_2
-    expected = s_1.trace() + s_2.trace() - 2 * (m.trace() + 2 * m.det().sqrt()).sqrt()
-    assert frechet_distance(zero, s_1, zero, s_2) == pytest.approx(float(expected), abs=1e-12)
-
-
 @pytest.mark.parametrize(
     ("d", "rank_1", "rank_t", "tolerance"),
     # Full rank, but eigenvalues down to 1e-13 of the largest, whose roots are known to that much less.
