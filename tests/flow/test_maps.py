@@ -20,15 +20,18 @@ def paths_of(function, times: Tensor = TIMES) -> Paths:
     return Paths(times, torch.stack([function(X_0, t) for t in times], 1))
 
 
+def starts(problem, t: Tensor, x: Tensor) -> Tensor:
+    """x_0 of the paths x_t = m_t + c_t x_0 that pass through x at t."""
+    shift = problem.solution(torch.zeros_like(x), t)
+    return (x - shift) / (problem.solution(torch.ones_like(x), t) - shift)
+
+
 def exact_map(problem):
-    """u(t, x, s) of a problem whose paths x_t = m_t + c_t x_0 are known."""
+    """u(t, x, s) of a problem whose paths are known."""
 
     def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-        zero, one = torch.zeros_like(x), torch.ones_like(x)
-        at = [problem.solution(zero, time) for time in (t, s)]
-        scale = [problem.solution(one, time) - shift for time, shift in zip((t, s), at, strict=True)]
-        moved = at[1] + scale[1] / scale[0] * (x - at[0]) - x
-        length = expand_time(s - t, x) * torch.ones_like(x)
+        length = expand_time(s - t, x)
+        moved = problem.solution(starts(problem, t, x), s) - x
         return torch.where(length == 0, problem(t, x), moved / torch.where(length == 0, 1.0, length))
 
     return u
@@ -104,22 +107,12 @@ def test_jump_times_that_cannot_be_are_refused(options):
 @pytest.mark.parametrize("problem", [Gaussian(), Straight(), Gaussian(std=2.0)])
 def test_the_map_of_a_flow_has_no_residual(problem):
     u = exact_map(problem)
-    arrived = torch.stack([problem.solution(x_0, s) for x_0, s in zip(starts(problem), S, strict=True)])
-    torch.testing.assert_close(jump(u, T, X_0, S), arrived)
+    torch.testing.assert_close(jump(u, T, X_0, S), problem.solution(starts(problem, T, X_0), S))
     middle = (T + S) / 2
     for begin, end in ((T, S), (S, T)):  # one jump is two half jumps
         halves = jump(u, middle, jump(u, begin, X_0, middle), end)
         assert float((jump(u, begin, X_0, end) - halves).abs().max()) < 1e-13
     torch.testing.assert_close(jump(u, S, jump(u, T, X_0, S), T), X_0)  # there and back
-
-
-def starts(problem) -> list[Tensor]:
-    """x_0 of the paths that pass through X_0 at the times T."""
-    found = []
-    for x, t in zip(X_0, T, strict=True):
-        shift = problem.solution(torch.zeros_like(x), t)
-        found.append((x - shift) / (problem.solution(torch.ones_like(x), t) - shift))
-    return found
 
 
 @pytest.mark.parametrize("name", list(OBJECTIVES))
@@ -129,7 +122,7 @@ def test_the_exact_map_of_a_straight_flow_is_what_every_objective_asks_for(name,
     paths = paths_of(problem.solution)
     u = exact_map(problem)
     x_t, target = OBJECTIVES[name](u, paths, T, S, torch.full_like(T, rho))
-    torch.testing.assert_close(x_t, torch.stack([problem.solution(x, t) for x, t in zip(X_0, T, strict=True)]))
+    torch.testing.assert_close(x_t, problem.solution(X_0, T))
     torch.testing.assert_close(target, u(T, x_t, S))
 
 

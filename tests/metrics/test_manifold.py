@@ -8,42 +8,25 @@ import pytest
 import torch
 
 from r2flow.metrics import METRICS, kid, manifold
-from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.kid import KernelDistance
 from r2flow.metrics.manifold import Manifold
-from r2flow.metrics.scans import Scans
-from r2flow.metrics.two_sample import TwoSample, area
-from tests.metrics.conftest import measured
+from r2flow.metrics.two_sample import area
+from tests.metrics.conftest import Summary
 
 
-class Given(Extractor):
-    """Features that are handed in as if they were scans."""
-
-    name = "given"
-    layer = "as they are"
-    dim = 3
-    weights = "0123456789ab"
-
-    def features(self, scans):
-        return scans.rows
+def given(metric, real, generated):
+    """The metric of these features, (N, D), in the place of scans'."""
+    for rows, side in ((real, "real"), (generated, "generated")):
+        metric.add_rows(torch.as_tensor(rows, dtype=torch.float32), side)
+    return metric.compute()
 
 
-class Rows(Scans):
-    has_reflectance = False
-
-    def __init__(self, rows):
-        self.rows = torch.as_tensor(rows, dtype=torch.float32)
-
-    def __len__(self):
-        return len(self.rows)
-
-
-def figures(real, generated, metric=Manifold):
-    return list(measured(metric(Given()), Rows(real), Rows(generated)).compute().values())
+def figures(real, generated):
+    return list(given(Manifold(Summary()), real, generated).values())
 
 
 def kernel_distance(real, generated):
-    return figures(real, generated, KernelDistance)[0]
+    return given(KernelDistance(Summary()), real, generated)["kid_summary"]
 
 
 def brute_force(real, generated, k):
@@ -111,12 +94,8 @@ def test_the_kernel_distance_is_the_reference_on_its_own_subsets(shared):
             assert np.mean(values) == pytest.approx(expected, rel=1e-6)  # theirs is float32
 
 
-def metric(real: torch.Tensor, generated: torch.Tensor) -> TwoSample:
-    """With these features, (N, D), in the place of scans'."""
-    found = METRICS["auc"]()
-    found.add_rows(real, "real")
-    found.add_rows(generated, "generated")
-    return found
+def auc(real, generated):
+    return given(METRICS["auc"](), real, generated)["auc"]
 
 
 @pytest.mark.parametrize("apart", [0.0, 1.0, 3.0])
@@ -126,12 +105,12 @@ def test_gaussians_have_the_area_of_their_distance(apart):
     y[:, 1] += apart
     # P(N(apart, 1) > N(0, 1)) = Phi(apart / sqrt 2); the error of an area of 2 x 4,000 scores is below 0.007
     expected = (1 + math.erf(apart / 2)) / 2
-    assert metric(x, y).compute()["auc"] == pytest.approx(expected, abs=0.02)
+    assert auc(x, y) == pytest.approx(expected, abs=0.02)
 
 
 def test_chance_is_a_half_also_for_more_features_than_scans():
     draw = torch.Generator().manual_seed(5)
-    values = [metric(*(torch.randn(30, 146, generator=draw) for _ in range(2))).compute()["auc"] for _ in range(20)]
+    values = [auc(*(torch.randn(30, 146, generator=draw) for _ in range(2))) for _ in range(20)]
     assert np.mean(values) == pytest.approx(0.5, abs=0.05)
 
 
@@ -141,7 +120,7 @@ def test_halves_are_blocks_so_that_neighbours_do_not_help():
     x, y = torch.randn(400, 2, generator=draw), torch.randn(400, 2, generator=draw)
     y[:200, 0] += 3
     y[200:, 0] -= 3
-    assert metric(x, y).compute()["auc"] < 0.2
+    assert auc(x, y) < 0.2
 
 
 def test_the_area_is_a_count_of_pairs_and_weights_are_repeats():
