@@ -6,11 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.metrics import METRICS
-from r2flow.metrics.base import ScanMetric
+from r2flow.metrics.base import SIDES, ScanMetric
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
@@ -75,6 +76,13 @@ def measured(metric: ScanMetric, real: Scans, generated: Scans) -> ScanMetric:
     metric.update(real, real=True)
     metric.update(generated, real=False)
     return metric
+
+
+def given(metric: ScanMetric, real: ArrayLike, generated: ArrayLike) -> dict[str, float]:
+    """The metric's figures of rows, (N, ...), in the place of scans."""
+    for rows, side in ((real, SIDES[0]), (generated, SIDES[1])):
+        metric.add_rows(torch.as_tensor(rows).flatten(1), side)
+    return metric.compute()
 
 
 @pytest.fixture

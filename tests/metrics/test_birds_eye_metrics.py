@@ -11,31 +11,19 @@ from r2flow.metrics import jsd_mmd, lidm
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.jsd_mmd import JSD, MMD, MMDUnbiased
 from r2flow.metrics.lidm import JSDLiDM, MMDLiDM
-from r2flow.metrics.scans import Scans
-from tests.metrics.conftest import measured
-
-
-class Seen(Scans):
-    """Scans of which nothing is known but their histograms."""
-
-    def __init__(self, histograms):
-        self.birds_eye = np.asarray(histograms, dtype=np.float64)
-
-    def __len__(self):
-        return len(self.birds_eye)
+from tests.metrics.conftest import given, measured
 
 
 def test_reference_figures(shared):
     case = torch.load(shared / "oracle" / "bev_metrics.pt", weights_only=True)
     seen = np.stack([birds_eye_histogram(points.numpy()) for points in case["point_clouds"]])
     np.testing.assert_array_equal(seen, case["hists"])
-    real, generated = Seen(seen[:12]), Seen(seen[12:])
-    assert measured(JSD(), real, generated).compute()["jsd"] == pytest.approx(
-        case["jsd"], rel=1e-7
-    )  # made of float32 histograms
-    assert measured(MMD(), real, generated).compute()["mmd"] == pytest.approx(case["mmd_float64"], rel=1e-10)
-    assert measured(JSD(), real, real).compute()["jsd"] == case["jsd_same"]
-    assert measured(MMD(), real, real).compute()["mmd"] == pytest.approx(case["mmd_same"], abs=1e-15)
+    real, generated = seen[:12].astype(float), seen[12:].astype(float)
+    # made of float32 histograms
+    assert given(JSD(), real, generated)["jsd"] == pytest.approx(case["jsd"], rel=1e-7)
+    assert given(MMD(), real, generated)["mmd"] == pytest.approx(case["mmd_float64"], rel=1e-10)
+    assert given(JSD(), real, real)["jsd"] == case["jsd_same"]
+    assert given(MMD(), real, real)["mmd"] == pytest.approx(case["mmd_same"], abs=1e-15)
 
 
 def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
@@ -53,9 +41,9 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
     unbiased = others(p[:10]) + others(p[10:]) - 2 * mean(p[:10], p[10:])
     for block in (3, 1000):
         monkeypatch.setattr(jsd_mmd, "BLOCK", block)
-        sets = Seen(counts[:10]), Seen(counts[10:])
-        assert measured(MMD(), *sets).compute()["mmd"] == pytest.approx(expected, rel=1e-9)
-        assert measured(MMDUnbiased(), *sets).compute()["mmd_unbiased"] == pytest.approx(unbiased, rel=1e-9)
+        sets = counts[:10].astype(float), counts[10:].astype(float)
+        assert given(MMD(), *sets)["mmd"] == pytest.approx(expected, rel=1e-9)
+        assert given(MMDUnbiased(), *sets)["mmd_unbiased"] == pytest.approx(unbiased, rel=1e-9)
 
 
 def test_disjoint_sets_have_the_largest_distance(scans_of):

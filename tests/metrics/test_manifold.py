@@ -11,22 +11,15 @@ from r2flow.metrics import METRICS, kid, manifold
 from r2flow.metrics.kid import KernelDistance
 from r2flow.metrics.manifold import Manifold
 from r2flow.metrics.two_sample import area
-from tests.metrics.conftest import Summary
+from tests.metrics.conftest import Summary, given
 
 
-def given(metric, real, generated):
-    """The metric of these features, (N, D), in the place of scans'."""
-    for rows, side in ((real, "real"), (generated, "generated")):
-        metric.add_rows(torch.as_tensor(rows, dtype=torch.float32), side)
-    return metric.compute()
-
-
-def figures(real, generated):
-    return list(given(Manifold(Summary()), real, generated).values())
+def figures(real, generated, metric=Manifold):
+    return list(given(metric(Summary()), *(torch.as_tensor(x).float() for x in (real, generated))).values())
 
 
 def kernel_distance(real, generated):
-    return given(KernelDistance(Summary()), real, generated)["kid_summary"]
+    return figures(real, generated, KernelDistance)[0]
 
 
 def brute_force(real, generated, k):
