@@ -102,15 +102,15 @@ def test_a_leaning_windscreen_is_met_in_its_plane():
 
 
 def test_the_nearest_of_many_overlapping_solids_is_met():
-    names = ("car", "truck", "fence", "building", "trunk")
-    places = (5.0, 6.0, 7.0, 9.0, 14.0)
-    solids = [(name, Boxes(x, 0.3 * x, 0.2 * x, 1.5, 1.0, 0.0, 2.0)) for name, x in zip(names, places, strict=True)]
+    places = {"car": 5.0, "truck": 6.0, "fence": 7.0, "building": 9.0, "trunk": 14.0}
+    solids = [(name, Boxes(x, 0.5 * (x - 5), 0.2 * x, 1.5, 1.0, 0.0, 2.0)) for name, x in places.items()]
     together, _, _ = look(*solids)
     alone = [look(one)[0] for one in solids]
     distances = np.stack([hits.distance for hits in alone])
     np.testing.assert_array_equal(together.distance, distances.min(0))
     nearest = np.choose(distances.argmin(0), [hits.label for hits in alone])
     np.testing.assert_array_equal(together.label, nearest)
+    assert {LABELS[name] for name in places} <= set(np.unique(nearest).tolist())
 
 
 def test_the_share_of_pulses_through_leaves_is_exponential_in_their_path():
