@@ -11,7 +11,7 @@ from r2flow.lidar.known import Ray
 from r2flow.lidar.projection import project
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.lidar.transfer import image_of_same, image_through, points_of_same, points_through, rows_of
+from r2flow.lidar.transfer import image_of_same, image_through, points_of_same, points_through, rows_of, sensor_of
 
 TARGET = SENSORS["hdl64e"].resized(32, 256)
 VLP16 = SENSORS["vlp16"]
@@ -109,6 +109,13 @@ def test_what_is_too_near_hides_and_what_is_too_far_does_not_come_back():
     assert (far.state[measured] == Ray.EMPTY).all()
     assert not near.image.any()
     assert not far.image.any()
+
+
+@pytest.mark.parametrize("named", [replace(VLP16, elevations=BEAMS), None])
+def test_beams_and_steps_are_found(named):
+    found = sensor_of([wall(fired())], named)
+    np.testing.assert_allclose(found.elevations, BEAMS, atol=1e-3)
+    assert found.columns == pytest.approx(1800, rel=1e-3)
 
 
 def test_an_image_of_another_sensor_says_its_empty_rays():
