@@ -181,11 +181,9 @@ class TestReflectance:
 
 
 @pytest.fixture
-def prepared_360(kitti_360: Path, tmp_path_factory) -> Path:
+def prepared_360(kitti_360: Path, tmp_path: Path) -> Path:
     """Drives 0, 2, 3, 4 and 10 of three scans each, prepared."""
-    folder = tmp_path_factory.mktemp("prepared")
-    prepare_folder(kitti_360, folder, SENSOR, "kitti_360")
-    return folder
+    return prepare_folder(kitti_360, tmp_path / "prepared", SENSOR, "kitti_360")
 
 
 class TestPrepared:
