@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -102,21 +103,48 @@ def saved(tmp_path: Path) -> tuple[Path, dict]:
     return path, averaged
 
 
-@pytest.fixture
-def r2flow(monkeypatch, capsys):
+@dataclass(frozen=True)
+class Command:
     """Runs a verb in this process: (exit code, standard output, standard error)."""
 
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
+    monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str]
+
+    def __call__(self, *arguments: object) -> tuple[int, str, str]:
+        self.monkeypatch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
         code = 0
         try:
             cli.main()
         except SystemExit as exit:
             code = exit.code if isinstance(exit.code, int) else 1
-        captured = capsys.readouterr()
+        captured = self.capsys.readouterr()
         return code, captured.out, captured.err
 
-    return run
+    def said(self, *arguments: object) -> str:
+        """The standard output of a verb that succeeds."""
+        return success(self(*arguments))
+
+    def refusal(self, *arguments: object) -> str:
+        """The one line that refuses a verb."""
+        return refusal(self(*arguments))
+
+
+def success(answer: tuple[int, str, str]) -> str:
+    code, said, error = answer
+    assert code == 0, error
+    return said
+
+
+def refusal(answer: tuple[int, str, str]) -> str:
+    code, _, error = answer
+    assert code == 2, error
+    (line,) = (line for line in error.splitlines() if not line.startswith("WARNING"))
+    return line
+
+
+@pytest.fixture
+def r2flow(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(monkeypatch, capsys)
 
 
 @pytest.fixture

@@ -39,8 +39,7 @@ def refuse(constant: str) -> None:
 
 
 def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_path):  # noqa: F811
-    code, said, _ = r2flow("evaluate", real, generated, *QUICK, "--json", tmp_path / "e.json")
-    assert code == 0
+    said = r2flow.said("evaluate", real, generated, *QUICK, "--json", tmp_path / "e.json")
     content = json.loads((tmp_path / "e.json").read_text(), parse_constant=refuse)
     found = {one["comparison"]: (one["kind"], one["generated"]["scans"]) for one in content["comparisons"]}
     baselines = dict.fromkeys(("noise", "flat ground", "mean scan", "shuffled pixels"), ("baseline", 10))
@@ -66,17 +65,14 @@ def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_
         write_points(tmp_path / "g" / f"{number}.ply", xyz, 255 * reflectance)
     assert r2flow("evaluate", real, tmp_path / "g", *QUICK)[0] == 0
     options = ("--metrics", "frechet_handcrafted", *QUICK[2:], "--json", tmp_path / "e.json")
-    code, _, said = r2flow("evaluate", real, tmp_path / "g", *options)
-    assert code == 2
-    assert "--reflectance-scale 255" in said
+    assert "--reflectance-scale 255" in r2flow.refusal("evaluate", real, tmp_path / "g", *options)
     assert r2flow("evaluate", real, tmp_path / "g", *options, "--generated-scale", 255)[0] == 0
 
 
 def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):  # noqa: F811
     empty = folder(tmp_path / "empty", np.zeros((2, 2, 8, 64), np.float32))
     options = ("--metrics", "mmd", *QUICK[2:], "--json", tmp_path / "e.json", "--out", tmp_path / "page")
-    code, said, _ = r2flow("evaluate", real, empty, *options)
-    assert code == 0
+    said = r2flow.said("evaluate", real, empty, *options)
     (metric,) = json.loads((tmp_path / "e.json").read_text(), parse_constant=refuse)["comparisons"][0]["metrics"]
     assert metric["figures"] == {"mmd": None}
     assert any("no figure for mmd" in remark for remark in metric["remarks"])
@@ -90,16 +86,15 @@ def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path): 
 def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):  # noqa: F811
     run = saved[0].parent.parent
     options = ("--metrics", "jsd", "--num", 3, "--steps", 2, "--workers", 0, "--json", tmp_path / "e.json")
-    code, said, _ = r2flow("evaluate", real, run, *options)
-    assert code == 0
+    r2flow.said("evaluate", real, run, *options)
     about = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["generated"]
     assert (about["kind"], about["num"], about["sampler"]["steps"], about["noise"]) == ("sampled", 3, 2, "evaluation")
-    code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--size", "16x64", "--num", 3)
-    assert code == 2
-    assert "8x64, not of hdl64e 16x64" in said
-    code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--sensor", "vlp16", "--size", "8x64", "--num", 3)
-    assert code == 2
-    assert "not of vlp16 8x64" in said
+    assert "8x64, not of hdl64e 16x64" in r2flow.refusal(
+        "evaluate", real, run, *QUICK[:2], "--size", "16x64", "--num", 3
+    )
+    assert "not of vlp16 8x64" in r2flow.refusal(
+        "evaluate", real, run, *QUICK[:2], "--sensor", "vlp16", "--size", "8x64", "--num", 3
+    )
 
 
 @pytest.fixture
@@ -108,8 +103,7 @@ def points(r2flow, real, tmp_path):  # noqa: F811
 
     def measure(*arguments: object) -> tuple[list[dict[str, Any]], str]:
         options = ("--metrics", "jsd", "--num", 4, "--workers", 0, "--no-reference", "--no-baselines")
-        code, _, err = r2flow("evaluate", real, *arguments, *options, "--out", tmp_path)
-        assert code == 0, err
+        r2flow.said("evaluate", real, *arguments, *options, "--out", tmp_path)
         return read_results([tmp_path / "evaluation.json"]), (tmp_path / "evaluation.md").read_text()
 
     return measure
@@ -199,8 +193,7 @@ def plugged_in(monkeypatch):
 
 def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, plugged_in):  # noqa: F811
     options = ("--metrics", "mine,frechet_means,kid_means", *QUICK[2:], "--bootstrap", 5, "--json", tmp_path / "e.json")
-    code, said, _ = r2flow("evaluate", real, generated, *options)
-    assert code == 0
+    said = r2flow.said("evaluate", real, generated, *options)
     ranges = [scans[:, 0][(scans[:, 0] > 0) & (scans[:, 0] < 63)].mean() for scans in (images(12, 1), images(10, 2))]
     rows = [scans[:, 0].astype(np.float64).mean(2) for scans in (images(12, 1), images(10, 2))]
     (a, s), (b, t) = ((x.mean(0), np.cov(x.T)) for x in rows)
@@ -215,9 +208,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
 def test_a_scan_is_no_place_for_figures(r2flow, real, generated):  # noqa: F811
     scan = min(real.iterdir())
     before = scan.read_bytes()
-    code, _, said = r2flow("evaluate", real, generated, *QUICK, "--json", scan)
-    assert code == 2
-    assert "--json must be a file" in said
+    assert "--json must be a file" in r2flow.refusal("evaluate", real, generated, *QUICK, "--json", scan)
     assert scan.read_bytes() == before
 
 
@@ -253,8 +244,7 @@ def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F
 def test_a_judged_set_may_have_the_name_of_a_baseline(r2flow, real, generated, tmp_path):  # noqa: F811
     shutil.copytree(generated, tmp_path / "noise")
     sets = real, tmp_path / "noise", generated
-    code, said, _ = r2flow("evaluate", *sets, *QUICK, "--no-reference", "--json", tmp_path / "e.json")
-    assert code == 0
+    said = r2flow.said("evaluate", *sets, *QUICK, "--no-reference", "--json", tmp_path / "e.json")
     of = {}
     for one in json.loads((tmp_path / "e.json").read_text())["comparisons"]:
         (jsd,) = (metric["printed"]["JSD x 10^2"] for metric in one["metrics"] if metric["metric"] == "jsd")

@@ -49,14 +49,12 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     assert sorted(path.name for path in out.parent.iterdir()) == ["mine.yaml"]
 
     npy, image = ("--format", "npy", "-o", tmp_path / "image"), tmp_path / "image" / "000000.npy"
-    code, printed, _ = r2flow("show", scans / "000000.bin", "--sensor", out, *npy)
-    assert code == 0
+    printed = r2flow.said("show", scans / "000000.bin", "--sensor", out, *npy)
     assert "8 x 128" in printed
     assert (np.load(image)[0] > 0).mean() == pytest.approx(0.9, abs=0.03)
     code, printed, _ = r2flow("show", scans / "000000.bin", "--sensor", out, "--size", "4x64", *npy)
     assert np.load(image).shape == (2, 4, 64)
-    code, _, _ = r2flow("show", scans / "000000.bin", "--sensor", out, "--out", tmp_path / "views")
-    assert code == 0
+    r2flow.said("show", scans / "000000.bin", "--sensor", out, "--out", tmp_path / "views")
     assert (tmp_path / "views" / "000000.png").stat().st_size > 10_000
 
 
@@ -119,9 +117,7 @@ def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, f
 def test_a_sensor_s_file_is_replaced_only_when_asked(r2flow, scans: Path, tmp_path: Path):
     out = tmp_path / "mine.yaml"
     out.write_text("mine by hand")
-    code, _, error = r2flow("sensor", scans, "--out", out)
-    assert code == 2
-    assert "--overwrite" in error
+    assert "--overwrite" in r2flow.refusal("sensor", scans, "--out", out)
     assert out.read_text() == "mine by hand"
     assert r2flow("sensor", scans, "--out", out, "--overwrite")[0] == 0
     assert read_sensor(out).reflectance_scale == 255

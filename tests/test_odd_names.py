@@ -39,8 +39,7 @@ def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, mon
 def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     Path(f"./{name}.bin").write_bytes(b"\0" * 30)
-    code, _, err = r2flow("show", f"./{name}.bin", "-o", "out")
-    assert code == 2
+    err = r2flow.refusal("show", f"./{name}.bin", "-o", "out")
     (line,) = err.splitlines()
     assert "14 bytes" in line
     assert name.partition("\n")[0].encode("utf-8", "backslashreplace").decode() in line

@@ -86,11 +86,10 @@ def test_a_task_that_is_none_is_one_line(checkpoint, task):
 def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: Path):
     checkpoint.save(tmp_path / "model.safetensors")
     out = tmp_path / "out"
-    code, _, error = r2flow(
+    r2flow.said(
         "report", "completion", "simulated:3", tmp_path / "model.safetensors", "--num", 2, "--answers", 2,
         "--samplers", "euler,jump", "--steps", 1, "--tasks", "rows:4,rows:2", "--out", out,
     )  # fmt: skip
-    assert code == 0, error
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
     ways = "model, euler, 1 step", "model, jump, 1 step"
@@ -101,11 +100,10 @@ def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: P
 def test_scans_without_reflectance_have_no_column_of_it(r2flow, checkpoint, tmp_path: Path):
     checkpoint.save(tmp_path / "model.safetensors")
     np.save(tmp_path / "scan.npy", simulate(checkpoint.sensor, 3, 0).image[:1])
-    code, _, error = r2flow(
+    r2flow.said(
         "report", "completion", tmp_path / "scan.npy", tmp_path / "model.safetensors", "--tasks", "rows:2",
         "--out", tmp_path / "out",
     )  # fmt: skip
-    assert code == 0, error
     rows = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
     assert all(math.isfinite(row["panel"]) and "reflectance_mae" not in row for row in rows)
     assert "reflectance MAE" not in (tmp_path / "out" / "completion.md").read_text()
@@ -118,11 +116,10 @@ def test_a_densifier_is_measured_on_the_sensor_of_the_scans(r2flow, checkpoint, 
     truth = simulate(sensor, 3, 500 if given else 0).image  # the middle of 1000 scenes
     if not given:
         write_folder(SimulatedFolder(tmp_path / "scans", sensor, 3, ["npy"]), range(1), workers=1)
-    code, _, error = r2flow(
+    r2flow.said(
         "report", "completion", "simulated:3" if given else tmp_path / "scans", tmp_path / "model.safetensors",
         "--num", 1, "--tasks", "rows:2", "--out", tmp_path / "out", *given,
     )  # fmt: skip
-    assert code == 0, error
     *_, row = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
     at = Way("", checkpoint.through(sensor), checkpoint.generator.sampler)
     *_, (expected, _) = completion_rows([truth], sensor, [at], ["rows:2"], 1)

@@ -107,8 +107,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):
     copy = path.with_name("step-00000009.ckpt")
     copy.write_bytes(path.read_bytes())
     how = ("-o", out, "--steps", 4, "--num", 2)
-    code, said, _ = r2flow("report", "curvature", path, copy, *how)
-    assert code == 0
+    said = r2flow.said("report", "curvature", path, copy, *how)
     figures = {f"{name}.{end}" for name in ("curvature", "trajectories") for end in ("png", "pdf")}
     names = figures | {"curvature.csv", "curvature.json", "curvature.md"}
     assert {file.name for file in out.iterdir()} == names

@@ -123,11 +123,10 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):
     quick = partial(checkpoint_subject, steps=16, tolerance=1e-3)
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     out = tmp_path / "reports"
-    code, said, _ = r2flow(
+    said = r2flow.said(
         "report", "solvers", saved[0], "-o", out, "--num", 2, "--samplers", "euler,heun2,dopri5",
         "--budgets", "2,4", "--problems", "gaussian,rotating",
     )  # fmt: skip
-    assert code == 0
     figures = {f"{name}.{end}" for name in ("solvers", "solvers_problems") for end in ("png", "pdf")}
     assert {path.name for path in out.iterdir()} == figures | {f"solvers.{end}" for end in ("csv", "json", "md")}
     assert f"**{saved[0]}**, 2 scans, against its reference solution" in said
