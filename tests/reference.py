@@ -10,6 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from r2flow.backbones import Backbone, build_backbone
+
 SCALES = {"half": 0.5, "bias": 0.1, "std01": 0.1, "codebook": 0.3, "unit100": 100.0, "ape": 0.5, "bn_mean": 0.2}
 
 
@@ -37,6 +39,22 @@ def _draw(name: str, shape: tuple[int, ...], kind: str, seed: int) -> Tensor:
     if kind == "logit_scale":
         return 2.302585092994046 + 1.2 * z
     return SCALES.get(kind, 1.0) * z
+
+
+OPTIONS = {
+    "attn_num_heads": "num_heads", "temb_channels": "time_channels", "time_embed_channels": "time_channels",
+    "coords_encoding": "position", "positional_embedding": "position", "gn_num_groups": "groups", "gn_eps": "eps",
+}  # fmt: skip
+KEPT = ("base_channels", "channel_multiplier", "num_residual_blocks", "depths", "num_heads", "ring")
+
+
+def backbone_of(name: str, case: dict[str, Any]) -> Backbone:
+    """The backbone of a case with its weights, among which are its rays."""
+    cfg = case["cfg"]
+    options = {OPTIONS.get(key, key): value for key, value in cfg.items() if key in (*OPTIONS, *KEPT)}
+    model = build_backbone({"name": name, **options}, torch.zeros(2, *cfg["resolution"]), cfg["in_channels"])
+    model.load_state_dict(case["state_dict"])
+    return model
 
 
 def relative(found: Tensor, expected: Tensor) -> float:

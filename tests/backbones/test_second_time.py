@@ -33,15 +33,6 @@ def test_with_the_weights_of_one_time_it_is_that_network_for_every_s(name, autoc
 
 
 @pytest.mark.parametrize("name", TWO_TIMES)
-def test_a_seed_gives_both_the_same_weights(name):
-    states = []
-    for second_time in (False, True):
-        torch.manual_seed(1)
-        states.append(untrained(name, second_time=second_time).state_dict())
-    assert all(torch.equal(value, states[1][key]) for key, value in states[0].items())
-
-
-@pytest.mark.parametrize("name", TWO_TIMES)
 def test_training_reaches_the_second_time(name):
     """The zero matrix learns first, then what is before it; by then s matters."""
     _, two = grown(name)

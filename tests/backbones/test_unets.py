@@ -3,35 +3,19 @@
 import pytest
 import torch
 
-from r2flow.backbones import BACKBONES, Backbone, build_backbone
+from r2flow.backbones import BACKBONES, build_backbone
 from r2flow.backbones.convolutions import Resample, SinusoidalTime
 from r2flow.errors import InputError
 from r2flow.registry import check_options
-from tests.reference import assert_gradients, load_case
+from tests.reference import assert_gradients, backbone_of, load_case
 
 CASES = {"eff_16x64_polar": "efficient_unet", "adm_16x64_fourier": "adm_unet"}
-
-
-def from_case(name: str, case: dict) -> Backbone:
-    cfg = case["cfg"]
-    options = {
-        "name": CASES[name],
-        "base_channels": cfg["base_channels"],
-        "channel_multiplier": cfg["channel_multiplier"],
-        "num_residual_blocks": cfg["num_residual_blocks"],
-        "num_heads": cfg["attn_num_heads"],
-        "time_channels": cfg.get("temb_channels"),
-        "position": cfg["coords_encoding"],
-    }
-    model = build_backbone(options, torch.zeros(2, *cfg["resolution"]), cfg["in_channels"])
-    model.load_state_dict(case["state_dict"])
-    return model
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_output_and_gradients_are_the_references(shared, name):
     case = load_case(shared, f"{name}.pt")
-    model = from_case(name, case)
+    model = backbone_of(CASES[name], case)
     x = case["x"].clone().requires_grad_()
     output = model(case["t"], x)
     torch.testing.assert_close(output, case["output"], rtol=0, atol=5e-5)

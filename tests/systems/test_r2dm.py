@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.backbones import Backbone, build_backbone
+from r2flow.backbones import Backbone
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
@@ -27,7 +27,15 @@ from r2flow.systems.diffusion.log_snr import SCHEDULES, Cosine, alpha_sigma, log
 from r2flow.systems.diffusion.objectives import ERRORS, PREDICTIONS, mean_errors, weighted_mean
 from r2flow.systems.diffusion.sampling import forward_step, noised, repaint, step, walk
 from r2flow.training import compose
-from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
+from tests.reference import (
+    assert_near,
+    assert_norms,
+    assert_published,
+    backbone_of,
+    load_case,
+    published_names,
+    shapes_of,
+)
 
 CONFIG: dict[str, Any] = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
@@ -37,29 +45,10 @@ CONFIG: dict[str, Any] = {
 }
 
 
-def network(case: dict[str, Any]) -> Backbone:
-    cfg = case["cfg"]
-    options = {
-        "name": "efficient_unet",
-        "base_channels": cfg["base_channels"],
-        "channel_multiplier": cfg["channel_multiplier"],
-        "num_residual_blocks": cfg["num_residual_blocks"],
-        "num_heads": cfg["attn_num_heads"],
-        "time_channels": cfg["temb_channels"],
-        "position": cfg["coords_encoding"],
-        "groups": cfg["gn_num_groups"],
-        "eps": cfg["gn_eps"],
-        "ring": cfg["ring"],
-    }
-    model = build_backbone(options, torch.zeros(2, *cfg["resolution"]), cfg["in_channels"])
-    model.load_state_dict(case["state_dict"])
-    return model
-
-
 @pytest.mark.parametrize("name", ["r2dm_net_16x64_fourier", "r2dm_net_16x32_polar"])
 def test_the_network_and_its_gradients_are_the_published(shared, name):
     case = load_case(shared, f"{name}.pt")
-    model = network(case)
+    model = backbone_of("efficient_unet", case)
     assert set(case["grad_inputs"]) == {"x", "t"}
     assert_published(model, case, 2e-5, lambda given: model(given["t"], given["x"]))
     assert sum(p.numel() for p in model.parameters()) == case["num_parameters"]
@@ -104,7 +93,7 @@ def test_the_learning_rate_is_the_published(shared):
 @pytest.mark.parametrize("paired", [False, True])
 def test_the_loss_and_its_gradients_are_the_published_and_the_formula_s(shared, name, paired):
     case = load_case(shared, "r2dm_objective.pt")
-    model, case = network(case), case["cases"][name]
+    model, case = backbone_of("efficient_unet", case), case["cases"][name]
     given = case["inputs"]
     x = given["x_0"].clone().requires_grad_()
     prediction, log_snr = PREDICTIONS["eps"], Cosine()(given["t"])
@@ -167,7 +156,7 @@ class Given:
 @torch.no_grad()
 def test_samplers_follow_the_published_trajectories(shared):
     case = load_case(shared, "r2dm_sampling.pt")
-    model = network(case).eval()
+    model = backbone_of("efficient_unet", case).eval()
     for one in case["cases"].values():
         eta = 1.0 if one["mode"] == "ddpm" else one["ddim_eta"]
         start, *draws = one["noise"]
@@ -179,7 +168,7 @@ def test_samplers_follow_the_published_trajectories(shared):
 @torch.no_grad()
 def test_single_steps_down_and_up_are_the_published(shared):
     case = load_case(shared, "r2dm_sampling.pt")
-    model, schedule = network(case).eval(), Cosine()
+    model, schedule = backbone_of("efficient_unet", case).eval(), Cosine()
     for name, one in case["steps"].items():
         at_t, at_s = schedule(one["t"]), schedule(one["s"])
         if name == "q_step":
@@ -193,7 +182,7 @@ def test_single_steps_down_and_up_are_the_published(shared):
 @torch.no_grad()
 def test_repaint_is_the_published(shared):
     case = load_case(shared, "r2dm_repaint.pt")
-    model = network(case).eval()
+    model = backbone_of("efficient_unet", case).eval()
     for one in case["cases"].values():
         start, *draws = one["noise"]
         log_snrs = Cosine()(torch.linspace(1, 0, one["num_steps"] * one["jump_length"] + 1, dtype=torch.float64))
@@ -208,7 +197,7 @@ def test_repaint_is_the_published(shared):
 
 def test_a_scan_is_completed_by_the_published_repaint(shared):
     case = load_case(shared, "r2dm_repaint.pt")
-    model, (one,) = network(case), case["cases"].values()
+    model, (one,) = backbone_of("efficient_unet", case), case["cases"].values()
     generator = build_generator({**CONFIG, "sensor": {"name": "hdl64e", "rows": 16, "columns": 32}})
     generator.backbone = model.eval()
     start, *draws = one["noise"]
