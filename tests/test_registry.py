@@ -7,14 +7,6 @@ import pytest
 from r2flow.errors import InputError
 from r2flow.registry import MISSING, Registry, check_options, options_of
 
-TABLE = Registry("backbone", hdit=dict, adm_unet=dict)
-
-
-def test_a_wrong_name_lists_the_known_ones_and_the_closest():
-    with pytest.raises(InputError) as error:
-        TABLE["hditt"]
-    assert str(error.value) == "no backbone named 'hditt'; known: adm_unet, hdit. Did you mean 'hdit'?"
-
 
 def test_a_wrong_option_lists_the_known_ones_and_the_closest():
     def make(width: int = 1, depth: int = 2) -> int:
@@ -22,10 +14,6 @@ def test_a_wrong_option_lists_the_known_ones_and_the_closest():
 
     with pytest.raises(InputError, match=r"no option 'widht'; it knows: width, depth. Did you mean 'width'\?"):
         Registry("thing", make=make).build({"name": "make", "widht": 3})
-
-
-def test_options_reach_the_constructor():
-    assert Registry("thing", make=lambda a, b: (a, b)).build({"name": "make", "b": 2}, 1) == (1, 2)
 
 
 def test_a_name_that_is_taken_is_refused():

@@ -33,11 +33,6 @@ def checkpoint(run: Path, step: int) -> Path:
     return path
 
 
-def test_a_new_folder_gets_the_config_and_starts_at_nothing(tmp_path: Path):
-    assert open_run(tmp_path / "run", CONFIG) is None
-    assert read_config(tmp_path / "run") == CONFIG
-
-
 def test_the_same_config_goes_on_from_the_newest_whole_checkpoint(tmp_path: Path):
     open_run(tmp_path, CONFIG)
     older, newer = checkpoint(tmp_path, 5), checkpoint(tmp_path, 10)
