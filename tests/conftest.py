@@ -1,12 +1,15 @@
 """Shared by all tests: where reference tensors and real scans lie, and small sensors."""
 
+import contextlib
 import os
+import resource
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -57,6 +60,21 @@ def tiny_options(name: str) -> dict[str, Any]:
     return {"name": name, **TINY.get(name, {})}
 
 
+class Trap:
+    """A pickle of it runs code when it is loaded."""
+
+    def __reduce__(self) -> Any:
+        return exec, ("raise SystemExit('a file has run code')",)
+
+
+def write_checkpoint(path: Path, config: dict[str, Any]) -> Path:
+    """A checkpoint of a config, with random weights."""
+    state = build_stage(config, build_generator(config)).state_dict()
+    content = {"state_dict": state, "current_model_state": state, "config": config, "global_step": 7}
+    AtomicCheckpointIO().save_checkpoint(content, path)
+    return path
+
+
 def write_run(folder: Path, flow: Checkpoint, stage: dict[str, Any], scale: float = 1.0) -> Path:
     """A run folder with the weights of a flow, times a number."""
     weights = dict(flow.generator.named_parameters())
@@ -67,6 +85,24 @@ def write_run(folder: Path, flow: Checkpoint, stage: dict[str, Any], scale: floa
     }  # fmt: skip
     AtomicCheckpointIO().save_checkpoint(content, folder / "checkpoints" / "step-00000007.ckpt")
     return folder
+
+
+@contextlib.contextmanager
+def small_disk(size: int) -> Iterator[None]:
+    """Writing a file past a number of bytes fails as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def quiet_trainer(folder: Path, **options: Any) -> L.Trainer:
+    """On the CPU; it writes and shows nothing unless told."""
+    quiet = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
+    given = {**dict.fromkeys(quiet, False), "max_epochs": -1, **options}
+    return L.Trainer(accelerator="cpu", default_root_dir=folder, **given)
 
 
 @pytest.fixture(scope="session")
@@ -136,6 +172,7 @@ def success(answer: tuple[int, str, str]) -> str:
 
 
 def refusal(answer: tuple[int, str, str]) -> str:
+    """The one line of an error, before which warnings may stand."""
     code, _, error = answer
     assert code == 2, error
     (line,) = (line for line in error.splitlines() if not line.startswith("WARNING"))
@@ -147,14 +184,18 @@ def r2flow(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
     return Command(monkeypatch, capsys)
 
 
+def ground(sensor: Sensor, above: float = 0.0) -> np.ndarray:
+    """An image of the ground 1.73 m below, and of another range above it."""
+    e = sensor.rays()[0].numpy()
+    r = np.where(e < -0.03, -1.73 / np.sin(np.minimum(e, -0.03)), above)
+    return np.stack([r, np.full_like(r, 0.3)]).astype(np.float32)
+
+
 @pytest.fixture
 def scan(tmp_path: Path) -> Path:
     """A scan of the ground 1.73 m below, as a KITTI .bin."""
     sensor = SENSORS["hdl64e"]
-    e = sensor.rays()[0].numpy()
-    r = np.where(e < -0.03, -1.73 / np.sin(np.minimum(e, -0.03)), 0)
-    image = np.stack([r, np.full_like(r, 0.3)]).astype(np.float32)
-    write_points(tmp_path / "ground.bin", *image_to_points(image, sensor.rays()))
+    write_points(tmp_path / "ground.bin", *image_to_points(ground(sensor), sensor.rays()))
     return tmp_path / "ground.bin"
 
 
@@ -190,6 +231,30 @@ def numbered(tmp_path: Path) -> Path:
     for number in range(12):
         write_scan(tmp_path / "scans" / f"{number:06d}.bin", number)
     return tmp_path / "scans"
+
+
+def images(count: int, seed: int) -> np.ndarray:
+    """Walls with holes at 4 to 60 m, (N, 2, 8, 64)."""
+    draw = np.random.default_rng(seed)
+    r = draw.uniform(4, 60, (count, 1, 8, 64)) * (draw.random((count, 1, 8, 64)) > 0.3)
+    return np.concatenate([r, 0.5 * (r > 0)], 1).astype(np.float32)
+
+
+def folder(path: Path, scans: np.ndarray) -> Path:
+    path.mkdir(parents=True)
+    for number, image in enumerate(scans):
+        np.save(path / f"{number:06d}.npy", image)
+    return path
+
+
+@pytest.fixture
+def real(tmp_path: Path) -> Path:
+    return folder(tmp_path / "real", images(12, 1))
+
+
+@pytest.fixture
+def generated(tmp_path: Path) -> Path:
+    return folder(tmp_path / "generated", images(10, 2))
 
 
 def prepare_folder(root: Path, out: Path, sensor: Sensor, layout: str = "folder") -> Path:

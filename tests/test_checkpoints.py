@@ -1,7 +1,6 @@
 import json
 import math
 import pickle
-import resource
 import subprocess
 import sys
 import zipfile
@@ -13,9 +12,9 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.model.checkpoint import Checkpoint, checkpoints_of, load_checkpoint, save_checkpoint
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from r2flow.stages.checkpointing import AtomicCheckpointIO
-from tests.conftest import CONFIG
+from tests.conftest import CONFIG, Trap, small_disk
 
 
 def test_the_averaged_weights_are_the_model(saved):
@@ -32,13 +31,6 @@ def test_the_averaged_weights_are_the_model(saved):
         assert torch.equal(value + 1, averaged[f"generator.backbone.{name}"])
 
 
-def test_the_newest_of_a_run_is_taken(saved):
-    path, _ = saved
-    newer = path.with_name("step-00000010.ckpt")
-    newer.write_bytes(path.read_bytes())
-    assert checkpoints_of(path.parent.parent) == [newer, path]
-
-
 def test_a_published_checkpoint_computes_what_its_authors_did(shared):
     loaded = load_checkpoint(shared / "oracle" / "published_format.pth")
     case = torch.load(shared / "oracle" / "hdit_16x192.pt", weights_only=False)
@@ -47,11 +39,6 @@ def test_a_published_checkpoint_computes_what_its_authors_did(shared):
     with torch.no_grad():
         output = loaded.model(case["t"], case["x"])
     assert (output - case["output"]).norm() / case["output"].norm() < 5e-5
-
-
-class Malicious:
-    def __reduce__(self):
-        return (Path.touch, (Path("touched-by-a-checkpoint"),))
 
 
 def test_a_run_goes_on_without_the_gpu_that_it_began_on(saved, monkeypatch):
@@ -64,15 +51,13 @@ def test_a_run_goes_on_without_the_gpu_that_it_began_on(saved, monkeypatch):
     assert all(torch.equal(value, averaged[name]) for name, value in found.items())
 
 
-def test_a_file_that_would_run_code_is_refused(tmp_path: Path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    torch.save({"state_dict": Malicious()}, tmp_path / "evil.ckpt")
+def test_a_file_that_would_run_code_is_refused(tmp_path: Path):
+    torch.save({"state_dict": Trap()}, tmp_path / "evil.ckpt")
     with pytest.raises(InputError, match=r"evil.ckpt is refused: it holds objects that would run code"):
         load_checkpoint(tmp_path / "evil.ckpt")
-    (tmp_path / "evil.pkl").write_bytes(pickle.dumps(Malicious()))
+    (tmp_path / "evil.pkl").write_bytes(pickle.dumps(Trap()))
     with pytest.raises(InputError, match="evil.pkl"):
         load_checkpoint(tmp_path / "evil.pkl")
-    assert not (tmp_path / "touched-by-a-checkpoint").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x80\x04N.", b"PK\x03\x04" + b"\0" * 100])
@@ -111,15 +96,6 @@ def test_notes_without_end_are_refused(tmp_path: Path, notes: str):
     safetensors.torch.save_file({"x": torch.zeros(1)}, path, metadata={"r2flow": notes})
     with pytest.raises(InputError, match="damaged"):
         load_checkpoint(path)
-
-
-def test_a_cut_checkpoint_is_an_error(saved):
-    path, _ = saved
-    whole = path.read_bytes()
-    for end in range(0, len(whole) - 1, len(whole) // 40):
-        path.write_bytes(whole[:end])
-        with pytest.raises(InputError, match="step-00000007"):
-            load_checkpoint(path)
 
 
 def test_missing_files_and_other_torch_files(tmp_path: Path):
@@ -179,13 +155,8 @@ def test_weights_that_do_not_fit_name_the_first(saved):
 def test_a_full_disk_is_one_line_and_loses_nothing(saved):
     path, _ = saved
     before = path.read_bytes()
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limit[1]))  # writing past it fails as on a full disk
-    try:
-        with pytest.raises(InputError, match=r"step-00000007.ckpt cannot be written: File too large"):
-            AtomicCheckpointIO().save_checkpoint({"x": torch.randn(100_000)}, path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    with small_disk(50_000), pytest.raises(InputError, match=r"step-00000007.ckpt cannot be written"):
+        AtomicCheckpointIO().save_checkpoint({"x": torch.randn(100_000)}, path)
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 

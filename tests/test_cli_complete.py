@@ -48,6 +48,7 @@ def complete(r2flow, run, tmp_path):
 def assert_refused(answer: tuple[int, str, str], message: str, out: Path) -> None:
     """With nothing written."""
     assert message in refusal(answer)
+    assert answer[2].count("\n") == 1  # and no warning
     assert not out.exists()
 
 

@@ -23,8 +23,8 @@ from r2flow.metrics.sums import SumMetric
 from r2flow.model.checkpoint import Checkpoint, save_checkpoint
 from r2flow.reports.paper import read_results
 from r2flow.samplers import build_sampler
-from tests.conftest import CONFIG
-from tests.test_evaluation import SENSOR, folder, generated, images, real  # noqa: F401  fixtures
+from tests.conftest import CONFIG, folder, images
+from tests.test_evaluation import SENSOR
 
 QUICK = ("--metrics", "jsd,mmd", "--size", "8x64", "--workers", 0)
 
@@ -38,7 +38,7 @@ def refuse(constant: str) -> None:
     raise AssertionError(constant)
 
 
-def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_path):  # noqa: F811
+def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_path):
     said = r2flow.said("evaluate", real, generated, *QUICK, "--json", tmp_path / "e.json")
     content = json.loads((tmp_path / "e.json").read_text(), parse_constant=refuse)
     found = {one["comparison"]: (one["kind"], one["generated"]["scans"]) for one in content["comparisons"]}
@@ -59,7 +59,7 @@ def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_p
     assert len(list((tmp_path / "cache" / "statistics").iterdir())) == 4
 
 
-def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_path):  # noqa: F811
+def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_path):
     for number, image in enumerate(images(3, 1)):
         xyz, reflectance = image_to_points(image, SENSOR.rays())
         write_points(tmp_path / "g" / f"{number}.ply", xyz, 255 * reflectance)
@@ -69,7 +69,7 @@ def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_
     assert r2flow("evaluate", real, tmp_path / "g", *options, "--generated-scale", 255)[0] == 0
 
 
-def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):  # noqa: F811
+def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):
     empty = folder(tmp_path / "empty", np.zeros((2, 2, 8, 64), np.float32))
     options = ("--metrics", "mmd", *QUICK[2:], "--json", tmp_path / "e.json", "--out", tmp_path / "page")
     said = r2flow.said("evaluate", real, empty, *options)
@@ -83,7 +83,7 @@ def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path): 
     }
 
 
-def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):  # noqa: F811
+def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     run = saved[0].parent.parent
     options = ("--metrics", "jsd", "--num", 3, "--steps", 2, "--workers", 0, "--json", tmp_path / "e.json")
     r2flow.said("evaluate", real, run, *options)
@@ -98,7 +98,7 @@ def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
 
 
 @pytest.fixture
-def points(r2flow, real, tmp_path):  # noqa: F811
+def points(r2flow, real, tmp_path):
     """The sampled sets of an evaluation, as `report paper` reads them, and its Markdown page."""
 
     def measure(*arguments: object) -> tuple[list[dict[str, Any]], str]:
@@ -191,7 +191,7 @@ def plugged_in(monkeypatch):
     EXTRACTORS.add("means", MeanRanges)
 
 
-def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, plugged_in):  # noqa: F811
+def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, plugged_in):
     options = ("--metrics", "mine,frechet_means,kid_means", *QUICK[2:], "--bootstrap", 5, "--json", tmp_path / "e.json")
     said = r2flow.said("evaluate", real, generated, *options)
     ranges = [scans[:, 0][(scans[:, 0] > 0) & (scans[:, 0] < 63)].mean() for scans in (images(12, 1), images(10, 2))]
@@ -205,7 +205,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
     assert "kid_means" in said
 
 
-def test_a_scan_is_no_place_for_figures(r2flow, real, generated):  # noqa: F811
+def test_a_scan_is_no_place_for_figures(r2flow, real, generated):
     scan = min(real.iterdir())
     before = scan.read_bytes()
     assert "--json must be a file" in r2flow.refusal("evaluate", real, generated, *QUICK, "--json", scan)
@@ -214,7 +214,7 @@ def test_a_scan_is_no_place_for_figures(r2flow, real, generated):  # noqa: F811
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [2, 3])
-def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path, ranks):  # noqa: F811
+def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path, ranks):
     def run(out: Path, *launcher: str) -> dict[str, float]:
         options = ("--metrics", "jsd,mmd,frechet_handcrafted", "--size", "8x64", "--batch-size", "2", "--workers", "0")
         command = [*launcher, "-m", "r2flow.cli", "evaluate", str(real), str(generated), *options, "--json", str(out)]
@@ -231,7 +231,7 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
     assert again == pytest.approx(expected, rel=1e-10)
 
 
-def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F811
+def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):
     run = saved[0].parent.parent
     assert r2flow("sample", run, "--num", 2, "--steps", 2, "-o", run / "samples", "--pictures", 0)[0] == 0
     quick = ("--metrics", "jsd", "--workers", 0)
@@ -241,7 +241,7 @@ def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["000000.png", "000001.png"]
 
 
-def test_a_judged_set_may_have_the_name_of_a_baseline(r2flow, real, generated, tmp_path):  # noqa: F811
+def test_a_judged_set_may_have_the_name_of_a_baseline(r2flow, real, generated, tmp_path):
     shutil.copytree(generated, tmp_path / "noise")
     sets = real, tmp_path / "noise", generated
     said = r2flow.said("evaluate", *sets, *QUICK, "--no-reference", "--json", tmp_path / "e.json")

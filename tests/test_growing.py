@@ -67,17 +67,9 @@ def test_a_grown_map_learns_on_as_a_map(r2flow, tmp_path):
     small = flow(generator={"name": "flow_map"})
     out, run = tmp_path / "larger.safetensors", tmp_path / "run"
     save_checkpoint(grown(small, (16, 128)), out)
-    said = r2flow(
-        *("train", "experiment=flow_map", f"stage.init={out}", f"run_dir={run}", "data.pairs.num=4", "trainer=cpu"),
-        *(
-            "data.pairs.sampler.steps=2",
-            "trainer.max_steps=2",
-            "data.batch_size=2",
-            "samples.num=0",
-            "callbacks.pictures=null",
-        ),
-    )
-    assert said[0] == 0, said
+    pairs = ("data.pairs.num=4", "data.pairs.sampler.steps=2", "data.batch_size=2")
+    quick = ("trainer=cpu", "trainer.max_steps=2", "samples.num=0", "callbacks.pictures=null")
+    r2flow.said("train", "experiment=flow_map", f"stage.init={out}", f"run_dir={run}", *pairs, *quick)
     found = load_checkpoint(run)
     assert type(found.generator) is FlowMap
     assert found.config["parent"]["grown_from"]["weights"] == weights_hash(small)

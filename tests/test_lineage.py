@@ -10,24 +10,16 @@ from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit
-from r2flow.stages import build_stage
-from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.conftest import CONFIG as BOTH
+from tests.conftest import write_checkpoint
 
 CONFIG = {**BOTH, "encoding": {"format": "logscale", "reflectance": False}}
-
-
-def written(path: Path, config: dict) -> Path:
-    """A checkpoint of a config, with random weights."""
-    state = {"state_dict": build_stage(config, build_generator(config)).state_dict(), "config": config}
-    AtomicCheckpointIO().save_checkpoint({**state, "global_step": 7}, path)
-    return path
 
 
 @pytest.fixture
 def parent(tmp_path: Path) -> Path:
     """A checkpoint of range alone."""
-    return written(tmp_path / "parent.ckpt", CONFIG)
+    return write_checkpoint(tmp_path / "parent.ckpt", CONFIG)
 
 
 def child(parent: Path, reflectance) -> dict:
@@ -79,20 +71,12 @@ def test_pairs_are_images_of_the_parents_sensor(parent: Path):
         completed(config, ["sensor.rows=16"])
 
 
-def test_what_is_learned_from_pairs_reads_real_scans_as_the_flow_that_drew_them(tmp_path: Path):
-    read = {"projection": "unfolding", "convention": "reference", "reflectance_scale": 255.0}
-    path = written(tmp_path / "parent.ckpt", {**CONFIG, "data": {**CONFIG["data"], "reading": read}})
-    data = {"name": "pairs", "root": None, "pairs": {}, "reading": dict.fromkeys(read)}
-    child = completed({**CONFIG, "data": data, "stage": {"name": "reflow", "init": str(path)}}, [])
-    assert {key: child["data"]["reading"][key] for key in read} == read
-
-
 def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
     def on_pairs_of(flow: Path | None) -> dict:
         data = {"name": "pairs", "root": None, "pairs": {"of": flow and str(flow)}}
         return completed({**child(parent, False), "data": data, "stage": {"name": "reflow", "init": str(parent)}}, [])
 
-    other = written(tmp_path / "other" / "flow.ckpt", CONFIG)
+    other = write_checkpoint(tmp_path / "other" / "flow.ckpt", CONFIG)
     config = on_pairs_of(other)
     assert config["data"]["pairs"]["parent"] == weights_hash(load_checkpoint(other)) != config["parent"]["weights"]
     assert Path(config["data"]["root"]).parent == other.parent
@@ -101,7 +85,7 @@ def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
     assert own["data"]["pairs"]["parent"] == own["parent"]["weights"]
     assert drawn_by(own) == str(parent)
     with pytest.raises(InputError, match=r"data\.pairs\.of=.*taller\.ckpt has another sensor than .*parent\.ckpt"):
-        on_pairs_of(written(tmp_path / "taller.ckpt", sized(CONFIG, 16, 64)))
+        on_pairs_of(write_checkpoint(tmp_path / "taller.ckpt", sized(CONFIG, 16, 64)))
 
 
 @pytest.mark.parametrize("position", ["none", "polar", "spherical_harmonics"])
@@ -210,9 +194,11 @@ def test_of_a_network_inside_another_that_may_change_which_is_no_weight(parent: 
 
 
 def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):
-    data = {"name": "pairs", "root": None, "pairs": {}, "reading": {"projection": "unfolding"}}
+    read = {"projection": "unfolding", "convention": "reference", "reflectance_scale": 255.0}
+    data = {"name": "pairs", "root": None, "pairs": {}, "reading": {**dict.fromkeys(read), "projection": "spherical"}}
     config = {**child(parent, False), "data": data}
-    there = Parent({**CONFIG, "data": {"reading": {"projection": "spherical", "convention": "centre"}}}, parent)
-    assert inherit(config, [], there)["data"]["reading"]["projection"] == "spherical"
+    there = Parent({**CONFIG, "data": {"reading": read}}, parent)
+    found = inherit(config, [], there)["data"]["reading"]
+    assert {key: found[key] for key in read} == read
     with pytest.raises(InputError, match=r"data\.reading\.projection"):
         inherit(config, ["data.reading.projection"], there)

@@ -23,7 +23,7 @@ from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
 from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
 from r2flow.simulator import simulate
-from tests.conftest import ROOT
+from tests.conftest import ROOT, Trap
 
 PACKAGED = [name for name, model in MODELS.items() if model.page is None]
 
@@ -221,11 +221,6 @@ def test_a_folder_for_the_hub_holds_the_flow_and_nothing_else(tmp_path):
     assert str(tmp_path) not in (tmp_path / "README.md").read_text()
     back = HubFlow.from_pretrained(str(tmp_path))
     assert torch.equal(back.sample(1, steps=1), r2flow.load("street").sample(1, steps=1))
-
-
-class Trap:
-    def __reduce__(self):
-        return (exec, ("raise SystemExit('a file from the hub was run')",))
 
 
 def test_nothing_in_such_a_folder_is_unpickled(tmp_path):

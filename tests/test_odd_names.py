@@ -1,7 +1,6 @@
 """Names of files that are no plain words, and a disk that is full."""
 
 import os
-import resource
 import shutil
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from r2flow.errors import InputError, explain_mistake
 from r2flow.files import atomic_write
 from r2flow.reports.pages import blank_figure
 from r2flow.reports.pictures import figure_pixels
-from tests.conftest import write_scan
+from tests.conftest import small_disk, write_scan
 
 ODD = [r"a$b$c", r"$\frac$", "a\nb", os.fsdecode(b"caf\xe9"), "ä ß 日", "-x", "a'b\"c"]
 NAMES = ["".join(ODD), *(pytest.param(name, marks=pytest.mark.slow) for name in ODD)]
@@ -73,17 +72,9 @@ def test_a_dollar_in_a_text_is_drawn_as_one():
 
 
 def test_a_full_disk_is_one_line_that_names_the_file(tmp_path: Path):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    image = np.zeros((2, 64, 1024), np.float32)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    try:
-        with (
-            pytest.raises(OSError, match="cannot be written whole") as caught,
-            atomic_write(tmp_path / "a.npy") as file,
-        ):
-            np.save(file, image)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    raised = pytest.raises(OSError, match="cannot be written whole")
+    with small_disk(10_000), raised as caught, atomic_write(tmp_path / "a.npy") as file:
+        np.save(file, np.zeros((2, 64, 1024), np.float32))
     assert explain_mistake(caught.value).startswith(f"{tmp_path / 'a.npy'}: cannot be written whole")
     assert list(tmp_path.iterdir()) == []
 

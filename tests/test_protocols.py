@@ -17,7 +17,8 @@ from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.protocols import PAPER, R2FLOW, published_choice
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
-from tests.test_evaluation import SENSOR, folder, generated, images  # noqa: F401  a fixture
+from tests.conftest import folder, images
+from tests.test_evaluation import SENSOR
 
 READING = Reading(SENSOR, convention="reference")
 H, W = SENSOR.shape
@@ -80,7 +81,7 @@ def figure(real: Path, judged: Path, rules, metric: str = "jsd") -> float:
     return one.figures[metric]
 
 
-def test_real_points_are_the_measured_ones_and_generated_ones_bin_corners(measured, generated):  # noqa: F811
+def test_real_points_are_the_measured_ones_and_generated_ones_bin_corners(measured, generated):
     made = images(10, 2)[:, 0].astype(np.float64)
     corners = from_above([on_corners(r) for r in images(10, 2)[:, 0]])
     found = figure(measured[0], generated, PAPER)
@@ -106,14 +107,14 @@ def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(k
     assert published_choice(open_scans("simulated:0", READING, num=15), 5) == sorted(place[:5])
 
 
-def test_scans_without_measured_points_are_refused(generated, kitti_360):  # noqa: F811
+def test_scans_without_measured_points_are_refused(generated, kitti_360):
     with pytest.raises(InputError, match="lacks the measured coordinates"):
         PAPER.check(open_scans(str(generated), READING))
 
 
 def test_several_sets_stand_in_one_table_with_references_and_baselines(
-    r2flow, measured, generated, tmp_path, monkeypatch  # noqa: F811
-):  # fmt: skip
+    r2flow, measured, generated, tmp_path, monkeypatch
+):
     monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)  # millions of cells take time
     monkeypatch.setattr("r2flow.metrics.lidm.COARSE", 5)
     monkeypatch.setenv("R2FLOW_CACHE", str(tmp_path / "cache"))
@@ -146,7 +147,7 @@ def test_several_sets_stand_in_one_table_with_references_and_baselines(
         (lambda x: x.__imul__(1000), "generated/000004.npy: .*millimetres"),
     ],
 )
-def test_a_scan_of_another_scale_is_named_in_one_line(r2flow, measured, generated, tmp_path, change, said):  # noqa: F811
+def test_a_scan_of_another_scale_is_named_in_one_line(r2flow, measured, generated, tmp_path, change, said):
     scan = np.load(generated / "000004.npy")
     change(scan)
     np.save(generated / "000004.npy", scan)

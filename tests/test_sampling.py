@@ -50,9 +50,9 @@ def flow(model: nn.Module | None = None, **encoding) -> Checkpoint:
     return Checkpoint(generator, {"sensor": {}, "encoding": {}}, 0, Path("none"), "r2flow")
 
 
-def network(reflectance: bool = True) -> Checkpoint:
-    """An HDiT with random weights."""
-    config = {**CONFIG, "encoding": {"format": "logscale", "reflectance": reflectance}}
+def network(reflectance: bool = True, **changes: Any) -> Checkpoint:
+    """A network with random weights, an HDiT if nothing else is said."""
+    config = {**CONFIG, "encoding": {"format": "logscale", "reflectance": reflectance}, **changes}
     generator = build_generator(config).eval().requires_grad_(False)
     torch.manual_seed(4)
     for parameter in generator.parameters():
@@ -285,11 +285,8 @@ def test_numeric_times_decide_the_number_of_steps():
     ("changes", "word"),
     [
         ({"grid": ("a", "b")}, "grid"),
-        ({"grid": "quadratic"}, "uniform"),
         ({"steps": 1.5}, "steps"),
-        ({"steps": 10**7}, "steps"),
         ({"name": "dopri5", "tolerance": "x"}, "tolerance"),
-        ({"name": "dopri5", "grid": "power:2"}, "grid"),
         ({"name": "sde", "finish": 1.5}, "finish"),
         ({"name": "sde", "churn": -1.0}, "churn"),
         ({"name": "jump"}, "map"),
@@ -362,10 +359,7 @@ def endless(network: nn.Module, count: int) -> None:
         ([*TINY, "+generator.name=flow_map"], build_sampler("renoise", steps=2)),
         (["experiment=r2dm", "size=small"], build_sampler("ddpm", steps=2)),
         (["experiment=r2dm", "size=small"], build_sampler("ddim", eta=0, steps=1)),
-        (
-            ["experiment=lidargen", "size=small", "generator.levels=2", "generator.width=4"],
-            build_sampler("langevin", steps=1),
-        ),
+        (["experiment=lidargen", "size=small", "generator.levels=2"], build_sampler("langevin", steps=1)),
         (["experiment=vanilla_gan", "size=small", "generator.base_channels=4"], build_sampler("direct")),
         (["experiment=dusty2", "size=small", "generator.base_channels=4"], build_sampler("direct")),
     ],

@@ -19,6 +19,7 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.noise import standard_normal
 from r2flow.reports import pictures
 from r2flow.reports.training import read_curves
+from tests.conftest import quiet_trainer
 from tests.fields import Field
 
 SHAPE = (2, 4, 8)
@@ -66,12 +67,9 @@ def fit(tmp_path, callbacks, steps=6, stage=None, logger=None, **options):
     torch.manual_seed(3)
     stage = stage or Stage()
     loader = torch.utils.data.DataLoader(torch.zeros(64, 1), batch_size=1)
-    L.Trainer(
-        max_steps=steps, max_epochs=-1, accelerator="cpu", callbacks=callbacks, enable_model_summary=False,
-        enable_checkpointing=False, enable_progress_bar=False,
-        logger=logger or CSVLogger(tmp_path, name="metrics"),
-        log_every_n_steps=1, **options,
-    ).fit(stage, loader)  # fmt: skip
+    logger = logger or CSVLogger(tmp_path, name="metrics")
+    more = {"max_steps": steps, "callbacks": callbacks, "logger": logger, "log_every_n_steps": 1, **options}
+    quiet_trainer(tmp_path, **more).fit(stage, loader)
     return stage
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from r2flow.callbacks.ema import EMA, averaged_weights, ema_decay
+from tests.conftest import quiet_trainer
 
 
 def test_the_decay_is_the_reference_s(shared):
@@ -49,11 +50,7 @@ class Watch(L.Callback):
 
 
 def trainer(callbacks: list[L.Callback], steps: int, tmp_path, **options) -> L.Trainer:
-    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    return L.Trainer(
-        max_steps=steps, max_epochs=-1, accelerator="cpu", callbacks=callbacks, enable_model_summary=False,
-        default_root_dir=tmp_path, num_sanity_val_steps=0, **quiet, **options,
-    )  # fmt: skip
+    return quiet_trainer(tmp_path, max_steps=steps, callbacks=callbacks, num_sanity_val_steps=0, **options)
 
 
 def test_the_average_follows_the_reference_s_trace(shared, tmp_path):
@@ -96,24 +93,6 @@ def test_a_look_at_the_average_leaves_what_the_module_counts():
         assert module.count == 2
     assert module.weight == 2
     assert module.count == 2
-
-
-def test_the_average_is_float32_whatever_the_weights_are():
-    module = Scripted([])
-    module.to(torch.bfloat16)
-    ema = EMA(every=1, warmup_steps=0)
-    ema.setup(None, module, "fit")  # type: ignore[arg-type]
-    assert all(p.dtype == torch.float32 for p in ema._average_model.parameters())
-    # An average of bfloat16 weights 1 and 1 + 2^-7 keeps what lies between two bfloat16 numbers.
-    ema.should_update(step_idx=0)
-    with torch.no_grad():
-        module.weight.fill_(1.0)
-    ema._average_model.update_parameters(module)
-    ema.should_update(step_idx=10**6)
-    with torch.no_grad():
-        module.weight.fill_(1 + 2**-7)
-    ema._average_model.update_parameters(module)
-    assert ema._average_model.module.weight.item() == pytest.approx(1 + 0.005 * 2**-7, abs=1e-7)
 
 
 @pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (3, 2), (3, 6), (3, 10), (20, 15)])

@@ -15,6 +15,7 @@ from r2flow.data.loader import Permutations, RunLoader, RunSampler
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
 from r2flow.stages.checkpointing import AtomicCheckpointIO
+from tests.conftest import quiet_trainer
 
 NAN, INF = float("nan"), float("inf")
 
@@ -44,12 +45,9 @@ def batches(*values: float, offset: dict[int, float] | None = None) -> DataLoade
 
 def fit(module: L.LightningModule, loader, tmp_path, *callbacks: L.Callback, **options) -> L.Trainer:
     clip = 1.0 if module.automatic_optimization else None
-    options = {"max_steps": 100, "max_epochs": 1, "gradient_clip_val": clip, **options}
-    trainer = L.Trainer(
-        accelerator="cpu", callbacks=list(callbacks), default_root_dir=tmp_path, logger=False,
-        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
-        use_distributed_sampler=False, plugins=[AtomicCheckpointIO(), *options.pop("plugins", [])], **options,
-    )  # fmt: skip
+    own = {"max_steps": 100, "max_epochs": 1, "gradient_clip_val": clip, "use_distributed_sampler": False}
+    plugins = [AtomicCheckpointIO(), *options.pop("plugins", [])]
+    trainer = quiet_trainer(tmp_path, callbacks=list(callbacks), plugins=plugins, **own, **options)
     trainer.fit(module, loader)
     return trainer
 

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
-from typer.testing import CliRunner
 
-from r2flow.cli.verbs import app
 from r2flow.errors import InputError
 from r2flow.reports.compare import (
     cell,
@@ -222,8 +220,8 @@ def test_losses_have_a_logarithmic_axis_where_it_has_labels(values, scale):
 
 
 @pytest.mark.parametrize("steps", [(40, 40), (40, 20)])
-def test_the_verb_tells_runs_of_different_lengths(tmp_path, steps):
+def test_the_verb_tells_runs_of_different_lengths(r2flow, tmp_path, steps):
     for name, step in zip("ab", steps, strict=True):
         make_run(tmp_path / name, checkpoint=step)
-    done = CliRunner().invoke(app, ["compare", str(tmp_path / "a"), str(tmp_path / "b")])
-    assert ("different numbers of images" in done.output) == (steps[0] != steps[1])
+    said = r2flow.said("compare", tmp_path / "a", tmp_path / "b")
+    assert ("different numbers of images" in said) == (steps[0] != steps[1])

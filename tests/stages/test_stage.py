@@ -2,7 +2,6 @@
 
 import copy
 
-import lightning as L
 import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
@@ -12,6 +11,7 @@ from torch.utils.data import DataLoader
 from r2flow.generators import Generated, Generator
 from r2flow.stages import Stage
 from r2flow.stages.muon import Muon, is_hidden_matrix, orthogonalised
+from tests.conftest import quiet_trainer
 
 BATCHES = DataLoader(list(torch.randn(6, 4, generator=torch.Generator().manual_seed(1))))
 CLIP = 0.1
@@ -61,11 +61,7 @@ class Manual(Automatic):
 
 
 def fitted(stage: Stage, folder) -> Stage:
-    trainer = L.Trainer(
-        accelerator="cpu", max_steps=6, max_epochs=-1, default_root_dir=folder, logger=False,
-        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
-        gradient_clip_val=CLIP if stage.automatic_optimization else None,
-    )  # fmt: skip
+    trainer = quiet_trainer(folder, max_steps=6, gradient_clip_val=CLIP if stage.automatic_optimization else None)
     trainer.fit(stage, BATCHES)
     assert trainer.global_step == 6
     return stage
@@ -101,11 +97,7 @@ def test_gradients_are_clipped_after_they_were_scaled_back(tmp_path, slope):
     scaled = MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu", init_scale=256.0))
     stage = Slope(slope)
     before = stage.generator.layer.bias.detach().clone()
-    trainer = L.Trainer(
-        accelerator="cpu", max_steps=1, default_root_dir=tmp_path, logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False, plugins=[scaled],
-    )  # fmt: skip
-    trainer.fit(stage, BATCHES)
+    quiet_trainer(tmp_path, max_steps=1, plugins=[scaled]).fit(stage, BATCHES)
     assert float(before - stage.generator.layer.bias.detach()) == pytest.approx(min(slope, CLIP), rel=1e-3)
 
 

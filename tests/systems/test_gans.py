@@ -30,7 +30,7 @@ from r2flow.systems.gan.layers import logistic, straight_through_mask
 from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
 from r2flow.systems.gan.style_gan import DustyV2
 from r2flow.training import compose
-from tests.conftest import ROOT
+from tests.conftest import ROOT, Trap
 from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
 
 NETWORKS = [
@@ -342,16 +342,9 @@ def test_sensor_and_angles_of_a_published_file_are_its_own(shared: Path):
     assert math.degrees(float(rays[0, 0, 0])) == pytest.approx(math.degrees(0.05), abs=1e-3)
 
 
-class Ran:
-    """What a pickle would call."""
-
-    def __reduce__(self) -> Any:
-        return exec, ("raise SystemExit('the file has run code')",)
-
-
 def test_a_file_that_would_run_code_beside_its_config_is_refused(shared: Path, tmp_path: Path):
     content = torch.load(shared / "oracle_baselines" / "vanilla_published.pth", weights_only=False)
-    content["optim_G"] = Ran()
+    content["optim_G"] = Trap()
     torch.save(content, tmp_path / "it.pth")
     with pytest.raises(InputError, match=r"would run code when loaded \(exec\)"):
         load_checkpoint(tmp_path / "it.pth")

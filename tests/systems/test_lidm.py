@@ -434,14 +434,8 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
     ("change", "said"),
     [
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1, 2], [2, 2]]}}, "needs 1 strides"),
-        (
-            {"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}},
-            "halves images 4 times",
-        ),
-        (
-            {"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER},
-            "position must be 'none' or 'learnable', found 'polar'",
-        ),
+        ({"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}}, "halves images 4"),
+        ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "position must be .* found 'polar'"),
         ({"unet": {"wdith": 3}, "autoencoder": SMALL_AUTOENCODER}, "generator.unet has no option 'wdith'"),
         ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers must be 1 integers"),
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),

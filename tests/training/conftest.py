@@ -24,8 +24,8 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.runs.launch import main
 from r2flow.signals import LATER
 from r2flow.training import build, compose, fit
+from tests.conftest import ROOT, refusal, success
 
-ROOT = Path(__file__).resolve().parents[2]
 HOLDING = Path(__file__).with_name("holding.py")
 COMMAND = [sys.executable, str(ROOT / "train.py")]
 
@@ -81,6 +81,17 @@ class Done:
     stdout: str
     stderr: str
 
+    @property
+    def said(self) -> str:
+        """The output of a command that succeeds."""
+        return success((self.returncode, self.stdout, self.stderr))
+
+    @property
+    def refusal(self) -> str:
+        """The one line of an error of the user's, without a warning."""
+        assert len(self.stderr.splitlines()) == 1, self.stderr
+        return refusal((self.returncode, self.stdout, self.stderr))
+
 
 Run = Callable[..., Done]
 
@@ -126,10 +137,10 @@ def run_links(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
         return in_process(cwd, arguments, check)
 
 
-def start(cwd: Path, arguments: Sequence[str], **variables: str) -> subprocess.Popen[str]:
-    """`train.py ARGUMENTS` from a folder, as a process group of its own."""
+def start(cwd: Path, arguments: Sequence[object], command: Sequence[str] = COMMAND) -> subprocess.Popen[str]:
+    """`train.py ARGUMENTS` or another command from a folder, as a process group of its own."""
     return subprocess.Popen(
-        [*COMMAND, *arguments], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1", **variables},
+        [*command, *map(str, arguments)], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1"},
         start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         # A shell's background job is started with Ctrl-C ignored, and hands that on.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),

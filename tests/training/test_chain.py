@@ -148,13 +148,8 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
     ("overrides", "message"),
     [
         (["experiment=reflow"], "stage=reflow starts from a trained run: give stage.init=RUN"),
-        (
-            ["experiment=reflow", "stage.init=RF1", "backbone.depths=[1,2]"],
-            "is [1, 2] here, but [1, 1] in",
-        ),
         (["experiment=reflow", "stage.init=RF1", "sensor=vlp16"], "the sensor is the parent's"),
         (["experiment=reflow", "stage.init=RF1", "data.augment.flip=true"], "data.augment changes scans"),
-        (["experiment=reflow", "stage.init=RF1", "data.pairs.sampler.name=jump"], "holds other pairs"),
         (["experiment=reflow", "stage.init=RF1"], "holds other pairs"),
     ],
 )
@@ -162,10 +157,7 @@ def test_a_child_that_cannot_be_is_refused_in_one_line(
     chained: tuple[Path, str], tmp_path: Path, overrides: list[str], message: str
 ):
     done = train_child(tmp_path, *(one.replace("RF1", str(chained[0] / "rf1")) for one in overrides), check=False)
-    assert done.returncode == 2
-    said = done.stderr.strip().splitlines()
-    assert len(said) == 1
-    assert message in said[0]
+    assert message in done.refusal
     assert list(tmp_path.iterdir()) == []
 
 
@@ -176,23 +168,15 @@ def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple
     last.unlink()
     overrides = ["experiment=reflow", "data.pairs.num=4", "data.pairs.batch_size=4", "trainer.max_steps=2"]
     done = train_child(tmp_path, *overrides, f"stage.init={parent}", check=False)
-    assert done.returncode == 2
-    assert "has stopped at step 10 of 12: finish it, or name the checkpoint" in done.stderr
-    done = train_child(tmp_path, *overrides, f"stage.init={before}")
-    assert done.returncode == 0, done.stderr
+    assert "has stopped at step 10 of 12: finish it, or name the checkpoint" in done.refusal
+    train_child(tmp_path, *overrides, f"stage.init={before}")
     assert (parent / "pairs" / "manifest.json").is_file()
 
 
 def test_pairs_of_a_flow_map_can_be_its_jumps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    given = [
-        "stage.init=street",
-        "data.root=pairs",
-        "data.pairs.sampler.name=jump",
-        "data.pairs.sampler.steps=4",
-        "trainer=cpu",
-    ]
-    run = build(compose(["experiment=reflow", *given]))
+    sampler = ("data.pairs.sampler.name=jump", "data.pairs.sampler.steps=4")
+    run = build(compose(["experiment=reflow", "stage.init=street", "data.root=pairs", "trainer=cpu", *sampler]))
     assert run.data.pairs.recipe(run.data.encoding.shape).sampler["name"] == "jump"
 
 
@@ -211,21 +195,24 @@ def test_two_devices_make_the_pairs_that_one_makes(chained: tuple[Path, str], tm
         assert (tmp_path / "pairs" / name).read_bytes() == (chained[0] / "rf1" / "pairs" / name).read_bytes()
 
 
+ALL_LINKS = ("data.batch_size=2", "data.validation.share=0.1", "+trainer.x=1")
+
+
 def test_links_take_what_concerns_them():
     chain = {
         "rf1": {"experiment": None, "trainer": {"max_steps": 5}},
         "rf2": {"experiment": "reflow", "init": "rf1", "stage": {"loss": "mse"}},
     }
     given = ["experiment=demo", "name=x", "chain.rf1.trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3",
-             "data.pairs.num=9", "data.batch_size=2", "+trainer.x=1", "backbone.depths=[1]"]  # fmt: skip
+             "data.pairs.num=9", *ALL_LINKS, "backbone.depths=[1]"]  # fmt: skip
     first, second = links_of(chain, "runs/x", given)
     assert first.overrides == (
-        "trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3", "data.batch_size=2", "+trainer.x=1",
+        "trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3", *ALL_LINKS,
         "backbone.depths=[1]", "trainer.max_steps=5", "run_dir='runs/x/rf1'",
     )  # fmt: skip
     assert second.overrides == (
         "experiment=reflow", "stage.loss=mse", "stage.init='runs/x/rf1'", "seed=3", "data.pairs.num=9",
-        "data.batch_size=2", "+trainer.x=1", "run_dir='runs/x/rf2'",
+        *ALL_LINKS, "run_dir='runs/x/rf2'",
     )  # fmt: skip
 
 
@@ -278,10 +265,7 @@ def test_a_chain_can_begin_at_a_flow_that_is_there():
 )
 def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path: Path, overrides: list[str], message: str):
     done = in_process(tmp_path, ["experiment=demo", *overrides], check=False)
-    assert done.returncode == 2
-    said = done.stderr.strip().splitlines()
-    assert len(said) == 1
-    assert message in said[0]
+    assert message in done.refusal
     assert list(tmp_path.iterdir()) == []
 
 

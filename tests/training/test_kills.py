@@ -3,7 +3,6 @@
 import os
 import random
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ import pytest
 from r2flow.model.checkpoint import checkpoints_of
 from tests.conftest import write_scan
 from tests.killing import wait_until
-from tests.training.conftest import COMMAND, TINY, let_go, tiny
+from tests.training.conftest import COMMAND, TINY, let_go, start, tiny
 from tests.training.test_chain import CHAIN, HELD, assert_alike
 from tests.training.test_train import assert_bit_equal
 
@@ -24,18 +23,10 @@ VERB = [sys.executable, "-m", "r2flow.cli"]
 TIMES = 10
 
 
-def start(cwd: Path, command: Sequence[object]) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [str(part) for part in command], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
-
-
 def finish(cwd: Path, command: Sequence[object]) -> float:
     """Run a command to its end; seconds."""
     begin = time.monotonic()
-    process = start(cwd, command)
+    process = start(cwd, command, command=[])
     said, _ = process.communicate(timeout=600)
     assert process.returncode == 0, said
     return time.monotonic() - begin
@@ -57,7 +48,7 @@ def end_ten_times(cwd: Path, command: Sequence[object], seconds: float, seed: in
     draw, ended = random.Random(seed), 0
     for number in range(TIMES):
         by = (signal.SIGTERM, signal.SIGINT, signal.SIGKILL)[number % 3]
-        process = start(cwd, command)
+        process = start(cwd, command, command=[])
         time.sleep(draw.uniform(0.05, 0.6) * seconds)
         if process.poll() is None:
             (os.kill if number % 2 else os.killpg)(process.pid, by)

@@ -100,9 +100,7 @@ def test_a_stage_of_ones_own_needs_no_yaml_trains_and_resumes(eager: Path, train
 @pytest.mark.parametrize("wanted", ["stage=eager", "+callbacks.mine={}"])
 def test_a_forgotten_plugin_is_named_by_the_run(tmp_path: Path, wanted: str):
     write_config(tmp_path / "runs" / "own", {"plugins": ["their.module"]})
-    done = in_process(tmp_path, [wanted, "name=own"], check=False)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
+    line = in_process(tmp_path, [wanted, "name=own"], check=False).refusal
     assert "runs/own was made with" in line
     assert "--plugin their.module" in line
 
@@ -119,13 +117,8 @@ def test_a_stage_that_takes_its_own_steps_clips_for_itself(eager: Path, scans: P
 
 
 def test_a_plugin_is_not_imported_because_a_file_names_it(eager: Path, tmp_path: Path):
-    with (
-        pytest.raises(
-            InputError,
-            match=f"no stage named 'eager'; known: .*; it was made with the plug-in {eager}: give --plugin {eager}",
-        ),
-        made_with({"plugins": [str(eager)]}, "it"),
-    ):
+    made = made_with({"plugins": [str(eager)]}, "it")
+    with pytest.raises(InputError, match=f"no stage named 'eager'; .* give --plugin {eager}"), made:
         STAGES["eager"]
     folder = tmp_path / "conf" / "experiment"
     folder.mkdir(parents=True)
@@ -133,10 +126,7 @@ def test_a_plugin_is_not_imported_because_a_file_names_it(eager: Path, tmp_path:
     for text, flags in ((f"plugins: [{eager}]", ()), (of_a_sweep, ("-m",))):
         (folder / "theirs.yaml").write_text(f"# @package _global_\n{text}\n")
         done = in_process(tmp_path, ["--config-dir", str(folder.parent), *flags, "experiment=theirs"], check=False)
-        assert done.returncode == 2
-        assert done.stderr.splitlines() == [
-            f"error: plug-ins are named on the command line, never in a file: give --plugin {eager}."
-        ]
+        assert f"never in a file: give --plugin {eager}" in done.refusal
     assert "eager" not in STAGES
 
 
@@ -184,5 +174,4 @@ def test_an_example_lacks_its_files_alone(tmp_path: Path, name: str):
     root = ("data.root=runs/street/scenes",) if name == "finetune_map" else ()
     command = ["--plugin", str(EXAMPLE / "street_stage.py"), "--config-dir", str(EXAMPLE), f"experiment={name}"]
     done = in_process(tmp_path, [*command, *of_links, *root], check=False)
-    assert done.returncode == 2
-    assert re.search(r"runs/street/(scenes|grown)", done.stderr)
+    assert re.search(r"runs/street/(scenes|grown)", done.refusal)

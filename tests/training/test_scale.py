@@ -8,7 +8,6 @@ import socket
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -80,9 +79,7 @@ def test_two_processes_share_one_average_and_one_writes(one: Path, two: Path):
     writers = {path.name.split("-")[1] for path in (two / "record").glob("wrote-*")}
     assert writers == {"0"}
     assert [p.name for p in checkpoints_of(two / "runs" / "two")] == ["step-00000020.ckpt", "step-00000018.ckpt"]
-    for a, b in zip(weights(one / "runs" / "one"), weights(two / "runs" / "two"), strict=True):
-        for name in a:
-            torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-4)
+    torch.testing.assert_close(weights(one / "runs" / "one"), weights(two / "runs" / "two"), rtol=0, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -94,9 +91,7 @@ def test_a_run_goes_on_in_more_processes(one: Path, scans: Path, tmp_path: Path)
     alone, resumed = losses(one / "record"), losses(tmp_path / "record")
     assert list(resumed) == [19, 20]
     assert all(abs(alone[step] - resumed[step]) < 1e-5 for step in resumed)
-    for a, b in zip(weights(one / "runs" / "one"), weights(tmp_path / "runs" / "one"), strict=True):
-        for name in a:
-            torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-5)
+    torch.testing.assert_close(weights(one / "runs" / "one"), weights(tmp_path / "runs" / "one"), rtol=0, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -155,12 +150,8 @@ def srun(
         )
         for task in range(tasks)
     ]  # fmt: skip
-    begin = time.monotonic()
-    while leave_after and not leave_after.exists():
-        assert started[-1].poll() is None, started[-1].communicate()[0].decode()
-        assert time.monotonic() - begin < 200
-        time.sleep(0.005)
     if leave_after:
+        wait_for(leave_after, started[-1])
         os.killpg(started[-1].pid, signal.SIGUSR1)  # its loader's workers get it too, as from SLURM
     said = [process.communicate(timeout=200)[0].decode() for process in started]
     return [(process.returncode, words) for process, words in zip(started, said, strict=True)]
@@ -199,9 +190,7 @@ def test_two_tasks_leave_together_when_one_is_told_to(one: Path, scans: Path, tm
     assert read_checkpoint(checkpoints_of(run)[0])["global_step"] < STEPS
     for code, said in srun(tmp_path, scans, *command, tasks=2):
         assert code == 0, said
-    for a, b in zip(weights(one / "runs" / "one"), weights(run), strict=True):
-        for name in a:
-            torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-4)
+    torch.testing.assert_close(weights(one / "runs" / "one"), weights(run), rtol=0, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -239,10 +228,7 @@ def test_what_is_queued_again_is_named_as_scontrol_names_it(monkeypatch, variabl
 
 def test_a_launcher_that_is_not_installed_says_how_to_get_it(tmp_path: Path):
     done = in_process(tmp_path, ["-m", "hydra/launcher=submitit_of_tomorrow", "seed=1,2"], check=False)
-    assert done.returncode == 2
-    said = done.stderr.strip().splitlines()
-    assert len(said) == 1
-    assert "pip install -e '.[slurm]'" in said[0]
+    assert "pip install -e '.[slurm]'" in done.refusal
 
 
 @pytest.mark.slow
