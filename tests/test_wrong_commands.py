@@ -24,31 +24,21 @@ import r2flow.training
 from r2flow import cli
 from r2flow.cli import verbs  # noqa: F401  which enters them
 from r2flow.cli.app import app
-from r2flow.generators import build_generator
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
-from r2flow.stages import build_stage
-from r2flow.stages.checkpointing import AtomicCheckpointIO
-from tests.conftest import CONFIG
+from tests.conftest import CONFIG, ground, write_checkpoint
 
 VERBS = """
 nope # No such command 'nope'
---nope # No such option: --nope
 sampel -c run -o out # Did you mean 'sample'?
 report nope
-report --nope
-sample run # Missing
 sample empty -o out
-sample scans -o out # scans holds no checkpoint
 sample run -o out --sampler torchdiffeq:nope
 sample run -o out --sampler euler --tolerance 0.1 # tolerance
-sample run -o out --sampler nope --tolerance 0.1 # no sampler named
 sample run -o out --sampler dopri5 --steps 50 # steps
-sample run -o out --device meta
 sample run -o out --device cuda:99
-sample run -o out --device '' # an argument is empty
 sample run -o out --format las
 sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column
@@ -58,21 +48,15 @@ sample run -o out --rows 5-3
 sample run -o out --rows 0-99
 sample run -o out --rows ' -1-3'
 sample run -o out --grid nope
-sample run -o out --grid nowhere.json
-sample run -o out --sampler dopri5 --grid power:2
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
-sample run -o out --grid power:3 --steps 1000000 # too short for float64
 sample run -o out --plugin nope
-sample run -o out --plugin plugin.py
 sample run -o out extra
 sample run -o out -o # '-o' requires an argument
 sample '' -o out # an argument is empty
 info nowhere
 info scans/000000.bin
-info run run # extra argument
 info run --jsn
 sample run -o out --steps 10000000 # 1,000,000
-view scans --seed 3 -o v.html # are of a run
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
 export run --to onx # no export format named 'onx'
@@ -84,33 +68,24 @@ report backbones --only nope
 report backbones --size ²x²
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels
 report backbones extra
-complete scans/000000.bin -c bad.ckpt -o out
 complete scans/000000.bin -c run -o out --mask nope # no mask
 complete scans/000000.bin -c run -o out --from nope
 complete scans/000000.bin -c run -o out --to os1_64
 view scans -o out # ends in .html
 view scans -o file.txt/a.html
-view scans -o out.html --num 257
 view scans -o out.html --steps 1,2 # of a run, a checkpoint or a model
 view run -o out.html --size 64x1024 --sensor vlp16 --reflectance-scale 7 # are of scans; found none
 view run -o out.html --steps 1,a
 view run -o out.html --times 3 --steps 1,2 # one number of --steps
 view run scans -o out.html --times 3 --sequence # --sequence
-view run -o out.html --sequence # --sequence
 simulate -o out --sensor bad.yaml
 simulate -o out --size 1x1 # found 1
-simulate -o out --seed 99999999999999999999999 --num 1 --size 8x64
-simulate -o out --format '' # an argument is empty
 simulate -o out --format npy --labels
 simulate -o scans --num 1 --size 8x64 # holds scans
-interpolate scans/000000.bin -c run -o out # Missing
-interpolate scans/000000.bin nowhere.bin -c run -o out
 interpolate scans/000000.bin bad.bin -c run -o out
 interpolate scans scans -c run -o out # scan
-show scans # Missing
 show file.txt -o out
 show scans -o out.png
-show scans -o out --size ²x²
 show scans -o out --projection unfolding
 show run -o out # a run without samples
 show nope:scans -o out
@@ -120,9 +95,7 @@ sensor bad.bin
 sensor image.npy
 sensor scans -o out # a .yaml file
 sensor scans -o file.txt/out.yaml
-prepare nope:scans -o out
 prepare empty -o out
-prepare -o out # Missing
 prepare simulated:3 -o out
 prepare scans/000000.bin -o out
 prepare scans -o out --split train # no split named 'train'
@@ -133,28 +106,15 @@ pairs stopped
 pairs run --num 1 --seed 99999999999999999999
 weights --add
 weights --add nope file.txt
-weights --add rangenet53
 weights --add rangenet53 file.txt
-weights nope
-compare file.txt -o out
-compare scans # is not a run
 evaluate scans # nothing to compare with
-evaluate scans empty
-evaluate scans file.txt
-evaluate scans scans --split train # no split named 'train'
 evaluate scans scans --generated-split train # no split named 'train'
-evaluate scans scans --steps 4 --sampler nope # are of a run, a checkpoint or a model to sample; found none
 evaluate scans --reference --steps 4 # found none
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans scans --json file.txt/a.json
-evaluate scans run --steps 2 --sampler dopri5 # steps
-evaluate scans run --steps 1,,2
 evaluate scans run --sampler euler,heun2 --tolerance 0.1 # tolerance
-evaluate scans run --tolerance 0.1 # tolerance
 evaluate scans run --sensor vlp16
 evaluate scans scans --sensor vlp # Did you mean 'vlp16'? Your own is a YAML file
-evaluate image.npy # nothing to compare with
-evaluate simulated:x scans
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
 report solvers nowhere -o out
 report solvers -o out --samplers nope
@@ -213,70 +173,40 @@ def wrong_values() -> Iterator[str]:
 
 
 TRAIN = """
-name=x callbacks.checkpoint.every=1.5
-name=x callbacks=other
 name=x +samples.steps=3
-name=x sampler.name=3
 name=x backbone.base_channels=7
-name=x backbone.patch=[3,5] # multiple of 12
 name=x backbone=
 name=x backbone.name=null
-name=x sensor.rows=1
 name=x encoding.format=null
-name=x data=null
 name=x data=folder data.root=scans data.reading.projection=flat
 name=x data=folder data.root=scans data.validation.data=3
-name=x data=folder data.root=scans data.pairs=3
 name=x data=prepared
 name=x data=mixed 'data.parts=[{name: folder, root: empty}]'
 name=x data=pairs
 name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
-name=x stage=reflow data=pairs stage.init=run +data.pairs.foo=1
 name=x stage=reflow data=pairs stage.init=run backbone=hdit
-name=x stage.loss=null
-name=x stage.time=uniform
 name=x stage=base
-name=x trainer=nope
 name=x trainer.max_time=foo
-name=x trainer.strategy=ddp_foo
-name=x trainer.profiler=foo
-name=x trainer.barebones=true
-name=x trainer.reload_dataloaders_every_n_epochs=-1
-name=x trainer.logger=true
 name=x +plugins.a=3
-name=x --plugin nope
 name=x --plugin nowhere.py
 --plugin
 name=x experiment=nope
-name=x chain=[]
 name=x 'chain={a: {init: b}}'
 name=x 'chain={a: {stage: 3}}'
 name=x 'chain={a/b: {seed: 3}}'
-name=x 'chain={"..": {seed: 3}}' # cannot be read
 name=x experiment=demo chain.rf1=null
 name=a/../../b
-name=null # names a folder
 name=x foo
-name=x foo=
-name=x == # KEY=VALUE
 name=x a=b=c
-name=x ~ # KEY=VALUE
-name=x data.=3 # data.=3 cannot be read
-name=x [a]=3 # [a]=3 cannot be read
 name=x 'data={' # data={ cannot be read
 name=x seed=${seed} # interpolation
-name=x --cfg
 name=x --cfg foo
 name=x --config-dir nowhere
 name=x --config-name nope
-name=x --multirun -x # -x; see --help
 -m seed=1,2 hydra/launcher=nope
--m seed=1,2 hydra/sweeper=nope
 name=x hydra.run.dir=file.txt
 name=x hydra=3
 name=x data@foo=kitti_raw
-name=x override
-name=x ~data.batch_size
 name=x scans=3 # no key 'scans'
 name=x +parent=3
 """
@@ -294,30 +224,19 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scans, a finished run and one that has stopped, and files that are none of these."""
     place = tmp_path_factory.mktemp("place")
     sensor = SENSORS["hdl64e"].resized(16, 128)
-    e = sensor.rays()[0].numpy()
     for number in range(3):
-        r = np.where(e < -0.03, -1.73 / np.sin(np.minimum(e, -0.03)), 20 + number)
-        image = np.stack([r, np.full_like(r, 0.3)]).astype(np.float32)
-        write_points(place / "scans" / f"{number:06d}.bin", *image_to_points(image, sensor.rays()))
+        points = image_to_points(ground(sensor, 20 + number), sensor.rays())
+        write_points(place / "scans" / f"{number:06d}.bin", *points)
     for name, more in (("run", {}), ("stopped", {"trainer": {"max_steps": 20}})):
         config = {**CONFIG, **more}
-        state = build_stage(config, build_generator(config)).state_dict()
-        content = {"state_dict": state, "current_model_state": state, "config": config, "global_step": 7}
-        AtomicCheckpointIO().save_checkpoint(content, place / name / "checkpoints" / "step-00000007.ckpt")
+        write_checkpoint(place / name / "checkpoints" / "step-00000007.ckpt", config)
         (place / name / "config.yaml").write_text(yaml.safe_dump(config))
     save_checkpoint(load_checkpoint(place / "run"), place / "flow.safetensors")
     (place / "empty").mkdir()
     np.save(place / "image.npy", np.stack([np.full((8, 64), 9.0), np.full((8, 64), 0.5)]).astype(np.float32))
     (place / "bad.bin").write_bytes(b"\0" * 30)
-    contents = {
-        "file.txt": "in the way",
-        "bad.ckpt": "nothing",
-        "bad.json": "{",
-        "bad.yaml": "name: mine\nelevations: [3]\n",
-        "plugin.py": "raise RuntimeError('no')\n",
-    }
-    for name, text in contents.items():
-        (place / name).write_text(text)
+    (place / "bad.yaml").write_text("name: mine\nelevations: [3]\n")
+    (place / "file.txt").write_text("in the way")
     return place
 
 

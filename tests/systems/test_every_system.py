@@ -204,13 +204,10 @@ def garble(part: str, **changes: Any) -> Callable[[Any], None]:
 OUTPUT = "model.generator.synthesis_kwargs.out_ch.0"
 GARBLED = [
     ("dusty2", garble("model.generator", arch="stylegan"), "KeyError: 'stylegan'"),
-    ("dusty2", garble("dataset", min_depth=None), "KeyError: 'min_depth'"),
     ("dusty2", garble("dataset", max_depth=1.0), "needs 0 < min_range < max_range"),
     ("dusty2", garble(OUTPUT, act="os.system"), "ValueError: the activation 'os.system'"),
     ("r2dm", garble("data", min_depth=90.0), "found 90.0 and 80.0"),
     ("r2dm", garble("diffusion", timestep_type="discrete"), "only diffusions of range in continuous time"),
-    ("r2dm", garble("data", train_depth=False), "only diffusions of range"),
-    ("r2dm", garble("", data=None), "KeyError: 'data'"),
     ("r2dm", garble("data", depth_format="disparity"), "KeyError: 'disparity'"),
     ("r2dm", garble("model", architecture="refinenet"), "no published architecture named 'refinenet'"),
     ("r2dm", garble("diffusion", noise_schedule="sigmoid"), "no log-SNR schedule named 'sigmoid'"),
