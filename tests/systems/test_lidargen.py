@@ -41,7 +41,6 @@ def test_output_and_gradients_are_the_published_network_s(shared: Path):
 def test_the_full_network_has_the_published_names_and_shapes(shared: Path):
     with torch.device("meta"):
         network = RefineNet(torch.empty(232))
-    assert sum(p.numel() for p in network.parameters()) == 29_694_082
     assert shapes_of(network) == published_names(shared, "lidargen")
 
 

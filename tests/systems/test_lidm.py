@@ -140,10 +140,6 @@ def test_unet_and_gradients_are_the_published(shared: Path):
 def test_the_full_networks_have_the_published_names_and_shapes(shared: Path):
     with torch.device("meta"):
         autoencoder, unet = Autoencoder(), LatentUNet((8, 16, 128))
-    parts = autoencoder.encoder, autoencoder.decoder, autoencoder, unet
-    encoder, decoder, whole, diffusion = (sum(p.numel() for p in part.parameters()) for part in parts)
-    assert (encoder, decoder, whole - encoder - decoder) == (6_343_368, 8_595_777, 131_216)
-    assert diffusion == 257_751_560
     names = published_names(shared, "lidm")
     for prefix, model in (("first_stage_model.", autoencoder), ("model.diffusion_model.", unet)):
         assert shapes_of(model) == within(names, prefix)
