@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from r2flow import load
-from r2flow.errors import InputError, require
+from r2flow.errors import require
 from r2flow.model.checkpoint import save_checkpoint
 
 require("r2flow.model.hub", "hub", "huggingface_hub")
@@ -56,14 +56,11 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # if the extra is not i
         save_checkpoint(self.checkpoint, save_directory / FILE)
 
     @classmethod
-    def _from_pretrained(cls, *, model_id: str, device: str = "cpu", **where: Any) -> "HubFlow":
-        options = ("revision", "cache_dir", "force_download", "local_files_only", "token")
-        older = "proxies", "resume_download"  # passed by the mixin of older versions
-        unknown = [key for key in where if key not in (*options, *older)]
-        if unknown:
-            raise InputError(
-                f"HubFlow.from_pretrained does not know {', '.join(unknown)}; it takes device, {', '.join(options)}."
-            )
-        if Path(model_id).is_dir():
-            return cls(Path(model_id, FILE), device)
-        return cls(hf_hub_download(model_id, FILE, **{key: where[key] for key in options if key in where}), device)
+    def _from_pretrained(
+        cls, *, model_id: str, device: str = "cpu", revision: Any, cache_dir: Any, force_download: bool,
+        local_files_only: bool, token: Any, proxies: Any = None, resume_download: Any = None,
+    ) -> "HubFlow":  # fmt: skip
+        where = {"revision": revision, "cache_dir": cache_dir, "force_download": force_download}
+        where |= {"local_files_only": local_files_only, "token": token}
+        path = Path(model_id, FILE) if Path(model_id).is_dir() else hf_hub_download(model_id, FILE, **where)
+        return cls(path, device)
