@@ -183,7 +183,7 @@ def test_a_region_is_generated_from_the_whole_image_s_noise():
     checkpoint = network()
     wanted = region(SENSOR.shape, (-30, 40), (2, 5))
     seen = evaluated_region(checkpoint.generator, wanted)
-    (drawn,) = sample(checkpoint, 2, name="euler", steps=3, batch_size=2, seed=9, region=wanted)
+    (drawn,) = sample(checkpoint, 2, sampler="euler", steps=3, batch_size=2, seed=9, region=wanted)
     shapes = []
     part = checkpoint.generator.part(seen).backbone
     x = seen.crop(Draws(9, range(2)).start((2, 8, 64)))

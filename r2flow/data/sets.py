@@ -46,6 +46,11 @@ class ScanSet:
     def __len__(self) -> int:
         return len(self.source)
 
+    def __getitem__(self, key: int | slice) -> Tensor:
+        """One image, (2 or 1, H, W), or those of a slice, (n, 2 or 1, H, W)."""
+        numbers = range(len(self))[key]
+        return self.source.batch([*numbers]) if isinstance(numbers, range) else self.source.batch([numbers])[0]
+
     def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
         """Some of the scans, in the given order; `name` describes the selection."""
         identity = self.identity

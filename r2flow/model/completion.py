@@ -69,7 +69,7 @@ def complete(
     num: int = 1,
     seed: int = 0,
     *,
-    sampler: Sampler | None = None,
+    sampler: Sampler | str | None = None,
     batch_size: int = 1,
     first: int = 0,
     precision: Precision = "32-true",
@@ -87,7 +87,7 @@ def complete(
             reflectance adds it to scans without; a model of range alone ignores it.
         state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); None: rays without a return count as not measured.
         num: Answers per scan.
-        sampler: Sampler; None: that of `completing`, for several answers `transport` if the generator has it.
+        sampler: Sampler or its name; None: that of `completing`, for several answers `transport` if there is one.
         batch_size: Answers per batch. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
         progress: Called after every network evaluation of a batch.
@@ -98,8 +98,9 @@ def complete(
             sensor's range.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    chosen = sampler or completing(generator, several=num > 1, **changes)
-    plain = generator.sampler if chosen.completes else chosen  # for a scan without a known ray
+    if not isinstance(sampler, Sampler):
+        sampler = completing(generator, several=num > 1, **{"name": sampler, **changes})
+    plain = generator.sampler if sampler.completes else sampler  # for a scan without a known ray
     images = torch.as_tensor(images).detach().float().cpu()
     if state is None:
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
@@ -115,7 +116,7 @@ def complete(
             numbers = [first + i + answer * ANSWER for answer in range(start, min(start + batch_size, num))]
             given = {name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()}
             parts.append(
-                draw(generator, numbers, seed, chosen if any_known else plain, given if any_known else None,
+                draw(generator, numbers, seed, sampler if any_known else plain, given if any_known else None,
                     precision=precision, progress=progress)
             )  # fmt: skip
         if not parts:

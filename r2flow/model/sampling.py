@@ -49,7 +49,7 @@ def sample(
     num: int,
     seed: int = 0,
     *,
-    sampler: Sampler | None = None,
+    sampler: Sampler | str | None = None,
     batch_size: int = 1,
     condition: Condition | None = None,
     region: Region | None = None,
@@ -61,7 +61,7 @@ def sample(
 
     Args:
         source: A checkpoint or its generator.
-        sampler: Sampler; None: the generator's default.
+        sampler: Sampler or its name; None: the generator's default.
         batch_size: Scans per batch. It does not change a fixed-step result beyond rounding.
         condition: Condition of the scans, each tensor (num, ...).
         region: Region of the image to generate. The network sees `evaluated_region` only, with the same noise as in the
@@ -77,7 +77,8 @@ def sample(
     generator = source if isinstance(source, Generator) else source.generator
     if not (isinstance(num, Integral) and isinstance(batch_size, Integral) and num >= 1 and batch_size >= 1):
         raise InputError(f"needs at least one scan and a batch of at least one; found {num!r} and {batch_size!r}.")
-    chosen = sampler.changed(**changes) if sampler else generator.choose(**changes)
+    named: dict[str, Any] = {"name": sampler, **changes}
+    chosen = sampler.changed(**changes) if isinstance(sampler, Sampler) else generator.choose(**named)
     for name, value in (condition or {}).items():
         if len(value) != num:
             raise InputError(f"the condition's {name} has {len(value)} scans, but num is {num}.")
