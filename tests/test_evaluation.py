@@ -236,7 +236,7 @@ def test_another_revision_of_the_simulator_draws_other_scans(monkeypatch):
     assert open_scans("simulated:0", READING, num=3).identity != before
 
 
-FEW = "the halves of your 24 real scans have 12 or more and the set has 18"
+FEW = "too few scans for a verdict: 24 real, 18 generated, 200 and 100 needed"
 
 
 @pytest.mark.parametrize(
@@ -246,10 +246,10 @@ FEW = "the halves of your 24 real scans have 12 or more and the set has 18"
         ("kid_x", 200, 200, 11.0, 1.0, "not distinguishable"),  # within the margin
         ("kid_x", 200, 200, 13.0, 1.0, "higher than between the real halves"),
         ("kid_x", 200, 200, 50.0, 1.0, "no lower than a baseline"),
-        ("kid_x", 200, 20, 9.0, None, "not above the real halves, below the baselines: an indication"),
-        ("panel", 24, 18, 9.0, 11.0, f"above the real halves, below the baselines: an indication, as {FEW}: give 200"),
-        ("panel", 24, 18, 60.0, 9.5, f"not above the real halves, not below the baselines: an indication, as {FEW}"),
-        ("panel", 24, 18, 9.0, None, f"an indication, as {FEW}"),
+        ("kid_x", 200, 20, 9.0, None, "not above the real halves, below the baselines; too few"),
+        ("panel", 24, 18, 9.0, 11.0, f"above the real halves, below the baselines; {FEW}"),
+        ("panel", 24, 18, 60.0, 9.5, f"not above the real halves, not below the baselines; {FEW}"),
+        ("panel", 24, 18, 9.0, None, FEW),
         ("panel", 200, 200, 9.0, None, "give 100 generated"),  # the halves' distance is larger since they are fewer
         ("panel", 200, 200, 9.0, 9.5, "not distinguishable"),
         ("panel", 200, 200, 9.0, 13.0, "higher than between the real halves"),
@@ -268,11 +268,12 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
         Comparison(name, *map(range, sizes), [MetricResult(metric, {metric: number}, {})], 0.0, kind)
         for name, number, sizes, kind in cases
     ]
-    first, _ = verdict(comparisons)
+    first, second = verdict(comparisons)
     same = f"in as many scans as the halves {equal:g}, " if metric == "panel" and equal is not None else ""
     known = f"{same}reference: real halves 10, baseline: noise 50"
     assert first.startswith(f"a: lowest, {metric} {value:g} ({known}): ")
     assert words in first
+    assert second.startswith(f"b: {1 + 1 / value:.2f} times the lowest, {metric} {value + 1:g} ")
 
 
 def test_the_verdict_is_of_the_panel_if_measured():

@@ -104,9 +104,8 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
         if min(scans, of_half) < ENOUGH:
             judgement = (
                 f"{'above' if compared > reference else 'not above'} the real halves, "
-                f"{'below' if value < best else 'not below'} the baselines: an indication, as the halves of your "
-                f"{len(comparison.real)} real scans have {of_half} or more and the set has "
-                f"{len(comparison.generated)}: give {2 * ENOUGH} real and {ENOUGH} generated scans for a verdict"
+                f"{'below' if value < best else 'not below'} the baselines; too few scans for a verdict: "
+                f"{len(comparison.real)} real, {len(comparison.generated)} generated, {2 * ENOUGH} and {ENOUGH} needed"
             )
         elif value >= best:
             judgement = "no lower than a baseline"
@@ -121,8 +120,9 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
         bounds = [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
         if as_many:
             bounds.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
-        first = "lowest, " if equal and comparison is judged[0][1] else ""
-        lines.append(f"{comparison.name}: {first}{title} {value * factor:.3g} ({', '.join(bounds)}): {judgement}.")
+        rank = "lowest, " if comparison is judged[0][1] else f"{value / judged[0][0]:.2f} times the lowest, "
+        text = f"{title} {value * factor:.3g} ({', '.join(bounds)}): {judgement}."
+        lines.append(f"{comparison.name}: {rank if equal and judged[0][0] > 0 else ''}{text}")
     return lines
 
 
