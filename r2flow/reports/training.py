@@ -112,8 +112,8 @@ def finish(
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
         single = " (single batches: too few to compare)" if tenth == 1 and name.startswith("train/") else ""
-        change = f"{values[:tenth].mean():.4f} at the start, {values[-tenth:].mean():.4f} at step {steps[-1]}"
-        print(f"{name}: {change}{single}")
+        start = f"{values[:tenth].mean():.4f} at the start, " if len(values) > 1 else ""
+        print(f"{name}: {start}{values[-tenth:].mean():.4f} at step {steps[-1]}{single}")
     print(
         f"""
 checkpoint    {path}

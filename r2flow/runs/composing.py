@@ -220,7 +220,7 @@ def explain(error: Exception) -> str:
     missing = re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL)
     if missing:
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."
-    if "Could not find 'hydra/launcher/submitit" in text:
+    if "'hydra/launcher/submitit" in text:
         return "this launcher needs an extra of the project: python -m pip install -e '.[slurm]'"
     choice = re.search(r"Could not find '([^/']+)/([^']+)'", text)
     if choice:
