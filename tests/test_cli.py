@@ -113,7 +113,7 @@ def test_every_verb_has_help_with_an_example(r2flow, verb):
     [
         (MemoryError(), "has no room;"),
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"), "for 20.00 GiB more;"),
-        (RuntimeError("DefaultCPUAllocator: you tried to allocate 96 bytes.\nx"), "96 bytes more"),
+        (RuntimeError("can't allocate memory: you tried to allocate 96 bytes.\nx"), "96 bytes more"),
         (RuntimeError("not enough memory: you tried to allocate 96 bytes."), "for 96 bytes more;"),
     ],
 )
