@@ -56,11 +56,11 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # if the extra is not i
         save_checkpoint(self.checkpoint, save_directory / FILE)
 
     @classmethod
-    def _from_pretrained(
+    def _from_pretrained(  # type: ignore[override, unused-ignore]
         cls, *, model_id: str, device: str = "cpu", revision: Any, cache_dir: Any, force_download: bool,
         local_files_only: bool, token: Any, proxies: Any = None, resume_download: Any = None,
     ) -> "HubFlow":  # fmt: skip
-        where = {"revision": revision, "cache_dir": cache_dir, "force_download": force_download}
-        where |= {"local_files_only": local_files_only, "token": token}
-        path = Path(model_id, FILE) if Path(model_id).is_dir() else hf_hub_download(model_id, FILE, **where)
-        return cls(path, device)
+        if Path(model_id).is_dir():
+            return cls(Path(model_id, FILE), device)
+        where = {"revision": revision, "cache_dir": cache_dir, "force_download": force_download, "token": token}
+        return cls(hf_hub_download(model_id, FILE, local_files_only=local_files_only, **where), device)

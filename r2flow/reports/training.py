@@ -90,15 +90,12 @@ def finish(
     """
     from r2flow.reports.pictures import save_figure
 
-    run = Path(run)
-    curves = read_curves(run)
+    curves = read_curves(run := Path(run))
     if curves:
         save_figure(curves_figure([(run.name, curves)]), run / "loss.png")
     if not checkpoints_of(run):
-        if kept:
-            print("stopped before a checkpoint was kept: the same command starts it again")
-            return
-        print("no checkpoint was kept, as configured" + (f"; loss curve: {run / 'loss.png'}" if curves else ""))
+        configured = "no checkpoint was kept, as configured" + (f"; loss curve: {run / 'loss.png'}" if curves else "")
+        print("stopped before a checkpoint was kept: the same command starts it again" if kept else configured)
         return
     path = find_checkpoint(run)
     checkpoint = load_checkpoint(path, device)
