@@ -63,5 +63,5 @@ class Progress(RichProgressBar):
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         super().on_validation_end(trainer, pl_module)
-        if (loss := trainer.callback_metrics.get("val/loss")) is not None:
+        if not trainer.sanity_checking and (loss := trainer.callback_metrics.get("val/loss")) is not None:
             self._print(trainer, f"val/loss {float(loss):.4f}")

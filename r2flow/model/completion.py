@@ -98,9 +98,9 @@ def complete(
             sensor's range.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    if not isinstance(sampler, Sampler):
-        sampler = completing(generator, several=num > 1, **{"name": sampler, **changes})
-    plain = generator.sampler if sampler.completes else sampler  # for a scan without a known ray
+    named: dict[str, Any] = {"name": sampler, "several": num > 1, **changes}
+    how = sampler.changed(**changes) if isinstance(sampler, Sampler) else completing(generator, **named)
+    plain = generator.sampler if how.completes else how  # for a scan without a known ray
     images = torch.as_tensor(images).detach().float().cpu()
     if state is None:
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
@@ -116,7 +116,7 @@ def complete(
             numbers = [first + i + answer * ANSWER for answer in range(start, min(start + batch_size, num))]
             given = {name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()}
             parts.append(
-                draw(generator, numbers, seed, sampler if any_known else plain, given if any_known else None,
+                draw(generator, numbers, seed, how if any_known else plain, given if any_known else None,
                     precision=precision, progress=progress)
             )  # fmt: skip
         if not parts:

@@ -60,7 +60,6 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # if the extra is not i
         cls, *, model_id: str, device: str = "cpu", revision: Any, cache_dir: Any, force_download: bool,
         local_files_only: bool, token: Any, proxies: Any = None, resume_download: Any = None,
     ) -> "HubFlow":  # fmt: skip
-        if Path(model_id).is_dir():
-            return cls(Path(model_id, FILE), device)
         where = {"revision": revision, "cache_dir": cache_dir, "force_download": force_download, "token": token}
-        return cls(hf_hub_download(model_id, FILE, local_files_only=local_files_only, **where), device)
+        local = Path(model_id, FILE) if Path(model_id).is_dir() else None
+        return cls(local or hf_hub_download(model_id, FILE, local_files_only=local_files_only, **where), device)

@@ -120,9 +120,10 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
         bounds = [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
         if as_many:
             bounds.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
-        rank = "lowest, " if comparison is judged[0][1] else f"{value / judged[0][0]:.2f} times the lowest, "
-        text = f"{title} {value * factor:.3g} ({', '.join(bounds)}): {judgement}."
-        lines.append(f"{comparison.name}: {rank if equal and judged[0][0] > 0 else ''}{text}")
+        ratio = 0.0 if unbiased or judged[0][0] <= 0 else value / judged[0][0]
+        rank = "lowest, " if comparison is judged[0][1] else f"{ratio:.2f} times the lowest, " if ratio else ""
+        place = f"{comparison.name}: {rank if equal else ''}{title} {value * factor:.3g}"
+        lines.append(f"{place} ({', '.join(bounds)}): {judgement}.")
     return lines
 
 

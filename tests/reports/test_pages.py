@@ -64,6 +64,14 @@ def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
         assert words in text
 
 
+def test_a_page_that_fails_leaves_the_old_one(tmp_path):
+    write_page(page(), tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix not in (".png", ".pdf")}
+    with pytest.raises(TypeError):
+        write_page(page(rows=[{"solver": object()}]), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix not in (".png", ".pdf")} == before
+
+
 def test_a_figure_is_as_wide_as_its_title():
     figure = blank_figure(2, 2, "Each metric's first figure, generated scans and real ones")
     figure_pixels(figure)
