@@ -56,8 +56,7 @@ def trainer(callbacks: list[L.Callback], steps: int, tmp_path, **options) -> L.T
 def test_the_average_follows_the_reference_s_trace(shared, tmp_path):
     reference = torch.load(shared / "oracle" / "training.pt", weights_only=False)["ema"]
     values = [raw for _, raw, _, _ in reference["trace"]]
-    ema = EMA(reference["beta"], reference["update_every"], reference["update_after_step"])
-    watch = Watch(ema)
+    watch = Watch(ema := EMA(reference["beta"], reference["update_every"], reference["update_after_step"]))
     loader = torch.utils.data.DataLoader(range(len(values)))
     trainer([ema, watch], len(values), tmp_path).fit(Scripted(values), loader)
     assert len(watch.trace) == len(values)
@@ -68,8 +67,7 @@ def test_the_average_follows_the_reference_s_trace(shared, tmp_path):
 
 def test_validation_sees_the_average_and_leaves_the_weights(tmp_path):
     module = Scripted([1.0, 2.0, 3.0, 4.0])
-    ema = EMA(decay=0.5, every=1, warmup_steps=0)
-    watch = Watch(ema)
+    watch = Watch(ema := EMA(decay=0.5, every=1, warmup_steps=0))
     loader = torch.utils.data.DataLoader(range(4))
     trainer([ema, watch], 4, tmp_path, val_check_interval=4, check_val_every_n_epoch=None).fit(module, loader, loader)
     raw, average = watch.trace[-1]
@@ -80,11 +78,12 @@ def test_validation_sees_the_average_and_leaves_the_weights(tmp_path):
     assert module.weight.item() == pytest.approx(average)  # after fit the module is the model
 
 
-def test_a_look_at_the_average_leaves_what_the_module_counts():
-    module = Scripted([])
+def test_a_look_at_a_float32_average_of_bfloat16_leaves_what_the_module_counts():
+    module = Scripted([]).to(torch.bfloat16)
     module.register_buffer("count", torch.tensor(1))
     ema = EMA(every=10, warmup_steps=0)
     ema.setup(None, module, "fit")  # type: ignore[arg-type]
+    assert all(p.dtype == torch.float32 for p in ema._average_model.parameters())
     with torch.no_grad():
         module.weight.fill_(2.0)
     module.count += 1  # since the average was last updated

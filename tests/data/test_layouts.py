@@ -42,7 +42,7 @@ def test_any_folder(tmp_path: Path):
     write_scan(tmp_path / "b/1.bin", 0)
     write_scan(tmp_path / "a/deep/1.bin", 0)
     (tmp_path / "b/notes.txt").write_text("not a scan")
-    (tmp_path / "b/._1.bin").touch()  # as a Mac leaves beside a file
+    (tmp_path / "b/._1.bin").touch()  # as a Mac leaves next to a file
     drives = find_drives("folder", tmp_path)
     assert names(drives) == ["a/deep", "b"]
     assert [Path(path).name for path in drives[1].scans] == ["1.bin", "2.bin"]

@@ -407,7 +407,7 @@ def wide(numbered: Path, tmp_path: Path) -> Path:
 
 
 def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
-    """Every verb that reads scans is told by one option."""
+    """One option names them for every verb that reads scans."""
     columns, small = ("--columns", "time,z,y,x,intensity,_"), ("--size", "4x16", "--workers", 1)
     for out, given in (("one", (numbered,)), ("two", (wide, *columns))):
         code, _, error = r2flow("prepare", *given, *small, "--out", tmp_path / out)

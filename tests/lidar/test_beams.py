@@ -266,7 +266,7 @@ def test_sensors_of_one_s_own_are_judged_by_their_beams():
     assert other_sensor([scan(mine, RING_AFTER_RING)], mine) is None
     assert other_sensor([scan(SENSORS["vlp16"], RING_AFTER_RING)], mine) is not None
     few = scan(SENSORS["pandar64"], RING_AFTER_RING).xyz[:900]
-    assert other_sensor([Points(few)], SENSORS["vlp16"]) is None  # a few returns tell nothing
+    assert other_sensor([Points(few)], SENSORS["vlp16"]) is None  # a few returns say nothing
 
 
 def without_beams(pattern: str) -> Points:
