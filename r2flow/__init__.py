@@ -48,7 +48,7 @@ def read(
     Args:
         path: A scan file, or a range image (.npy).
         sensor: Sensor of the image, or its name or YAML file. Default: the sensor in the manifest of a folder that
-            r2flow wrote, else hdl64e.
+            r2flow wrote, else the built-in sensor with the file's beams, else hdl64e.
         reflectance_scale: Value of full reflectance in the file. Default: the sensor's, else 1, 255 or the largest
             value of the file, whichever is the first that no value exceeds.
 

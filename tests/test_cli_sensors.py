@@ -4,8 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
+import r2flow as package
+from r2flow.data.opening import open_scans
+from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import read_sensor
@@ -53,22 +57,30 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     assert np.load(image).shape == (2, 4, 64)
 
 
-def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_path: Path):
+def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, tmp_path: Path):
     given, out = write_scans(tmp_path / "scans", SENSORS["pandar64"], 2, 1), tmp_path / "out"
     for verb in (
-        ("show", given),
+        ("show", given, "--format", "npy"),
         ("prepare", given, "--workers", 1),
         ("evaluate", given, given / "000000.bin", "--metrics", "jsd", "--workers", 0),
     ):
-        code, _, error = r2flow(*verb, "--out", out / verb[0])
-        warnings = [line for line in error.splitlines() if line.startswith("WARNING")]
-        assert code == 0, error
-        assert len(warnings) == (2 if verb[0] == "evaluate" else 1), error  # one for each of its two sets
-        assert "do not look like those of sensor 'hdl64e', which sees +3.0 to -25.0 degrees" in warnings[0]
-        assert "64 beams from +14.9 to -24.9 degrees" in warnings[0]
-        assert "sensor=pandar64 in training, --sensor pandar64 in verbs" in warnings[0]
-    code, _, error = r2flow("show", tmp_path / "scans", "--sensor", "pandar64", "--out", out)
-    assert (code, error) == (0, "")
+        for sensor in ((), ("--sensor", "hdl64e")):
+            code, _, error = r2flow(*verb, *sensor, "--out", out / (verb[0] + "".join(sensor)))
+            warnings = [line for line in error.splitlines() if line.startswith("WARNING")]
+            assert code == 0, error
+            assert len(warnings) == 1 + (verb[0] == "evaluate" and sensor != ()), error  # one for each set
+            assert "64 beams from +14.9 to -24.9 degrees" in warnings[0]
+            assert ("sensor=pandar64" if sensor else "read as pandar64, not hdl64e") in warnings[0]
+    assert read_manifest(out / "prepare")["recipe"]["reading"]["sensor"]["name"] == "pandar64"
+    images = [np.load(out / f"show{forced}" / "000000.npy") for forced in ("", "--sensorhdl64e")]
+    assert (images[0][0] > 0).sum() > 1.1 * (images[1][0] > 0).sum()  # hdl64e sees 92 % of the returns
+    assert r2flow("show", given, "--sensor", "pandar64", "--out", out)[::2] == (0, "")
+    detected = package.read(given / "000000.bin")
+    assert torch.equal(detected, package.read(given / "000000.bin", "pandar64"))
+    assert torch.equal(detected, open_scans(given / "000000.bin").source.batch([0])[0])
+    assert open_scans(given, sensor="vlp16", size=(4, 64)).sensor.shape == (4, 64)
+    with pytest.raises(InputError, match="is a folder"):
+        package.read(given)
 
 
 def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, tmp_path: Path):

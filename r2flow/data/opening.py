@@ -23,7 +23,7 @@ from r2flow.data.options import FOLDER, PREPARED, SIMULATED, SourceOptions
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, warn_of_other_sensor
+from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, mismatch_of, warn_of_other_sensor
 from r2flow.errors import InputError, check
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensor_files import named_sensor
@@ -91,20 +91,22 @@ def open_scans(
     split: str | None = None,
     num: int | None = None,
     own_size: bool = False,
+    sensor: Sensor | str | None = None,
+    size: tuple[int, int] | None = None,
 ) -> ScanSet:
     """Open the scans of a name. Scans are read on access, except those that decide whether the set has reflectance.
 
     Args:
         spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`, `NAME:ROOT` with a
             name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run folder (its samples).
-        reading: How scans become images; None: `reading_for([spec])`.
+        reading: How scans become images; None: `reading_for([spec], sensor=sensor, size=size)`.
         split: A part of the data set's standard split.
         num: Maximum number of scans, chosen by a fixed shuffle; the number of simulated scenes.
         own_size: For pictures: take the size of the range image instead of the sensor's, and do not compare beams.
     """
     label = str(spec)
     options, file = parse(label)
-    reading = reading or reading_for([label])
+    reading = reading or reading_for([label], sensor=sensor, size=size)
     if file is None:
         columns = None if reading.columns is None else list(reading.columns)
         options = replace(options, split=split, scenes=num or SCENES, reading={"columns": columns})
@@ -198,6 +200,8 @@ def reading_for(
 ) -> Reading:
     """How scans become images: arguments first, then the model's training scans, the scans' manifest, the defaults.
 
+    The default sensor is hdl64e, or the built-in sensor whose beams plain scan files have.
+
     Args:
         scans: Names as for `open_scans`; None is skipped.
         model: The model that the scans are for; another sensor or size than the model's is refused.
@@ -207,6 +211,8 @@ def reading_for(
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
     kind = SOURCES[parse(specs[0])[0].name if specs else FOLDER]
     reading = _reading_of(model) if model else stored or Reading(SENSORS[kind.sensor])
+    if specs and not (model or stored or sensor):
+        sensor = _detected(specs[0], reading if columns is None else replace(reading, columns=tuple(columns)))
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and not chosen.same_image(model.sensor):
         expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
@@ -225,6 +231,20 @@ def reading_for(
     return replace(reading, **{key: value for key, value in requested.items() if value is not None})  # type: ignore[arg-type]
 
 
+def _detected(spec: str, reading: Reading) -> str | None:
+    """The built-in sensor of plain scan files whose beams are not those of `reading.sensor`."""
+    options, file = parse(spec)
+    if options.name != FOLDER:
+        return None
+    drives = [] if file else SOURCES[FOLDER].find_drives(options)
+    paths = [file] if file else [path for drive in drives for path in drive.scans]
+    mismatch = mismatch_of(paths, reading, options.folder)
+    if mismatch and mismatch.name:
+        name, usual = mismatch.name, reading.sensor.name
+        log.warning("%s: read as %s, not %s: %s; --sensor names another", spec, name, usual, mismatch.seen)
+    return mismatch and mismatch.name
+
+
 def _reading_of(model: Model) -> Reading:
     """How a model's training scans became images; for a mixture, the fields on which all parts agree."""
     data = model.config.get("data", {})
@@ -239,6 +259,9 @@ def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale
     check(
         reflectance_scale is None or 0 < reflectance_scale < math.inf,
         f"reflectance_scale must be a positive number, found {reflectance_scale}.",
+    )
+    check(
+        not Path(path).is_dir(), f"{path} is a folder, and read takes a file; r2flow.data.opening.open_scans opens it."
     )
     reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale)
     if reflectance_scale is None:

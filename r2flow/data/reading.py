@@ -131,9 +131,8 @@ def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, 
 
 def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
-        f"{path} has no reflectance and the config, the model or the first scan of its set has it. In training give "
-        "encoding.reflectance=false for range alone, and no stage.init that has reflectance; in measuring give metrics "
-        "of range, or only scans that have it."
+        f"{path} has no reflectance, and other scans, a metric or the model (such as stage.init=street) need it. To "
+        "train on range alone give encoding.reflectance=false and no such stage.init; to measure give metrics of range."
     )
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.errors import InputError
-from r2flow.lidar.beams import other_sensor
+from r2flow.lidar.beams import Doubt, other_sensor
 from r2flow.lidar.scan_files import read_points, read_range_image
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import MANIFEST
@@ -101,19 +101,22 @@ def made_here(root: str | Path) -> bool:
     return any((place / MANIFEST).is_file() for place in places)
 
 
-def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:
-    """Warn if scan files do not match a sensor, and name the sensor that matches (`other_sensor`).
+def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> Doubt | None:
+    """The mismatch of a few scan files and a sensor (`other_sensor`).
 
     Only for plain scan files: files that r2flow wrote store their sensor, and range images have no beams. Unreadable
     files are reported when they are read as scans.
     """
-    if made_here(root):
-        return
-    scans, sensor = [], reading.sensor
-    for number in spread(len(paths), LOOKED_AT):
+    scans = []
+    for number in spread(len(paths), LOOKED_AT if not made_here(root) else 0):
         with suppress(InputError):
             scans.append(read_points(paths[number], reading.columns))
-    mismatch = other_sensor(scans, sensor) if scans else None
+    return other_sensor(scans, reading.sensor) if scans else None
+
+
+def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:
+    """Warn if scan files do not match a sensor (`mismatch_of`), and name the sensor that matches."""
+    mismatch, sensor = mismatch_of(paths, reading, root), reading.sensor
     if mismatch is None:
         return
     seen, name, hopeless = mismatch
