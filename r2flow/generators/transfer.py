@@ -28,6 +28,7 @@ FINEST = 1e-3  # smallest Laplace scale on log r
 FREE, SHIFT = 0.3, 0.02  # log r per unit of network output: of the free candidate, of a neighbour
 NEVER = -1e4  # logit of a missing candidate
 REFLECTANCE = 0.265  # mean reflectance of returns to which scans of other sensors are scaled: of simulated scans
+TOGETHER = math.radians(1.5)  # correlation length of drawn answers: best panel on scans of KITTI raw and object
 WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0}  # loss weights
 
 
@@ -174,12 +175,14 @@ class TransferFlow(Flow):
         return ((x_1 - x) / (1 - expand_time(t, x)).clamp(min=LAST)).to(x)
 
     def transported(self, x_0: Tensor, condition: Condition) -> Tensor:
-        """x_1 in one evaluation, by the monotone map of each ray's noise e to its density: log r = F^-1(Phi(e)).
+        """x_1 in one evaluation, by the monotone map of a normal number z per ray to its density: log r = F^-1(Phi(z)).
 
-        This is the optimal transport between the two in one dimension. Rays are independent of each other.
+        This is the optimal transport between the two in one dimension. z is the noise, smoothed so that neighbouring
+        rays agree on an edge or a gap (a Gaussian copula).
         """
         answers = self._answered(torch.zeros((), device=x_0.device), x_0, condition)
-        u = torch.special.ndtr((x_0 - condition["start"])[:, :1].float() / max(self.sigma, 1e-6))
+        e = (x_0 - condition["start"])[:, :1].float() / max(self.sigma, 1e-6)
+        u = torch.special.ndtr(smoothed(e, condition[KNOWN][:, :1] < 1, self.elevations))
         p = answers.returns.sigmoid()
         log_r = answers.quantile((u / p).clamp(1e-6, 1 - 1e-6))
         strength = answers.strengths.gather(1, answers.likeliest(log_r))
@@ -261,6 +264,32 @@ class TransferFlow(Flow):
             errors = (answers.strengths - metres[:, 1:2]).abs()
             losses["reflectance"] = _mean_over((answers.logits.detach().exp() * errors).sum(1, keepdim=True), mask)
         return losses
+
+
+def smoothed(e: Tensor, hidden: Tensor, elevations: Tensor) -> Tensor:
+    """Standard normal numbers of hidden rays, correlated over `TOGETHER` in both angles.
+
+    z = sum_k w_k e_k / sqrt(sum_k w_k^2) over hidden rays k, with w_k = exp(-d^2 / 2) for d the angle over `TOGETHER`.
+
+    Args:
+        e: Independent standard normal numbers, (B, 1, H, W).
+        hidden: Rays to smooth over, (B, 1, H, W) bool; others get no meaningful number.
+        elevations: Of the rows, in radians, (H,).
+    """
+    rows, columns = e.shape[2:]
+    steps = (abs(float(elevations[0] - elevations[-1])) / max(rows - 1, 1), 2 * math.pi / columns)
+    weights = []
+    for step in steps:
+        reach = int(3 * TOGETHER / max(step, 1e-3)) + 1
+        weights.append(torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=e.device) * step / TOGETHER) ** 2))
+
+    def convolved(x: Tensor, down: Tensor, along: Tensor) -> Tensor:
+        x = F.conv2d(x, down[None, None, :, None], padding=(len(down) // 2, 0))
+        side = len(along) // 2
+        return F.conv2d(F.pad(x, (side, side, 0, 0), "circular"), along[None, None, None])
+
+    variance = convolved(hidden.to(e), *(w**2 for w in weights))
+    return convolved(e * hidden, *weights) / variance.clamp(min=1e-12).sqrt()
 
 
 def gain_of(space: ModelSpace, image: Tensor, known: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from r2flow import noise
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.errors import InputError
 from r2flow.generators import TransferFlow, build_generator, condition_of
-from r2flow.generators.transfer import Answers
+from r2flow.generators.transfer import TOGETHER, Answers, smoothed
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.completion import completing
@@ -162,6 +162,23 @@ def test_transported_answers_return_as_often_as_expected_and_keep_what_is_known(
     off = (share - seen[0].returns.sigmoid()[0, 0])[hidden]
     assert off.abs().max() < 0.15  # six standard errors of 400 draws
     assert off.mean().abs() < 0.01
+
+
+def test_smoothed_noise_is_standard_normal_and_agrees_within_the_correlation_length():
+    elevations = torch.linspace(0.05, -0.05, 5)
+    hidden = torch.rand(1, 1, 5, 64, generator=torch.Generator().manual_seed(0)) < 0.7
+    units = torch.eye(5 * 64).reshape(-1, 1, 5, 64)  # a linear map: these are its columns
+    matrix = smoothed(units, hidden.expand(len(units), -1, -1, -1), elevations).reshape(len(units), -1).T.double()
+    covariance = matrix @ matrix.T
+    rays = torch.cartesian_prod(torch.arange(5), torch.arange(64))[hidden.flatten()]
+    covariance = covariance[hidden.flatten()][:, hidden.flatten()]
+    assert covariance.diagonal().allclose(torch.ones(len(rays), dtype=torch.float64), atol=1e-5)
+    down = (rays[:, None, 0] - rays[:, 0]).abs() * 0.025
+    along = (rays[:, None, 1] - rays[:, 1]).abs()
+    along = torch.minimum(along, 64 - along) * 2 * math.pi / 64  # ends meet
+    distance = (down**2 + along**2).sqrt() / TOGETHER
+    assert covariance[distance > 11].abs().max() < 1e-6
+    assert covariance[(distance > 0) & (distance < 1)].min() > 0.6  # exp(-1 / 4) without rays between that are known
 
 
 def test_several_answers_are_drawn_by_transport(flow):
