@@ -117,7 +117,9 @@ def _draw_row(
     figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tensor, strips_of: int = 0, error: Any = None
 ) -> list[Any]:
     """Draw one scan in a row of a sheet with space for `strips_of` channels; return the axes of its channels."""
-    cells = grid[row, 0].subgridspec(max(strips_of, len(image)) + (error is not None), 1, hspace=0.25)
+    channels = max(strips_of, len(image))
+    places = [grid[row, column].subgridspec(channels + (error is not None), 1, hspace=0.25) for column in range(3)]
+    cells, *views = places
     strips = [figure.add_subplot(cells[channel]) for channel in range(len(image))]
     for axes, draw in zip(strips, (draw_range, draw_reflectance), strict=False):
         draw(axes, image, label=row == 0)
@@ -125,8 +127,8 @@ def _draw_row(
         scale, title = colormaps["YlOrRd"].with_extremes(bad="0.8"), "error of the range, m (grey: not compared)"
         _show(figure.add_subplot(cells[-1]), error, title, scale, {0: 0, 1: 1, 2: 2})
     xyz, _ = image_to_points(image, rays)
-    draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, label=row == 0)
-    draw_perspective(figure.add_subplot(grid[row, 2]), xyz, label=row == 0)
+    for view, draw in zip(views, (draw_birds_eye, draw_perspective), strict=True):
+        draw(figure.add_subplot(view[:channels, 0]), xyz, label=row == 0)  # of equal size in all rows
     return strips
 
 
