@@ -127,8 +127,8 @@ def _draw_row(
         scale, title = colormaps["YlOrRd"].with_extremes(bad="0.8"), "error of the range, m (grey: not compared)"
         _show(figure.add_subplot(cells[-1]), error, title, scale, {0: 0, 1: 1, 2: 2})
     xyz, _ = image_to_points(image, rays)
-    for view, draw in zip(views, (draw_birds_eye, draw_perspective), strict=True):
-        draw(figure.add_subplot(view[:channels, 0]), xyz, label=row == 0)  # of equal size in all rows
+    for view, draw_points in zip(views, (draw_birds_eye, draw_perspective), strict=True):
+        draw_points(figure.add_subplot(view[:channels, 0]), xyz, label=row == 0)  # of equal size in all rows
     return strips
 
 
