@@ -28,7 +28,7 @@ def main() -> None:
     torch.set_num_threads(given.threads)
     loaded = r2flow.load(given.flow)
     flow = loaded.generator
-    sampler = flow.choose(flow.plain, steps=given.steps)
+    sampler = flow.choose(steps=given.steps)
     noise = Draws(0, [0]).start(flow.noise_shape)
 
     def drawn(generator: torch.nn.Module) -> Callable[[], object]:

@@ -48,13 +48,11 @@ class Generator(nn.Module):
         sampler: Default sampler.
         few: Sampler for fewer steps than `sampler.steps`; None: `sampler`.
         fixed: True for a distilled model: only `sampler` is valid.
-        plain: Name of the sampler for comparisons at equal steps; None: `sampler`.
         draws: Whether it generates scans from noise; False for an autoencoder, which is never sampled.
         told: Whether it takes a condition of `r2flow.generators.condition_of`.
         goes_on_as: Generator class used when fine-tuned with a velocity loss; None: same class.
     """
 
-    plain: ClassVar[str | None] = None
     draws: ClassVar[bool] = True
     told: ClassVar[bool] = False
     goes_on_as: ClassVar[str | None] = None

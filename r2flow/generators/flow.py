@@ -26,7 +26,6 @@ class Flow(Generator):
         completers: Samplers that complete scans, with their default settings; the first one is the default.
     """
 
-    plain = "euler"
     completers: ClassVar[tuple[Sampler, ...]] = (MMPS(),)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:

@@ -20,7 +20,6 @@ class FlowMap(RectifiedFlow):
 
     second_time: ClassVar[bool] = True
     goes_on_as = "rectified_flow"  # a velocity loss would leave the jumps to those of the old flow
-    plain = "jump"
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)

@@ -40,7 +40,6 @@ class Diffusion(NetworkFlow):
         clip: Clamp expected data to [-clip, clip] in sampling; null: no clamping.
     """
 
-    plain = "ddpm"
     completers = MMPS(), Repaint(steps=32, grid="uniform", repeats=16)  # Repaint as in the published script
 
     def __init__(
