@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from r2flow.errors import InputError
-from r2flow.flow.path import expand_time
+from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.solvers.solution import selected
 from r2flow.flow.times import TIMES
@@ -43,11 +43,6 @@ class Paths:
 
     def __init__(self, times: Tensor, states: Tensor) -> None:
         self.times, self.states = times.double(), states
-
-    @property
-    def chord(self) -> "Paths":
-        """The straight lines between the ends."""
-        return Paths(self.times[[0, -1]], self.states[:, [0, -1]])
 
     def at(self, t: Tensor) -> Tensor:
         """x_t, (B, ...), at times t, (B,)."""
@@ -167,8 +162,7 @@ def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor
     x_t lies on the straight line from x_0 to x_1, v = x_1 - x_0; the target has no gradient (Luo et al. 2025, SoFlow;
     Zhang et al. 2025, alpha-Flow). rho = 1 is k-TD's regression; rho -> 0 gives MeanFlow.
     """
-    chord = paths.chord
-    x_t, v = chord.at(t), chord.velocity(t)
+    x_t, v = interpolate(paths.states[:, 0], paths.states[:, -1], t)
     target, learned = v.clone(), rho < 1
     if bool(learned.any()):
         t, s, rho, v = t[learned], s[learned], rho[learned], v[learned]
