@@ -17,7 +17,7 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.registry import Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid, Steps
-from r2flow.samplers.stochastic import back, sde
+from r2flow.samplers.stochastic import SDE, back, sde
 
 GROWN = 10.0  # largest growth of |y - A x_1hat|^2 in conjugate gradients: a larger residual has diverged
 EARLIEST = 0.1  # earliest time of the Jacobian in `MMPS`: Cov(x_1 | x_t) divides it by t
@@ -145,12 +145,10 @@ class MMPS(Posterior):
         churn: Noise replacement, as in `SDE`.
     """
 
+    draws = SDE.draws
+
     products: Count = 2
     churn: NonNegative = 1.0
-
-    @property
-    def draws(self) -> bool:  # type: ignore[override]
-        return self.churn > 0
 
     def evaluations(self, generator: Any = None) -> int:
         """Network evaluations per scan; a vector-Jacobian product counts as one."""

@@ -12,7 +12,7 @@ from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Bound, Count, construct
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
-from r2flow.systems.diffusion.generator import Share
+from r2flow.systems.diffusion.generator import DDIM, Share
 from r2flow.systems.diffusion.log_snr import square_root_linear
 from r2flow.systems.diffusion.objectives import PREDICTIONS
 from r2flow.systems.diffusion.sampling import walk
@@ -106,14 +106,11 @@ class LatentDDIM(Sampler):
     """
 
     paired: ClassVar[bool] = False
+    draws = DDIM.draws
     needs: ClassVar[str] = "unet"
 
     steps: Count = 50
     eta: Share = 1.0
-
-    @property
-    def draws(self) -> bool:  # type: ignore[override]
-        return self.eta > 0
 
     def evaluations(self, generator: Any) -> int:
         return len(some_of(len(generator.log_snr), self.steps))
