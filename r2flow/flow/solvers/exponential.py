@@ -19,7 +19,7 @@ from torch import Tensor
 from r2flow.flow.solvers.adaptive import advance, attainable
 from r2flow.flow.solvers.batched import norms, powered, unpowered
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
-from r2flow.flow.solvers.solution import Evaluations, Limits, Solution
+from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Spent
 
 LARGEST = 40  # dimension of a Krylov space; if that is not enough, the step is halved
 KRYLOV = 0.05  # error of a function of J, in tolerances
@@ -63,10 +63,6 @@ class ExponentialMethod:
 
 exprb43 = ExponentialMethod()
 automatic = ExponentialMethod(start=dopri5)
-
-
-class _Spent(Exception):
-    """The scene has used up its budget of evaluations."""
 
 
 class _Scene:
@@ -120,17 +116,16 @@ class _Scene:
                     return False
                 self.accepted += 1
                 self.u, self.t, f, h = end, t, following, h * factor
-        except _Spent:
+        except Spent:
             return False
         return self.t == self.t_end
 
     def velocity(self, t: float, u: Tensor) -> Tensor:
         """v(t, u) as a vector."""
-        if self.v.counts[self.v.scenes[0]] >= self.limits.max_evaluations:
-            raise _Spent
         low, high = sorted((self.t_0, self.t_end))
         with self._of_network:
-            return self.v(u.new_full((1,), min(max(t, low), high)), u.view(1, *self.shape)).flatten()
+            time = u.new_full((1,), min(max(t, low), high))
+            return self.v.of_one(time, u.view(1, *self.shape), self.limits).flatten()
 
     def product(self, f: Tensor, direction: Tensor) -> Tensor:
         """J times a vector, by a difference of v forward in time, so that v is not evaluated outside the interval."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers.adaptive import attainable
-from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, finite
+from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Spent, finite
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ class TorchDiffEqMethod:
         # From the state's type, since the velocity has not been evaluated yet.
         tolerance = attainable(limits, v.coarsest(x)) if self.adapts else limits.tolerance
         options = {} if self.adapts else {"grid_constructor": lambda field, start, span: grid}
-        scenes = [_Scene(v, start, limits.max_evaluations, self.adapts) for start in x.split(1)]
+        scenes = [_Scene(v, start, limits, self.adapts) for start in x.split(1)]
         converged = finite(x).cpu().numpy()
         for i in converged.nonzero()[0]:
             v.only(np.array([i]))
@@ -68,7 +68,7 @@ class TorchDiffEqMethod:
                 )[-1]  # fmt: skip
                 converged[i] = bool(end.isfinite().all())
                 scenes[i].last = end if converged[i] else scenes[i].last
-            except (_Spent, AssertionError) as error:  # it asserts on underflowing steps, non-finite values
+            except (Spent, AssertionError) as error:  # it asserts on underflowing steps, non-finite values
                 converged[i] = False
                 log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, self.name, i, error)
         v.only(np.arange(len(x)))
@@ -79,24 +79,16 @@ class TorchDiffEqMethod:
         )  # fmt: skip
 
 
-class _Spent(Exception):
-    """A scene has used up its budget of evaluations."""
-
-
 class _Scene:
     """One scene's velocity, and the steps that torchdiffeq reports."""
 
-    def __init__(self, v: Evaluations, x: Tensor, max_evaluations: int, adapts: bool) -> None:
-        self._v, self._left = v, max_evaluations
-        self.last, self.steps, self.rejected = x, 0, 0
+    def __init__(self, v: Evaluations, x: Tensor, limits: Limits, adapts: bool) -> None:
+        self._v, self._limits, self.last, self.steps, self.rejected = v, limits, x, 0, 0
         if adapts:  # torchdiffeq warns about callbacks that a method does not call
             self.callback_reject_step = self._reject
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        if self._left <= 0:
-            raise _Spent("its evaluations are used up")
-        self._left -= 1
-        return self._v(t, x)
+        return self._v.of_one(t, x, self._limits)
 
     def callback_step(self, t: Tensor, x: Tensor, h: Tensor) -> None:
         """Called before each step."""

@@ -80,6 +80,10 @@ class Limits(NamedTuple):
     knots: int = 0
 
 
+class Spent(Exception):
+    """A scene has used up its evaluations."""
+
+
 class Evaluations:
     """The velocity as called by solvers: counts evaluations per scene and returns v in the state's type.
 
@@ -110,6 +114,12 @@ class Evaluations:
         if self._progress is not None:
             self._progress()
         return v.to(x.dtype, copy=True)  # a runtime may write each output into the same buffer
+
+    def of_one(self, t: Tensor, x: Tensor, limits: Limits) -> Tensor:
+        """v of a single scene; raises `Spent` if it has had `max_evaluations`."""
+        if self.counts[self.scenes[0]] >= limits.max_evaluations:
+            raise Spent("its evaluations are used up")
+        return self(t, x)
 
     def some(self, places: np.ndarray, t: Tensor, x: Tensor) -> Tensor:
         """v of some scenes of the current state."""
