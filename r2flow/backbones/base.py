@@ -53,6 +53,7 @@ class Backbone(ExactBuffers):
     takes_second_time: ClassVar[bool] = False
     croppable: ClassVar[bool] = False
     any_size: ClassVar[bool] = False
+    learns_directions: ClassVar[bool] = False
     coords: Tensor
     interval_embedding: nn.Module
 
@@ -128,11 +129,6 @@ class Backbone(ExactBuffers):
 
     def follow_rays(self) -> None:
         """Recompute buffers that derive from `coords`."""
-
-    @property
-    def learns_directions(self) -> bool:
-        """Whether the network learns a vector per direction."""
-        return False
 
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
         """The backbone for a part of its image, (B, C, len(rows), len(columns)), with shared parameters.

@@ -150,7 +150,7 @@ class HDiT(Backbone):
             self.spatial_pe.follow(mean_rays(self.coords, self.patch))
 
     @property
-    def learns_directions(self) -> bool:
+    def learns_directions(self) -> bool:  # type: ignore[override]
         return isinstance(self.spatial_pe, LearnablePosition)
 
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:

@@ -132,5 +132,5 @@ class Pyramid(Backbone):
         return super().second_time_names() | {f"inner.{name}" for name in self.inner.second_time_names()}
 
     @property
-    def learns_directions(self) -> bool:
+    def learns_directions(self) -> bool:  # type: ignore[override]
         return self.inner.learns_directions

@@ -50,11 +50,13 @@ class Generator(nn.Module):
         fixed: True for a distilled model: only `sampler` is valid.
         draws: Whether it generates scans from noise; False for an autoencoder, which is never sampled.
         told: Whether it takes a condition of `r2flow.generators.condition_of`.
+        learns_directions: Whether it learns one vector per direction; scans must then not be rotated in training.
         goes_on_as: Generator class used when fine-tuned with a velocity loss; None: same class.
     """
 
     draws: ClassVar[bool] = True
     told: ClassVar[bool] = False
+    learns_directions: ClassVar[bool] = False
     goes_on_as: ClassVar[str | None] = None
 
     def __init__(self, space: ModelSpace, noise_shape: tuple[int, ...] | None = None) -> None:
@@ -152,11 +154,6 @@ class Generator(nn.Module):
                 f"the weights of a {type(parent).__name__} do not fit this {type(self).__name__}: give the "
                 "generator and the options that it was trained with, or leave stage.init out."
             ) from None
-
-    @property
-    def learns_directions(self) -> bool:
-        """Whether it learns one vector per direction; scans must then not be rotated in training."""
-        return False
 
     @property
     def device(self) -> torch.device:

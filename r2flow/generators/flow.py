@@ -121,7 +121,7 @@ class NetworkFlow(Flow):
         return self.backbone.unit
 
     @property
-    def learns_directions(self) -> bool:
+    def learns_directions(self) -> bool:  # type: ignore[override]
         return self.backbone.learns_directions
 
     def part(self, region: Region) -> Self:
