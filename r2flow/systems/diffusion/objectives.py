@@ -1,4 +1,4 @@
-"""Predictions of diffusion networks, and their losses."""
+"""Predictions of diffusion networks, and their errors."""
 
 from collections.abc import Callable
 
@@ -69,20 +69,3 @@ ERRORS: Registry[Error] = Registry(
     l1=lambda y, target: F.l1_loss(y, target, reduction="none"),
     huber=lambda y, target: F.smooth_l1_loss(y, target, reduction="none"),
 )
-
-
-def mean_errors(errors: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean over each sample's elements, (B, ...) to (B,), optionally where a 0/1 mask is 1; 0 for an empty mask."""
-    if mask is None:
-        return errors.flatten(1).mean(1)
-    return (errors * mask).flatten(1).sum(1) / mask.expand_as(errors).flatten(1).sum(1).clamp(min=1)
-
-
-def weighted_mean(errors: Tensor, weights: Tensor, paired: bool = True) -> Tensor:
-    """Mean of weights times errors, (B,) each.
-
-    Args:
-        paired: False: mean of errors times mean of weights, as in the published code of R2DM, which weights samples
-            by the mean over the batch.
-    """
-    return (errors * weights).mean() if paired else errors.mean() * weights.mean()

@@ -8,7 +8,7 @@ from r2flow.generators import Generator
 from r2flow.registry import Positive
 from r2flow.stages.base import Batch, SingleLoss
 from r2flow.systems.diffusion.generator import Diffusion
-from r2flow.systems.diffusion.objectives import ERRORS, mean_errors, weighted_mean
+from r2flow.systems.diffusion.objectives import ERRORS
 from r2flow.systems.diffusion.sampling import noised
 
 
@@ -20,8 +20,7 @@ class LearnDiffusion(SingleLoss):
         loss: Name in `r2flow.systems.diffusion.objectives.ERRORS`.
         min_snr: gamma of the weight min(SNR, gamma) on the error of expected data; None: the SNR, which weights the
             noise's error equally.
-        paired: Whether a sample's error has its own weight; False as published, see
-            `r2flow.systems.diffusion.objectives.weighted_mean`.
+        paired: Whether a sample's error has its own weight; False: the batch's mean, as in R2DM's published code.
         options: Options of `Stage`.
     """
 
@@ -45,5 +44,6 @@ class LearnDiffusion(SingleLoss):
         diffusion, x, eps = self.generator, batch["x_1"], batch["x_0"]
         log_snr = diffusion.schedule(u)
         y = diffusion.predict(noised(x, log_snr, eps), log_snr)
-        errors = mean_errors(self.error(y.float(), diffusion.prediction.target(x, eps, log_snr)))
-        return weighted_mean(errors, diffusion.prediction.weight(log_snr, self.min_snr), self.paired)
+        errors = self.error(y.float(), diffusion.prediction.target(x, eps, log_snr)).flatten(1).mean(1)
+        weights = diffusion.prediction.weight(log_snr, self.min_snr)
+        return (errors * weights).mean() if self.paired else errors.mean() * weights.mean()
