@@ -13,7 +13,7 @@ from r2flow.generators.base import Generator, parts_of
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Count, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
-from r2flow.systems.score.langevin import annealed_langevin, noise_levels, toward
+from r2flow.systems.score.langevin import annealed_langevin, noise_levels
 from r2flow.systems.score.refinenet import RefineNet
 
 
@@ -73,10 +73,13 @@ class Langevin(Sampler):
         return len(generator.network.sigmas) * self.steps + 1
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        x, pull = torch.special.ndtr(noise), None
-        if condition is not None:
-            image, known = parts_of(condition, x)
-            pull = toward((image + 1) / 2, known, generator.pull)
+        x = torch.special.ndtr(noise)
+        image, known = parts_of(condition, x)
+
+        def pull(x: Tensor) -> Tensor:
+            """Likelihood gradient of the known pixels (Zyrianov et al. 2022, eq. 8)."""
+            return generator.pull * known * ((image + 1) / 2 - x)
+
         assert draws is not None
         network = generator.network
         states = annealed_langevin(network, x, network.sigmas, draws, generator.rate, self.steps, pull)

@@ -51,7 +51,7 @@ def annealed_langevin(
     noise: Callable[[int], Tensor],
     rate: float = 6.2e-6,
     steps: int = 5,
-    pull: Callable[[Tensor], Tensor] | None = None,
+    pull: Callable[[Tensor], Tensor] = torch.zeros_like,
 ) -> Iterator[Tensor]:
     """Yield the states of annealed Langevin dynamics (2019, algorithm 1) after each evaluation of the score.
 
@@ -63,24 +63,16 @@ def annealed_langevin(
         x: Initial state, (B, C, H, W).
         sigmas: Noise levels, (L,).
         noise: z of step k = 1, 2, ..., counted over all levels, of x's shape.
-        pull: Likelihood gradient as a function of the state before a step, such as `toward`, added in every step.
-            As in LiDARGen, the last denoising adds the previous pull again, and the final state is pulled once
-            more.
+        pull: Likelihood gradient as a function of the state before a step, added in every step. As in LiDARGen, the
+            last denoising adds the previous pull again, and the final state is pulled once more.
     """
-    number, pulled = 0, torch.zeros_like(x)
+    number = 0
     for level, size in enumerate(step_sizes(sigmas, rate).tolist()):
         labels = torch.full((len(x),), level, device=x.device)
         for _ in range(steps):
             number += 1
-            if pull is not None:
-                pulled = pull(x)
+            pulled = pull(x)
             x = x + size * score(x, labels) + math.sqrt(2 * size) * noise(number) + pulled
             yield x
     x = x + sigmas[-1].square() * score(x, labels) + pulled
-    yield x if pull is None else x + pull(x)
-
-
-def toward(image: Tensor, mask: Tensor, strength: float = 0.1) -> Callable[[Tensor], Tensor]:
-    """strength mask (image - x): pulls the known pixels to their values (Zyrianov et al. 2022, "Learning to generate
-    realistic LiDAR point clouds", eq. 8); their 4-beam scans know every 16th row."""
-    return lambda x: strength * mask * (image - x)
+    yield x + pull(x)
