@@ -78,7 +78,7 @@ class Comparer:
     ) -> None:
         self.metrics, self.work, self.rules, self.draws, self.cache = metrics, work, rules, draws, cache
         self.folder = folder
-        protocols = {name: metric.protocol.asdict() for name, metric in metrics.items()}
+        protocols = {name: asdict(metric.protocol) for name, metric in metrics.items()}
         self.recipe = {"metrics": protocols, "bootstrap": draws, "protocol": rules.name, "device": device}
         self._statistics: dict[int, dict[str, Statistics]] = {}
 

@@ -10,7 +10,7 @@ non-parametric test to detect data-copying in generative models".
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import torch
@@ -127,7 +127,7 @@ def copies_result(judged: Nearest, real: Nearest, training: int) -> MetricResult
         )
     settings = {"cells": list(CELLS), "turned": True, "mirrored": True, "training scans": training}
     sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(judged.numbers)}
-    protocol = {**Protocol("copies", "log-range of cells", settings=settings).asdict(), "sizes": sizes}
+    protocol = {**asdict(Protocol("copies", "log-range of cells", settings=settings)), "sizes": sizes}
     return MetricResult("copies", figures, protocol, remarks)
 
 

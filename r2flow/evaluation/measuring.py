@@ -3,7 +3,7 @@
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
@@ -134,7 +134,7 @@ def measure(
             "generated": len(generated), "generated_empty": empty,
         }  # fmt: skip
         settings: dict[str, Any] = {
-            **protocol.describe(), **metric.protocol.asdict(), **described, "sizes": sizes
+            **protocol.describe(), **asdict(metric.protocol), **described, "sizes": sizes
         }  # fmt: skip
         intervals: dict[str, tuple[float, float]] = {}
         if draws and not metric.resamples:
@@ -157,7 +157,7 @@ def speed_result(real: ScanSet, generated: ScanSet) -> MetricResult:
         "seconds": statistics.median(source.seconds or [math.nan]),
     }
     sizes = {"real": len(real), "real_chosen": "none", "generated": len(generated)}
-    return MetricResult("speed", figures, {**Protocol("speed", "network and solver").asdict(), "sizes": sizes})
+    return MetricResult("speed", figures, {**asdict(Protocol("speed", "network and solver")), "sizes": sizes})
 
 
 def _update(

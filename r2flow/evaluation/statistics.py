@@ -4,7 +4,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
@@ -73,7 +73,7 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
     metric's protocol with its weights' hash, the device type, and the file format.
     """
     parts = {
-        "format": FORMAT, "scans": scans.identity, "subset": rule, "protocol": metric.protocol.asdict(),
+        "format": FORMAT, "scans": scans.identity, "subset": rule, "protocol": asdict(metric.protocol),
         "keeps": metric.keeps, "device": torch.device(metric.device).type,
     }  # fmt: skip
     return json.dumps(parts, sort_keys=True)

@@ -1,7 +1,7 @@
 """Base class of metrics between two sets of scans, and the protocol of their results."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -39,9 +39,6 @@ class Protocol:
     weights: str | None = None
     layer: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
-
-    def asdict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def blocks(rows: Tensor, size: int) -> Iterator[tuple[slice, Tensor]]:

@@ -4,6 +4,7 @@ import copy
 import json
 import math
 import pickle
+from dataclasses import asdict
 from itertools import chain
 
 import pytest
@@ -58,7 +59,7 @@ def test_every_name_is_that_of_its_protocol_and_of_one_figure_only(summary, sets
     for name, build in METRICS.items():
         metric = give(build(), sets)
         assert metric.protocol.metric == name
-        json.dumps(metric.protocol.asdict())
+        json.dumps(asdict(metric.protocol))
         values = metric.compute()
         assert values
         assert all(isinstance(value, float) and math.isfinite(value) for value in values.values())
