@@ -33,7 +33,6 @@ class Stopping(L.Callback):
     stop is skipped: the curves lack a point, the weights are the same.
 
     Args:
-        run_dir: The run's folder.
         every: Steps between two checks whether any device received a signal; a single device checks every step.
     """
 

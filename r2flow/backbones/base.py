@@ -43,7 +43,6 @@ class Backbone(ExactBuffers):
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
-        unit: See above.
         in_channels: Channels C of the image plus those of the condition concatenated to it.
         out_channels: Channels C' of the output; None: C.
         second_time: Whether the network takes s.

@@ -184,7 +184,6 @@ class UNet(Backbone, ABC):
         ring: Whether the columns are a full turn.
         dropout: Dropout rate of activations in training.
         groups: Number of groups of group norms; every width is a multiple of it.
-        eps: Epsilon of group norms.
     """
 
     takes_second_time = True

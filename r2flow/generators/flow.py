@@ -62,7 +62,6 @@ class NetworkFlow(Flow):
     """A flow whose velocity is computed from a backbone's output, by the subclass.
 
     Args:
-        space: Model space of the images.
         backbone: Name and options, as in conf/backbone.
 
     Attributes:

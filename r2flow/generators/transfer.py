@@ -98,7 +98,6 @@ class TransferFlow(Flow):
     returned bit for bit. Images can have any size and sensor (`at`).
 
     Args:
-        space: Model space of the images.
         backbone: Name and options of a backbone for any size, as in conf/backbone/local.yaml.
         sigma: Standard deviation of the noise in x_0, in model space.
     """

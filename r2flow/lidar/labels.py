@@ -49,7 +49,6 @@ def read_labels(path: str | Path, scan: str | Path, points: Points | None = None
 
     Args:
         path: A `.label` file: a uint32 per row of the scan's file, class id in the low 16 bits, instance in the high.
-        scan: The scan of the labels.
         points: The points of the scan, if already read.
     """
     path = Path(path)

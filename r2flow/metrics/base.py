@@ -70,7 +70,6 @@ class ScanMetric(Metric):
     Args:
         keep: Store rows for bootstrap intervals.
         sensor: Sensor of images passed to `update` as tensors.
-        name: Name, for classes with several names.
         options: Options of torchmetrics' Metric: process_group, sync_on_compute, ...
     """
 

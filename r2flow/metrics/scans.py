@@ -26,7 +26,6 @@ class Scans:
 
     Args:
         images: Range in metres and optionally reflectance in [0, 1], (B, 2 or 1, H, W); 0 where missing.
-        sensor: The sensor of the images.
         rays: Position of a pixel's ray, and so its point, in its bin: as in `Sensor.rays`.
         xyz: Measured points of the pixels, (B, 3, H, W) in metres; `rays` is then unused.
         names: Names of the scans in messages; default: index in the batch.

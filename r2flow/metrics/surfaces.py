@@ -14,7 +14,6 @@ def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 
     Args:
         r: Ranges in metres, (N, H, W); 0 where missing.
-        sensor: Sensor of the images.
 
     Returns:
         n_z, the upward part, and |n . d| = cos i, i the angle of incidence, (N, H, W) float32 each; NaN where one

@@ -43,7 +43,6 @@ def completing(generator: Generator, name: str | None = None, *, several: bool =
     """The sampler for completion: the generator's default if it takes a condition, else the flow's first completer.
 
     Args:
-        name: Name of another sampler.
         several: Whether answers must differ; a transfer flow then uses `transport`.
         changes: Fields of the sampler.
     """

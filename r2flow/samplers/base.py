@@ -82,7 +82,6 @@ class Sampler(ABC):
         Args:
             generator: A generator with the attribute `needs`.
             noise: (B, *noise_shape), on the generator's device, float32 or float64.
-            condition: Condition of each scan.
             draws: Noise of step j; required if `self.draws`.
             progress: Called after every network evaluation.
         """

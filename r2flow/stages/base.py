@@ -35,12 +35,10 @@ class Stage(L.LightningModule):
     Args:
         generator: The generator to train. Checkpoints store its weights and no others.
         learning_rate: AdamW's learning rate; linear warm-up, then a cosine to 0 at the run's last step.
-        betas: AdamW's betas.
-        weight_decay: AdamW's weight decay.
+        betas, weight_decay: AdamW's.
         muon: Learning rate of the weight matrices by `Muon`, with the same schedule; None: AdamW for all weights.
         warmup_images: Images seen during the warm-up.
         batch_size: Images per step, to convert images into steps.
-        seed: Run seed.
 
     Attributes:
         learns: Class of the generators that it can train.

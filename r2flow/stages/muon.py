@@ -22,7 +22,6 @@ class Muon(torch.optim.AdamW):
     trains biases, norms and matrices with fewer than 8 rows or columns, such as those of an image's channels.
 
     Args:
-        parameters: Parameters to train.
         rate: Learning rate of the matrices.
         momentum: m.
         options: Options of AdamW, for all other parameters.

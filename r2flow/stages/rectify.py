@@ -17,10 +17,8 @@ class Rectify(SingleLoss):
     """1-RF: regress v(t, x_t) onto x_1 - x_0 for independent x_0 ~ N(0, I) and x_1 a scan (paper, eq. 2).
 
     Args:
-        generator: A flow.
         loss: Name in `r2flow.flow.losses.LOSSES`.
         time: Name and options of a density in `r2flow.flow.times.TIMES`.
-        options: Options of `Stage`.
 
     Raises:
         InputError: the generator is not a flow or takes a condition; an unknown loss or density.

@@ -33,7 +33,6 @@ class Diffusion(NetworkFlow):
     Beyond the ends of the schedule, lambda is constant.
 
     Args:
-        space: Space of the images.
         backbone: Name and options, as in conf/backbone.
         prediction: Meaning of y, a name in `r2flow.systems.diffusion.objectives.PREDICTIONS`.
         schedule: Name and options of a log-SNR schedule in `r2flow.systems.diffusion.log_snr.SCHEDULES`.

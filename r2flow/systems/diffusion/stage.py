@@ -16,12 +16,10 @@ class LearnDiffusion(SingleLoss):
     """Regression of the prediction y(z_t, lambda_t) at t ~ Uniform[0, 1] (Kingma et al. 2021).
 
     Args:
-        generator: A `Diffusion`.
         loss: Name in `r2flow.systems.diffusion.objectives.ERRORS`.
         min_snr: gamma of the weight min(SNR, gamma) on the error of expected data; None: the SNR, which weights the
             noise's error equally.
         paired: Whether a sample's error has its own weight; False: the batch's mean, as in R2DM's published code.
-        options: Options of `Stage`.
     """
 
     learns = Diffusion

@@ -47,11 +47,8 @@ class VanillaGan(Gan):
     z is projected to a small map, which 4 x 4 transposed convolutions upsample to the image.
 
     Args:
-        space: Space of the images.
-        backbone: Not used.
         latent: Width of z.
         base_channels: Width of the outermost map; it doubles inwards.
-        max_channels: Maximum width.
         doublings: From the first map to the image; 4 as published.
         tanh: Whether the image ends in tanh; the published weights of v2 alone do.
         ring: Whether the columns are a full turn.
@@ -93,7 +90,6 @@ class DustyV1(VanillaGan):
 
     Args:
         temperature: Temperature of the relaxed mask.
-        options: Those of `VanillaGan`.
     """
 
     drops = True
@@ -114,9 +110,7 @@ class Discriminator(nn.Sequential):
 
     Args:
         shape: Rows and columns of the image.
-        channels: Image channels.
         base_channels: Width of the first layer; each further layer doubles it.
-        max_channels: Maximum width.
         halvings: Number of strided convolutions; published: 4.
     """
 

@@ -30,7 +30,6 @@ class LearnGan(Stage):
     r1 r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's.
 
     Args:
-        generator: A GAN's.
         discriminator: Name and options, as `{name: style_gan, base_channels: 32}`.
         r1: gamma of R1; 0 for none.
         r1_every: Steps between two of R1.

@@ -282,9 +282,7 @@ class Discriminator(nn.Module):
 
     Args:
         shape: Rows and columns of the image.
-        channels: Image channels.
         base_channels: Width of the first layer; each block doubles it.
-        max_channels: Maximum width.
         halvings: Number of blocks; None: as many as leave at least 4 rows and columns.
     """
 

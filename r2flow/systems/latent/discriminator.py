@@ -12,7 +12,6 @@ class PatchDiscriminator(nn.Module):
     """Map of scores of images (B, channels, H, W): 4 x 4 convolutions, batch norm and leaky ReLU.
 
     Args:
-        channels: Image channels.
         width: Width of the first convolution; each further one doubles it, up to a factor of 8.
         layers: Number of strided convolutions.
 

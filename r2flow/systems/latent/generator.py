@@ -27,8 +27,6 @@ class VQAutoencoder(Generator):
     """An autoencoder, the first stage of a `LatentDiffusion`. It cannot sample scans from noise.
 
     Args:
-        space: The images that it learns.
-        backbone: Not used.
         autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
     """
 
@@ -48,8 +46,6 @@ class LatentDiffusion(Generator):
     Latents become codes when they are decoded, not before. Its sampler is `LatentDDIM`.
 
     Args:
-        space: The images it makes.
-        backbone: Not used.
         autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
         unet: Options of `r2flow.systems.latent.unet.LatentUNet`; `position: learnable` is LiDM + APE.
         beta_first, beta_last: Arguments of `r2flow.systems.diffusion.log_snr.square_root_linear`.

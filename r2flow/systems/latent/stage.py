@@ -40,7 +40,6 @@ class LearnAutoencoder(Stage):
     hinge loss and f `adversarial_factor`, all of `r2flow.systems.latent.discriminator` (Esser et al. 2021).
 
     Args:
-        generator: A `VQAutoencoder`.
         discriminator: Options of `PatchDiscriminator`: width and layers.
         adversarial_weight: In w.
         adversarial_start: Step that f changes at.

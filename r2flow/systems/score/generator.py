@@ -25,8 +25,6 @@ class ScoreModel(Generator):
     `steps` are per noise level. A condition pulls the scan to the known rays: densification.
 
     Args:
-        space: Space of the images.
-        backbone: Not used: the network is a `RefineNet`.
         rate: Rate of `r2flow.systems.score.langevin.step_sizes`.
         pull: Strength of the pull to known pixels per step.
         width: Width of the network, see `RefineNet`.

@@ -141,7 +141,6 @@ class RefineNet(nn.Module):
 
     Args:
         sigmas: Noise levels, (L,).
-        channels: Image channels.
         width: Width of the first level; the others are twice as wide.
     """
 

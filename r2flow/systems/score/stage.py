@@ -16,7 +16,6 @@ class MatchScore(SingleLoss):
     """Denoising score matching at all noise levels alike (`r2flow.systems.score.langevin.score_loss`).
 
     Args:
-        generator: A `ScoreModel`.
         power: Exponent of sigma in the weight of each level.
         options: Those of `Stage`. The learning rate does not fall.
     """
