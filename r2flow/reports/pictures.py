@@ -88,6 +88,8 @@ def completed_figure(
         strips = _draw_row(figure, grid, row, image, rays, channels, error)
         legend = " (grey: not measured, black: no return)" if row == 0 else ""
         strips[0].set_title(f"{name}: range, m{legend}", fontsize=7, loc="left", pad=2)
+        if row == 1 and len(strips) > len(rows[0][1]):  # the scan has no reflectance
+            strips[1].set_title("reflectance, estimated", fontsize=7, loc="left", pad=2)
         for axes in strips if row == 0 else ():
             axes.imshow(np.where(unknown[..., None], (0.6, 0.6, 0.6, 1), 0), aspect="auto", interpolation="nearest")
     if spread is not None:

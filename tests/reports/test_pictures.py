@@ -27,6 +27,7 @@ def test_known_rays_without_reflectance_are_as_high_as_answers_with_it():
     figure = completed_figure([("known", scan[:1]), ("answer", scan)], E > 0, SENSOR.rays())
     known, answer = (axes for axes in figure.axes if "range" in axes.get_title("left"))
     assert known.get_position().height == pytest.approx(answer.get_position().height)
+    assert [axes.get_title("left") for axes in figure.axes].count("reflectance, estimated") == 1
 
 
 def test_the_error_of_an_answer_is_in_metres_where_hidden_rays_return_in_both():
@@ -40,6 +41,9 @@ def test_the_error_of_an_answer_is_in_metres_where_hidden_rays_return_in_both():
     shown = axes.images[0].get_array()
     assert (shown.mask == ~(hidden & (np.arange(64) >= 16))).all()
     assert (shown.compressed() == 1.5).all()
+    heights = [axes.get_position().height for axes in figure.axes if axes.get_aspect() == 1.0]
+    assert len(heights) == 6
+    assert max(heights) < 1.1 * min(heights)  # views of one scan have one scale
     (bar,) = (bar for bar in axes.child_axes if bar.get_yticks().size)
     assert [text.get_text() for text in bar.get_yticklabels()] == ["0", "1", "2"]
 
