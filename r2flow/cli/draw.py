@@ -21,7 +21,6 @@ from r2flow.cli.options import (
     SizeOption,
     build_sized,
     choose_device,
-    command,
     grouped,
     named_columns,
     rows_and_columns,
@@ -131,7 +130,7 @@ def interpolate(
     ends = real_scans(loaded, [first, last], reflectance_scale)
     check(len(ends) == 2, f"give two scans, found {len(ends)}.")
     prepare_folder(out)
-    written = write_page(interpolation(loaded, ends, frames, out, sampler, command()), out)
+    written = write_page(interpolation(loaded, ends, frames, out, sampler), out)
     pages = ", ".join(map(str, [*written, out / "interpolation.html"]))
     print(f"{frames} scans in {out / 'frames'}; {pages}")
 

@@ -16,7 +16,6 @@ from r2flow.cli.options import (
     ReadingOptions,
     SamplerOptions,
     choose_device,
-    command,
     grouped,
     numbers,
 )
@@ -191,7 +190,7 @@ def _compare(
     seeds = {"bootstrap": 0} if options.bootstrap else {}
     if any(scans.source.drawn for scans in judged.values()):
         seeds["sampled scans"] = options.seed
-    page = evaluation_page(comparisons, command(), device, seeds, nearest, training)
+    page = evaluation_page(comparisons, device, seeds, nearest, training)
     print_comparisons(comparisons)
     if options.json is not None:
         write_json(page, options.json)

@@ -3,8 +3,6 @@
 import inspect
 import math
 import os
-import shlex
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
@@ -184,8 +182,3 @@ def numbers(option: str, text: str, kind: type = float) -> list[Any]:
     if not all(0 < value < math.inf for value in values):
         raise InputError(f"--{option} must be positive numbers separated by commas, found {text!r}.")
     return values
-
-
-def command() -> str:
-    """The current command line, quoted for a shell."""
-    return shlex.join(["r2flow", *sys.argv[1:]])

@@ -22,7 +22,6 @@ from r2flow.cli.options import (
     SizeOption,
     build_sized,
     choose_device,
-    command,
     cores,
     grouped,
     numbers,
@@ -69,7 +68,7 @@ def curvature(
             measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, progress=advance)
             for label, checkpoint in loaded.items()
         ]
-    page = curvature_page(flows, draw.seed, command(), where)
+    page = curvature_page(flows, draw.seed, where)
     finish(page, out, page.text)
 
 
@@ -117,7 +116,7 @@ def solvers(
         subjects.append(flow)
     with Bar("measuring", len(subjects) * len(chosen), "solutions") as advance:
         rows = measuring.measure(subjects, chosen, advance)
-    page = measuring.solvers_page(rows, flow, most, {"scans": draw.seed}, command(), where)
+    page = measuring.solvers_page(rows, flow, most, {"scans": draw.seed}, where)
     finish(page, out, page.text[:-2])  # without the long table
 
 
@@ -204,7 +203,7 @@ def completion(
         shown = list(completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, progress=advance))
     figure = pictured(truths[0], shown, first.sensor)
     about = f"{len(truths)} scans of {real}, {answers} completions per scan."
-    page = completion_page([row for row, _ in shown], figure, about, seed, command(), str(choose_device(device)))
+    page = completion_page([row for row, _ in shown], figure, about, seed, str(choose_device(device)))
     finish(page, out, page.text[1:])
 
 
@@ -236,7 +235,7 @@ def paper(
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
     scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
     prepare_folder(out)
-    page = paper_page(runs, rows, scans, num, steps, command(), where)
+    page = paper_page(runs, rows, scans, num, steps, where)
     finish(page, out, page.text[:1])
 
 
@@ -265,5 +264,5 @@ def compare(
     if len({run.values["images"] for run in compared} - {None}) > 1:
         print("the runs have seen different numbers of images: compare their curves at equal steps")
     if out is not None:
-        for path in write_page(compare_page(groups, command()), out):
+        for path in write_page(compare_page(groups), out):
             print(path)

@@ -28,7 +28,7 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu", command: str = "") -> None:
+def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu") -> None:
     """Sample every generator, compare the samples with held-out scans, and write figure, table and scans.
 
     Args:
@@ -64,7 +64,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     ]
     titles = [f"{name}, {steps} step{'s' * (steps > 1)}" for name, steps in cells]
     figures = {"chain": contact_sheet([drawn[cell][0] for cell in cells], rays, titles)}
-    page = Page("chain", "From many steps to few", text, rows, figures, command, {"evaluation": 0}, device)
+    page = Page("chain", "From many steps to few", text, rows, figures, {"evaluation": 0}, device)
     written = write_page(page, out)[-1]
     print_table(rows, COLUMNS)
     before = [row for row in rows if row["flow"] == cells[0][0]][-1]

@@ -191,7 +191,7 @@ NOTES = (
 )
 
 
-def compare_page(groups: Groups, command: str) -> Page:
+def compare_page(groups: Groups) -> Page:
     """Build the page `compare.md .csv .json .png`."""
     members = [(label, run) for label, runs in groups.items() for run in runs]
     seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
@@ -199,5 +199,5 @@ def compare_page(groups: Groups, command: str) -> Page:
     curves = [(label, run.curves) for label, run in members]
     figures = {"compare": curves_figure(curves)} if any(one for _, one in curves) else {}
     rows = [{"group": label, "run": run.label, **run.values} for label, run in members]
-    return Page("compare", "Runs compared", [*written, NOTES], rows_of(groups), figures, command, seeds,
+    return Page("compare", "Runs compared", [*written, NOTES], rows_of(groups), figures, seeds,
                 more={"runs": rows})  # fmt: skip

@@ -118,9 +118,7 @@ def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {key: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for key, x in columns.items()}
 
 
-def completion_page(
-    rows: Sequence[Mapping[str, Any]], figure: Figure, about: str, seed: int, command: str, device: str
-) -> Page:
+def completion_page(rows: Sequence[Mapping[str, Any]], figure: Figure, about: str, seed: int, device: str) -> Page:
     """Build the page: a table per task, and the picture."""
     text = [
         f"{about} Figures are of the hidden rays, means over scans and answers, unless their name says otherwise: "
@@ -132,7 +130,7 @@ def completion_page(
         part = [row for row in rows if row["task"] == task]
         columns = {key: heading for key, heading in COLUMNS.items() if any(key in row for row in part)}
         text += [f"## {task}", table([{key: row.get(key) for key in columns} for row in part], columns)]
-    return Page("completion", "Completed scans", text, rows, {"completion": figure}, command, {"noise": seed}, device)
+    return Page("completion", "Completed scans", text, rows, {"completion": figure}, {"noise": seed}, device)
 
 
 def pictured(truth: np.ndarray, shown: Sequence[tuple[Mapping[str, Any], np.ndarray]], sensor: Sensor) -> Figure:

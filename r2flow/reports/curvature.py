@@ -150,10 +150,10 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
     return figure
 
 
-def curvature_page(flows: Sequence[Paths], seed: int, command: str, device: str = "cpu") -> Page:
+def curvature_page(flows: Sequence[Paths], seed: int, device: str = "cpu") -> Page:
     """Build the report on one or several checkpoints."""
     figures = {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)}
     return Page(
-        "curvature", "Straightness of flows", curvature_text(flows), curvature_rows(flows), figures, command,
+        "curvature", "Straightness of flows", curvature_text(flows), curvature_rows(flows), figures,
         {"scans": seed}, device, {"summary": [summary(flow) for flow in flows]},
     )  # fmt: skip

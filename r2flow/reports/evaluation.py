@@ -129,7 +129,6 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
 
 def evaluation_page(
     comparisons: Sequence[Comparison],
-    command: str,
     device: str,
     seeds: Mapping[str, int],
     nearest: Mapping[str, Nearest] | None = None,
@@ -175,7 +174,7 @@ def evaluation_page(
     if nearest and training is not None:
         figures["evaluation_copies"] = copies_figure(nearest, training)
     title = "Generated scans against real ones"
-    return Page("evaluation", title, text, rows_of(comparisons), figures, command, seeds, device, more)
+    return Page("evaluation", title, text, rows_of(comparisons), figures, seeds, device, more)
 
 
 def _protocol(comparisons: Sequence[Comparison]) -> str:

@@ -45,7 +45,6 @@ def interpolation(
     frames: int,
     out: str | Path,
     sampler: Sampler = TIGHT,
-    command: str = "",
 ) -> Page:
     """Write `frames` interpolated scans as `out/frames/NNN.ply` and `.npy`.
 
@@ -80,7 +79,7 @@ def interpolation(
     write_panels(Path(out, "interpolation.html"), panels, captions, "Interpolation")
     figures = {"interpolation": interpolation_figure(pair.numpy(), images, weights, rays, names)}
     device = str(checkpoint.generator.device)
-    return Page("interpolation", "Interpolation", text, rows, figures, command, device=device)
+    return Page("interpolation", "Interpolation", text, rows, figures, device=device)
 
 
 def interpolation_figure(

@@ -7,6 +7,8 @@ import math
 import os
 import platform
 import re
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -36,6 +38,13 @@ STYLES: tuple[dict[str, Any], ...] = tuple(
 )
 
 
+def command() -> str:
+    """The command line of this process, quoted for a shell."""
+    program, *arguments = sys.argv
+    verb = Path(program).stem in ("r2flow", "__main__")
+    return shlex.join([*(["r2flow"] if verb else ["python", program]), *arguments])
+
+
 @dataclass(frozen=True)
 class Page:
     """Contents of a report.
@@ -45,10 +54,10 @@ class Page:
         text: Paragraphs and tables of Markdown.
         rows: One row per measurement, for the CSV and the `rows` of the JSON.
         figures: Figures by name, written as `NAME.png` and `NAME.pdf`.
-        command: Command that reproduces the page.
         seeds: All seeds, by purpose.
         device: Device of the networks.
         more: Further lists for the JSON, by name.
+        command: Command that reproduces the page.
     """
 
     name: str
@@ -56,10 +65,10 @@ class Page:
     text: Sequence[str]
     rows: Sequence[Row]
     figures: Mapping[str, Figure]
-    command: str
     seeds: Mapping[str, int] = field(default_factory=dict)
     device: str = "cpu"
     more: Mapping[str, Sequence[Row]] = field(default_factory=dict)
+    command: str = field(default_factory=command)
 
 
 def write_page(page: Page, out: str | Path) -> list[Path]:

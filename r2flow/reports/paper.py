@@ -66,7 +66,6 @@ def paper_page(
     real: ScanSet | None = None,
     num: int = 16,
     steps: int = 256,
-    command: str = "",
     device: str = "cpu",
 ) -> Page:
     """Build the page.
@@ -107,7 +106,7 @@ def paper_page(
         figures |= {"figure_8a": curvature_figure(paths), "figure_8b": trajectories_figure(paths)}
         text += ["## Figure 8: straightness", *curvature_text(paths)]
     return Page(
-        "paper", "The paper's tables and figures", text, evaluated, figures, command, {"sampled scans": 0}, device,
+        "paper", "The paper's tables and figures", text, evaluated, figures, {"sampled scans": 0}, device,
         {"architectures": architectures},
     )  # fmt: skip
 

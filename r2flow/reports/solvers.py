@@ -194,7 +194,6 @@ def solvers_page(
     subject: Subject | None,
     budgets: Sequence[int],
     seeds: Mapping[str, int],
-    command: str,
     device: str = "cpu",
 ) -> Page:
     """Build the report on the rows of `measure`; `subject` is the trained flow, if any."""
@@ -216,7 +215,7 @@ def solvers_page(
         panels = [(name, group, "evaluations", "error") for name, group in groups.items()]
         figures["solvers_problems"] = _figure(panels, 4)
     text += ["## All configurations", table(rows, COLUMNS)]
-    return Page("solvers", "Solvers: error against run time", text, rows, figures, command, seeds, device)
+    return Page("solvers", "Solvers: error against run time", text, rows, figures, seeds, device)
 
 
 def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> list[str]:

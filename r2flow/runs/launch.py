@@ -263,7 +263,7 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     device, cards = "cpu", settings["trainer"]["devices"]
     if torch.cuda.is_available() and settings["trainer"]["accelerator"] != "cpu":
         device = f"cuda:{cards[0]}" if isinstance(cards, list) else "cuda"
-    report({link.name: link.run_dir for link in links}, out, device=device, command=" ".join(["python", *sys.argv]))
+    report({link.name: link.run_dir for link in links}, out, device=device)
     note(out, *links)
     return 0
 

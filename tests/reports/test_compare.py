@@ -170,13 +170,12 @@ def test_the_page_is_written_with_its_picture(tmp_path):
              checkpoint=40)  # fmt: skip
     make_run(tmp_path / "runs" / "bare", {"stage.learning_rate": 2e-3})
     groups = group_runs(read_runs([tmp_path / "runs"]))
-    written = {path.name: path for path in write_page(compare_page(groups, "r2flow compare runs"), tmp_path / "out")}
+    written = {path.name: path for path in write_page(compare_page(groups), tmp_path / "out")}
     assert set(written) == {"compare.md", "compare.csv", "compare.json", "compare.png", "compare.pdf"}
     said = written["compare.md"].read_text()
     for words in (
         "| bare | 1 | rectify | hdit |",
         "| run | train loss, last tenth |",
-        "r2flow compare runs",
     ):
         assert words in said, words
     rows = json.loads(written["compare.json"].read_text())["rows"]

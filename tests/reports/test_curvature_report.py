@@ -77,7 +77,7 @@ def test_the_summary_and_the_rows_are_of_the_mean_over_scenes():
 
 def test_the_page_compares_the_flows():
     flows = [measure_paths(checkpoint(Falling(a)), name, 1, STEPS, 5) for name, a in (("slow", 0.5), ("fast", 4.0))]
-    page = curvature_page(flows, 5, "r2flow report curvature")
+    page = curvature_page(flows, 5)
     said = " ".join(page.text)
     # s / |d|^2 does not change when a straight-line velocity is scaled; here the slower one is nearer to v = c t,
     # whose variance over squared mean is (1/12) / (1/4) = 1/3.
@@ -92,7 +92,7 @@ def test_the_page_compares_the_flows():
 
 def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
     flow = measure_paths(checkpoint(Falling(0.0)), "still", 1, 4, 5)
-    page = curvature_page([flow], 5, "")
+    page = curvature_page([flow], 5)
     assert math.isnan(summary(flow)["integral_normalised"])
     assert "| still | 0 | - |" in page.text[1]
 

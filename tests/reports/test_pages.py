@@ -72,6 +72,15 @@ def test_a_page_that_fails_leaves_the_old_one(tmp_path):
     assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix not in (".png", ".pdf")} == before
 
 
+@pytest.mark.parametrize(
+    ("argv", "command"),
+    [(["/bin/r2flow", "compare", "a b"], "r2flow compare 'a b'"), (["train.py", "seed=1"], "python train.py seed=1")],
+)
+def test_a_page_names_the_command_that_makes_it(monkeypatch, argv: list[str], command: str):
+    monkeypatch.setattr("sys.argv", argv)
+    assert Page("name", "Title", [], [], {}).command == command
+
+
 def test_a_figure_is_as_wide_as_its_title():
     figure = blank_figure(2, 2, "Each metric's first figure, generated scans and real ones")
     figure_pixels(figure)

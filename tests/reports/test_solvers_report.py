@@ -113,9 +113,9 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
     straight = {r["label"]: r for r in rows if r["problem"] == "straight"}
     assert straight["euler, 4 steps"]["error"] < 1e-12
     assert (
-        "| stiff_1e4 | none |" in solvers_page(rows, None, [4, 8], {}, "").text[2]
+        "| stiff_1e4 | none |" in solvers_page(rows, None, [4, 8], {}).text[2]
     )  # explicit steps of 1/4 end farther than x_0
-    page = solvers_page(rows, None, [4, 8], {}, "r2flow report solvers")
+    page = solvers_page(rows, None, [4, 8], {})
     assert set(page.figures) == {"solvers_problems"}
 
 
