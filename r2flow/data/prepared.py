@@ -22,7 +22,7 @@ from safetensors import safe_open
 
 from r2flow.config import at_most_three, differences
 from r2flow.data.layouts import Drive
-from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
+from r2flow.data.quantise import OTHER_LEVELS, Codes, find_levels, fits, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, lacks_reflectance, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError
@@ -35,7 +35,7 @@ KIND = "scans"
 CHANNELS = ("range", "reflectance")
 SHARD_SCANS = 64  # 13 MB at 64 x 1024, held in memory until written
 PROBED = 8  # number of scans read to determine the levels of reflectance
-PROJECTION = 1  # revision; increase it when the same files give different images or codes
+PROJECTION = 2  # revision; increase it when the same files give different images or codes
 
 
 # Making
@@ -96,7 +96,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
     if not values.any():
         return OTHER_LEVELS
     levels, highest = find_levels(values), float(values.max())
-    if not images and highest < 0.25 and not ReflectanceCodes(levels).fits(values):
+    if not images and highest < 0.25 and not fits(values, levels):
         log.warning(
             "reflectance goes up to %.3g of 1 alone and is kept in steps of 1/%d: --reflectance-scale %.3g spreads it",
             highest, levels, highest * scale,
@@ -162,11 +162,11 @@ def shards_of(recipe: Mapping[str, Any]) -> list[range]:
     return [scans[first : first + size] for first in scans[::size]]
 
 
-def codes_of(recipe: Mapping[str, Any]) -> list[RangeCodes | ReflectanceCodes]:
+def codes_of(recipe: Mapping[str, Any]) -> list[Codes]:
     """The codes of range and, if the scans have it, of reflectance."""
     sensor, levels = recipe["reading"]["sensor"], recipe["levels"]
-    ranges = RangeCodes(sensor["min_range"], sensor["max_range"])
-    return [ranges] if levels is None else [ranges, ReflectanceCodes(levels)]
+    ranges = range_codes(sensor["min_range"], sensor["max_range"])
+    return [ranges] if levels is None else [ranges, reflectance_codes(levels)]
 
 
 # Reading

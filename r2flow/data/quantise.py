@@ -1,6 +1,7 @@
 """Quantisation of range images: range as uint16, reflectance as uint8."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,70 +15,46 @@ OTHER_LEVELS = 255
 ROUNDING = 1e-6  # some KITTI files store n * 0.01 in float32 instead of n / 100: 0.20000002
 
 
-class RangeCodes:
-    """uint16 codes of ranges in [min_range, max_range], with finer steps at short range.
+class Codes:
+    """Integer codes of values, linear between some values and their codes, both increasing.
 
-    r(0) = 0, no return;
-    r(c) = min_range + (c - 1) fine     for 1 <= c <= knee_code;
-    r(c) = knee + (c - knee_code) coarse     for knee_code <= c <= 65535.
-
-    Single step fine = (max_range - min_range) / 65534 if that is at most `STEP` (max_range - min_range up to 124 m);
-    else fine <= `STEP` up to 65 m, and the remaining codes divide the rest. The error is at most half a step. `values`
-    are the decoded ranges, (65536,), float32.
+    `values` are the decoded values of all codes, float32.
     """
 
-    dtype = np.uint16
+    def __init__(self, values: Sequence[float], codes: Sequence[int], dtype: type[np.unsignedinteger]) -> None:
+        self._knots, self.dtype = (values, codes), dtype
+        self.values = np.interp(np.arange(np.iinfo(dtype).max + 1), codes, values).astype(np.float32)
 
-    def __init__(self, min_range: float, max_range: float) -> None:
-        self.near, self.far = np.float32(min_range), np.float32(max_range)
-        self.min_range = min_range
-        if (max_range - min_range) / (CODES - 2) <= STEP:
-            self.knee, self.knee_code = max_range, CODES - 1
-        else:
-            self.knee = min(max(KNEE, min_range), max_range)
-            self.knee_code = 1 + math.ceil((self.knee - min_range) / STEP)
-        self.fine = (self.knee - min_range) / max(self.knee_code - 1, 1)
-        self.coarse = (max_range - self.knee) / max(CODES - 1 - self.knee_code, 1)
-        code = np.arange(CODES)
-        beyond = self.knee + (code - self.knee_code) * self.coarse
-        r = np.where(code <= self.knee_code, min_range + (code - 1) * self.fine, beyond)
-        self.values = np.clip(r.astype(np.float32), self.near, self.far)
-        self.values[0] = 0
-
-    def encode(self, r: np.ndarray) -> np.ndarray:
-        """The nearest codes, uint16, of ranges in metres, 0 for no return."""
-        returned = r != 0
-        inside = (r >= self.near) & (r <= self.far) | ~returned  # False for NaN, too
-        assert inside.all(), f"ranges must be 0 or lie in [{self.near:g}, {self.far:g}] m"
-        r = r.astype(np.float64)
-        code = 1 + (r - self.min_range) / (self.fine or 1)
-        if self.coarse:
-            code = np.where(r <= self.knee, code, self.knee_code + (r - self.knee) / self.coarse)
-        return np.where(returned, np.clip(np.rint(code), 1, CODES - 1), 0).astype(np.uint16)
+    def encode(self, x: np.ndarray) -> np.ndarray:
+        """The nearest codes of values."""
+        return np.rint(np.interp(x, *self._knots)).astype(self.dtype)
 
 
-class ReflectanceCodes:
-    """uint8 codes of reflectance, n / levels, rounded to the nearest level.
+def range_codes(min_range: float, max_range: float) -> Codes:
+    """uint16 codes of ranges in metres, 0 or in [min_range, max_range]; the error is at most half a step.
 
-    `values` are the decoded reflectances, (256,), float32 in [0, 1].
+    Code 0 is no return. One step (max_range - min_range) / 65534 if that is at most `STEP` (max_range - min_range up
+    to 124 m); else steps of at most `STEP` up to 65 m, and the remaining codes divide the rest.
     """
+    values, codes = [0.0, min_range, max_range], [0, 1, CODES - 1]
+    if (max_range - min_range) / (CODES - 2) > STEP and min_range < KNEE:
+        values.insert(2, KNEE)
+        codes.insert(2, 1 + math.ceil((KNEE - min_range) / STEP))
+    return Codes(values, codes, np.uint16)
 
-    dtype = np.uint8
 
-    def __init__(self, levels: int) -> None:
-        assert 1 <= levels <= 256
-        self.levels = levels
-        self.values = np.minimum(np.arange(256, dtype=np.float32) / np.float32(levels), np.float32(1))
+def reflectance_codes(levels: int) -> Codes:
+    """uint8 codes of reflectance in [0, 1], n / levels; with 256 levels the maximum is 255 / 256."""
+    highest = min(levels, 255)
+    return Codes([0, highest / levels], [0, highest], np.uint8)
 
-    def encode(self, reflectance: np.ndarray) -> np.ndarray:
-        """The codes, uint8, of reflectance in [0, 1]. With 256 levels the maximum is 255 / 256."""
-        return np.clip(np.rint(reflectance * np.float32(self.levels)), 0, 255).astype(np.uint8)
 
-    def fits(self, reflectance: np.ndarray) -> bool:
-        """Whether every value is a level, up to rounding."""
-        return bool(np.abs(self.values[self.encode(reflectance)] - reflectance).max(initial=0) <= ROUNDING)
+def fits(reflectance: np.ndarray, levels: int) -> bool:
+    """Whether every value is a multiple of 1 / levels, up to rounding."""
+    codes = reflectance_codes(levels)
+    return bool(np.abs(codes.values[codes.encode(reflectance)] - reflectance).max(initial=0) <= ROUNDING)
 
 
 def find_levels(reflectance: np.ndarray) -> int:
     """The number of levels n for which all values are multiples of 1 / n; 255 if no known n fits."""
-    return next((n for n in KNOWN_LEVELS if ReflectanceCodes(n).fits(reflectance)), OTHER_LEVELS)
+    return next((n for n in KNOWN_LEVELS if fits(reflectance, n)), OTHER_LEVELS)

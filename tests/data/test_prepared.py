@@ -14,7 +14,7 @@ from r2flow.data.layouts import Drive
 from r2flow.data.opening import SOURCES, find_drives
 from r2flow.data.options import SourceOptions
 from r2flow.data.prepared import Plan, plan_files, prepare
-from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
+from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, read_scan
 from r2flow.data.sources import ScanFiles
 from r2flow.errors import InputError
@@ -73,9 +73,9 @@ def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options
 @pytest.mark.parametrize("far", [None, 120.0, 245.0, 500.0])
 def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | None):
     near, far = sensor.min_range, far or sensor.max_range
-    codes = RangeCodes(near, far)
+    codes = range_codes(near, far)
     r = np.concatenate([np.random.default_rng(0).uniform(near, far, 50_000), [near, 65.0, far]]).astype(np.float32)
-    r = r.clip(codes.near, codes.far)
+    r = r.clip(np.float32(near), np.float32(far))
     decoded = codes.values[codes.encode(r)]
     error = np.abs(decoded.astype(np.float64) - r)
     assert error[r < 65].max() <= MILLIMETRE
@@ -90,14 +90,14 @@ def test_reflectance_in_levels_is_kept_to_the_bit_and_the_levels_are_found(level
     steps = np.arange(min(levels + 1, 256))
     reflectance = np.array([step / levels for step in steps], dtype=np.float32)
     assert find_levels(reflectance) == levels
-    codes = ReflectanceCodes(levels)
+    codes = reflectance_codes(levels)
     assert np.array_equal(codes.values[codes.encode(reflectance)], reflectance)
 
 
 def test_reflectance_without_levels_is_off_by_half_a_step_at_most():
     reflectance = np.random.default_rng(0).random(10_000, dtype=np.float32)
     assert find_levels(reflectance) == 255
-    codes = ReflectanceCodes(255)
+    codes = reflectance_codes(255)
     assert np.abs(codes.values[codes.encode(reflectance)] - reflectance).max() <= 0.5 / 255 + 1e-7
 
 
