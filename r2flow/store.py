@@ -55,11 +55,12 @@ class Store:
     Args:
         kind: Prefix of the files, `KIND-000003.safetensors`, and format in the manifest, `r2flow KIND`.
         recipe: Everything that the items depend on, as plain values.
-        option: Option by which a user gives another folder, for messages.
     """
 
-    def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any], option: str = "--out FOLDER") -> None:
-        self.folder, self.kind, self.option = Path(folder).expanduser(), kind, option
+    option = "--out FOLDER"  # in messages: how a user gives another folder
+
+    def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any]) -> None:
+        self.folder, self.kind = Path(folder).expanduser(), kind
         self.described: dict[str, Any] = json.loads(json.dumps(recipe))
         self.digest = checksum(self.described)
 

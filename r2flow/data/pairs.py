@@ -23,8 +23,6 @@ from r2flow.models import name_of
 from r2flow.samplers import build_sampler
 from r2flow.store import Damaged, Store
 
-ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # advice for messages: how to choose another folder
-
 
 @dataclass(frozen=True)
 class PairRecipe:
@@ -48,9 +46,11 @@ class PairStore(Store):
     The last shard has only the batches that the first `num` pairs need; it is made again for a larger `num`.
     """
 
+    option = "data.root=FOLDER (r2flow pairs --out FOLDER)"
+
     def __init__(self, folder: str | Path, recipe: PairRecipe, num: int) -> None:
         self.recipe, self.num = recipe, num
-        super().__init__(folder, "pairs", asdict(recipe), ELSEWHERE)
+        super().__init__(folder, "pairs", asdict(recipe))
         self.check()
         self.shards = range(-(-num // (recipe.shard_batches * recipe.batch_size)))
 
