@@ -16,10 +16,10 @@ from r2flow.cli.options import (
     ReadingOptions,
     SensorOption,
     SizeOption,
-    build_sized,
     cores,
     grouped,
     named_columns,
+    rows_and_columns,
 )
 from r2flow.errors import InputError, check
 
@@ -40,11 +40,12 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate scans of street scenes. The same command resumes an interrupted run."""
+    from r2flow.lidar.sensor_files import named_sensor
     from r2flow.progress import Bar
     from r2flow.simulator.folder import SimulatedFolder
 
     formats = tuple(dict.fromkeys(format.split(",")))
-    folder = SimulatedFolder(out, build_sized(sensor, size), seed, formats, labels)
+    folder = SimulatedFolder(out, named_sensor(sensor, rows_and_columns(size)), seed, formats, labels)
     folder.begin()
     missing = folder.missing(range(num))
     with Bar("simulating", len(missing), "scans") as advance:

@@ -19,7 +19,6 @@ from r2flow.cli.options import (
     SamplerOptions,
     ScaleChoice,
     SizeOption,
-    build_sized,
     choose_device,
     grouped,
     named_columns,
@@ -172,7 +171,7 @@ class PartialOptions:
         if self.to or self.size:
             loaded = loaded.through(named_sensor(self.to or loaded.sensor, rows_and_columns(self.size)))
         reading = replace(reading_for([], loaded), columns=named_columns(self.columns))
-        sensor = None if self.source is None else build_sized(self.source, None)
+        sensor = None if self.source is None else named_sensor(self.source)
         return loaded, *open_partial(what, reading, sensor, self.reflectance_scale, self.scans)
 
 

@@ -16,7 +16,6 @@ from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
-    from r2flow.lidar.sensors import Sensor
     from r2flow.model.checkpoint import Checkpoint
 
 CheckpointOption = Annotated[
@@ -54,13 +53,6 @@ def named_columns(text: str | None) -> tuple[str, ...] | None:
     columns = None if text is None else tuple(name.strip() for name in text.split(","))
     check_columns(columns)
     return columns
-
-
-def build_sized(sensor: str, size: str | None) -> "Sensor":
-    """Build a sensor from its name or YAML file and an image size such as 64x1024."""
-    from r2flow.lidar.sensor_files import named_sensor
-
-    return named_sensor(sensor, rows_and_columns(size))
 
 
 def rows_and_columns(size: str | None) -> tuple[int, int] | None:

@@ -20,7 +20,6 @@ from r2flow.cli.options import (
     SensorChoice,
     SensorOption,
     SizeOption,
-    build_sized,
     choose_device,
     cores,
     grouped,
@@ -130,10 +129,11 @@ def backbones(
 ) -> None:
     """List parameters, multiply-accumulates and latency of all backbone configurations (the paper's table II)."""
     from r2flow.backbones import configurations
+    from r2flow.lidar.sensor_files import named_sensor
     from r2flow.progress import track
     from r2flow.reports.backbones import backbone_costs, print_costs
 
-    chosen, where = build_sized(sensor, size), choose_device(device)
+    chosen, where = named_sensor(sensor, rows_and_columns(size)), choose_device(device)
     names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, repeats, where)
     load = os.getloadavg()[0]
