@@ -6,15 +6,11 @@ against all real ones, Euler steps, NVIDIA RTX 6000 Ada.
 
 from typing import NamedTuple
 
+from r2flow.reports.evaluation import PRINTED
+
 # Name in `r2flow.metrics` -> (heading, factor of the printed values).
 COLUMNS = {
-    "frd": ("FRD", 1.0),
-    "frid": ("FRID", 1.0),
-    "fpd": ("FPD", 1.0),
-    "fpvd": ("FPVD", 1.0),
-    "fsvd": ("FSVD", 1.0),
-    "jsd": ("JSD x 10^2", 1e2),
-    "mmd": ("MMD x 10^4", 1e4),
+    name: PRINTED.get(name, (name.upper(), 1.0)) for name in ("frd", "frid", "fpd", "fpvd", "fsvd", "jsd", "mmd")
 }
 
 
