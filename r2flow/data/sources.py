@@ -1,5 +1,6 @@
 """Sources of numbered range images in metres: scan files, the simulator, memory."""
 
+import copy
 import hashlib
 import json
 import logging
@@ -11,7 +12,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -216,20 +217,32 @@ class ScanFiles(ScanSource):
         raise InputError(f"all {len(self.paths)} scans were left out as unusable; see the warnings above.")
 
 
-class SimulatedScans(ScanSource):
-    """Simulated scenes of one seed, by their numbers."""
+class MadeScans(ScanSource):
+    """Scans made on access, by their numbers; `word` begins their names."""
 
-    slow = True
+    word: str
+    numbers: Sequence[int]
 
-    def __init__(self, sensor: Sensor, seed: int, scenes: Sequence[int], reflectance: bool = True) -> None:
-        self.sensor, self.seed, self.scenes, self.reflectance = sensor, seed, scenes, reflectance
+    def __len__(self) -> int:
+        return len(self.numbers)
 
     @property
     def names(self) -> list[str]:
-        return [f"scene {scene}" for scene in self.scenes]
+        return [f"{self.word} {number}" for number in self.numbers]
 
-    def subset(self, indices: Sequence[int]) -> "SimulatedScans":
-        return SimulatedScans(self.sensor, self.seed, [self.scenes[i] for i in indices], self.reflectance)
+    def subset(self, indices: Sequence[int]) -> Self:
+        part = copy.copy(self)
+        part.numbers = [self.numbers[i] for i in indices]
+        return part
+
+
+class SimulatedScans(MadeScans):
+    """Simulated scenes of one seed."""
+
+    slow, word = True, "scene"
+
+    def __init__(self, sensor: Sensor, seed: int, numbers: Sequence[int], reflectance: bool = True) -> None:
+        self.sensor, self.seed, self.numbers, self.reflectance = sensor, seed, numbers, reflectance
 
     def about(self) -> dict[str, Any]:
         return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}
@@ -237,16 +250,13 @@ class SimulatedScans(ScanSource):
     def identity(self) -> dict[str, Any]:
         from r2flow import simulator
 
-        numbers = hashlib.sha256(np.asarray(self.scenes, dtype=np.int64).tobytes()).hexdigest()[:16]
+        numbers = hashlib.sha256(np.asarray(self.numbers, dtype=np.int64).tobytes()).hexdigest()[:16]
         return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": self.sensor.described()}
-
-    def __len__(self) -> int:
-        return len(self.scenes)
 
     def __getitem__(self, index: int) -> np.ndarray:
         from r2flow.simulator import simulate
 
-        return simulate(self.sensor, self.seed, self.scenes[index]).image[: 1 + self.reflectance]
+        return simulate(self.sensor, self.seed, self.numbers[index]).image[: 1 + self.reflectance]
 
 
 class InMemory(ScanSource):

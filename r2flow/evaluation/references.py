@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from r2flow.data.sets import ScanSet
+from r2flow.data.sources import MadeScans
 from r2flow.errors import check
-from r2flow.evaluation.sets import MadeScans
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator, standard_normal

@@ -1,6 +1,5 @@
 """Sets of scans sampled from a generator on access."""
 
-import copy
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
@@ -9,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanSource
+from r2flow.data.sources import MadeScans
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.model.checkpoint import Checkpoint, checkpoints_of, weights_hash
@@ -47,25 +46,6 @@ def sampled_set(
         "reflectance": flow.encoding.reflectance,
     }  # fmt: skip
     return ScanSet(label, SampledScans(flow, range(num), sampler, seed, precision), flow.sensor, about)
-
-
-class MadeScans(ScanSource):
-    """Scans made on access, by their numbers; `word` begins their names."""
-
-    word: str
-    numbers: Sequence[int]
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    @property
-    def names(self) -> list[str]:
-        return [f"{self.word} {number}" for number in self.numbers]
-
-    def subset(self, indices: Sequence[int]) -> Self:
-        part = copy.copy(self)
-        part.numbers = [self.numbers[i] for i in indices]
-        return part
 
 
 class SampledScans(MadeScans):

@@ -99,7 +99,7 @@ def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray |
     if isinstance(source, SimulatedScans):
         from r2flow.simulator import simulate
 
-        made = simulate(source.sensor, source.seed, source.scenes[number])
+        made = simulate(source.sensor, source.seed, source.numbers[number])
         return made.image[: 1 + source.reflectance], made.labels
     path = Path(source.paths[number]) if isinstance(source, ScanFiles) else None
     if path is None or labels_beside(path) is None or read_range_image(path) is not None:
