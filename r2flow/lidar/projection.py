@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import check
+from r2flow.files import save_array
+from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.scan_files.points import check_xyz
 from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import Convention, Sensor
@@ -194,3 +197,18 @@ def image_to_points(
     order = np.roll(np.arange(columns)[::-1], (columns + 1) // 2)
     xyz, reflectance, returned = xyz[..., order], reflectance[..., order], image[0][..., order] > 0
     return np.ascontiguousarray(xyz[:, returned].T), np.ascontiguousarray(reflectance[returned])
+
+
+def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]) -> None:
+    """Write a range image as `out/NAME.ENDING`: the image in .npy, points in other formats."""
+    for path in (out / f"{name}.{ending}" for ending in endings):
+        if path.suffix == ".npy":
+            save_array(path, image)
+        else:
+            write_cloud(path, image, rays)
+
+
+def write_cloud(path: Path, image: np.ndarray, rays: Tensor, measured: np.ndarray | None = None) -> None:
+    """Write the points of a range image (`image_to_points`)."""
+    xyz, reflectance = image_to_points(image, rays, measured)
+    write_points(path, xyz, reflectance if len(image) > 1 else None)

@@ -10,12 +10,13 @@ import torch
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.flow.straightness import curvature
 from r2flow.generators import Flow
+from r2flow.lidar.projection import write_scan
 from r2flow.metrics.panel import PANEL, distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.progress import track
-from r2flow.reports.outputs import draw_pages, what_next, write_scan
+from r2flow.reports.outputs import draw_pages, what_next
 from r2flow.reports.pages import Page, write_page
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import print_table, table

@@ -18,6 +18,7 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
+from r2flow.lidar.projection import write_cloud
 from r2flow.lidar.scan_files import WRITTEN
 from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import common_mae
@@ -25,7 +26,7 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.models import DEFAULT, DENSIFY
 from r2flow.progress import track
-from r2flow.reports.outputs import ScanBar, recipe_of, warn_unsolved, write_cloud
+from r2flow.reports.outputs import ScanBar, recipe_of, warn_unsolved
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
 from r2flow.store import Store, read_manifest

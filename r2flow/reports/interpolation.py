@@ -11,9 +11,9 @@ from torch import Tensor
 from r2flow.data.sources import spread
 from r2flow.generators import Sampler
 from r2flow.inversion import TIGHT, Real, interpolate_scans, round_trip
-from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.projection import image_to_points, write_scan
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.outputs import ScanBar, warn_unsolved, write_scan
+from r2flow.reports.outputs import ScanBar, warn_unsolved
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import (
     draw_birds_eye,

@@ -15,12 +15,10 @@ from torch import Tensor
 from r2flow.config import as_override
 from r2flow.data.opening import reading_for
 from r2flow.errors import InputError
-from r2flow.files import save_array
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
-from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.projection import write_scan
 from r2flow.lidar.region import Region
-from r2flow.lidar.scan_files import write_points
 from r2flow.model.checkpoint import FOLDER, Checkpoint, weights_hash
 from r2flow.model.sampling import batches, draw
 from r2flow.progress import Bar, track
@@ -159,21 +157,6 @@ class ScanBar(Bar):
         self._spent += 1
         self(self._share)
         self.set(note=f"{self._spent} evaluations")
-
-
-def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]) -> None:
-    """Write a range image as `out/NAME.ENDING`: the image in .npy, points in other formats."""
-    for path in (out / f"{name}.{ending}" for ending in endings):
-        if path.suffix == ".npy":
-            save_array(path, image)
-        else:
-            write_cloud(path, image, rays)
-
-
-def write_cloud(path: Path, image: np.ndarray, rays: Tensor, measured: np.ndarray | None = None) -> None:
-    """Write the points of a range image (`image_to_points`)."""
-    xyz, reflectance = image_to_points(image, rays, measured)
-    write_points(path, xyz, reflectance if len(image) > 1 else None)
 
 
 def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str) -> None:

@@ -7,8 +7,7 @@ import numpy as np
 
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.projection import image_to_points, write_scan
 from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Registry
 from r2flow.simulator import REVISION, simulate
@@ -32,7 +31,7 @@ class SimulatedFolder(FileStore):
         reading = {"sensor": sensor.described(), "reflectance_scale": 1.0}
         endings = [*formats, *(["label"] if labels else [])]
         super().__init__(folder, KIND, {"simulator": REVISION, "seed": seed, "reading": reading}, endings)
-        self.sensor, self.seed = sensor, seed
+        self.sensor, self.seed, self.formats, self.labels = sensor, seed, formats, labels
         for name in formats:
             FORMATS[name]
         if labels and tuple(formats) == ("npy",):
@@ -43,16 +42,10 @@ class SimulatedFolder(FileStore):
     def simulate(self, item: int) -> None:
         """Simulate a scan and write its files."""
         scan = simulate(self.sensor, self.seed, item)
-        rays = self.sensor.rays()
-        xyz, reflectance = image_to_points(scan.image, rays)
-        for path in self.files(item):
-            if path.suffix == ".npy":
-                with atomic_write(path) as file:
-                    np.save(file, scan.image)
-            elif path.suffix == ".label":
-                # In the order of the points; ids are exact in float32.
-                _, labels = image_to_points(np.stack([scan.image[0], scan.labels.astype(np.float32)]), rays)
-                with atomic_write(path) as file:
-                    file.write(labels.astype("<u4").tobytes())
-            else:
-                write_points(path, xyz, reflectance)
+        rays, name = self.sensor.rays(), f"{item:06d}"
+        write_scan(scan.image, rays, self.folder, name, self.formats)
+        if self.labels:
+            # In the order of the points; ids are exact in float32.
+            _, labels = image_to_points(np.stack([scan.image[0], scan.labels.astype(np.float32)]), rays)
+            with atomic_write(self.folder / f"{name}.label") as file:
+                file.write(labels.astype("<u4").tobytes())
