@@ -117,13 +117,15 @@ class ReadingOptions:
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
 
-    def reading(self, specs: Sequence[str | None], model: "Checkpoint | None" = None) -> "Reading":
+    def reading(
+        self, specs: Sequence[str | None], model: "Checkpoint | None" = None, estimate_scale: bool = False
+    ) -> "Reading":
         """The reading for scans and a model under these options."""
         from r2flow.data.opening import reading_for
 
         return reading_for(
             specs, model, self.sensor, rows_and_columns(self.size), self.projection, self.convention,
-            self.reflectance_scale, named_columns(self.columns),
+            self.reflectance_scale, named_columns(self.columns), estimate_scale,
         )  # fmt: skip
 
 

@@ -28,13 +28,9 @@ MOST = 256  # largest number of each per page
 
 def panels_of(spec: str, how: ReadingOptions, most: int, labelled: bool = True) -> "Iterator[Panel]":
     """At most `most` scans of a set as panels."""
-    from r2flow.data.opening import estimating_scale
     from r2flow.reports.view.panels import scan_panels
 
-    reading = how.reading([spec])
-    if how.reflectance_scale is None:
-        reading = estimating_scale(reading, spec)
-    return scan_panels(spec, reading, most, labelled)
+    return scan_panels(spec, how.reading([spec], estimate_scale=True), most, labelled)
 
 
 @app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")

@@ -9,10 +9,10 @@ scan files listed by `find_mine(root)`, or a subclass of `SourceKind`.
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -178,25 +178,16 @@ def samples_of(run: Path) -> Path | None:
     return run / "samples"
 
 
-class Model(Protocol):
-    """The attributes of a trained generator that determine its images."""
-
-    @property
-    def config(self) -> Mapping[str, Any]: ...
-
-    @property
-    def sensor(self) -> Sensor: ...
-
-
 def reading_for(
     scans: Sequence[str | Path | None],
-    model: Model | None = None,
+    model: Any = None,
     sensor: Sensor | str | None = None,
     size: tuple[int, int] | None = None,
     projection: str | None = None,
     convention: str | None = None,
     reflectance_scale: float | None = None,
     columns: Sequence[str] | None = None,
+    estimate_scale: bool = False,
 ) -> Reading:
     """How scans become images: arguments first, then the model's training scans, the scans' manifest, the defaults.
 
@@ -204,13 +195,14 @@ def reading_for(
 
     Args:
         scans: Names as for `open_scans`; None is skipped.
-        model: The model that the scans are for; another sensor or size than the model's is refused.
+        model: The checkpoint that the scans are for; another sensor or size than the model's is refused.
         sensor, size, ...: Requested fields; None: not requested.
+        estimate_scale: Estimate full reflectance from each plain scan file, if the sensor does not tell it.
     """
     specs = [str(spec) for spec in scans if spec is not None]
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
-    kind = SOURCES[parse(specs[0])[0].name if specs else FOLDER]
-    reading = _reading_of(model) if model else stored or Reading(SENSORS[kind.sensor])
+    name = parse(specs[0])[0].name if specs else FOLDER
+    reading = _reading_of(model) if model else stored or Reading(SENSORS[SOURCES[name].sensor])
     if specs and not (model or stored or sensor):
         sensor = _detected(specs[0], reading if columns is None else replace(reading, columns=tuple(columns)))
     chosen = named_sensor(sensor or reading.sensor, size)
@@ -222,7 +214,9 @@ def reading_for(
         options, _ = parse(spec)
         if options.name == FOLDER:
             refuse_other_samples(Path(options.folder), reading.sensor)
-    if reflectance_scale is None and specs:
+    if reflectance_scale is None and estimate_scale and stored is None and name == FOLDER:
+        reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
+    elif reflectance_scale is None and specs:
         reflectance_scale = usual_scale(specs[0], reading.sensor)
     requested = {
         "projection": projection, "convention": convention, "reflectance_scale": reflectance_scale,
@@ -245,7 +239,7 @@ def _detected(spec: str, reading: Reading) -> str | None:
     return mismatch and mismatch.name
 
 
-def _reading_of(model: Model) -> Reading:
+def _reading_of(model: Any) -> Reading:
     """How a model's training scans became images; for a mixture, the fields on which all parts agree."""
     data = model.config.get("data", {})
     readings = [part.get("reading") for part in data.get("parts") or ()] or [data.get("reading")]
@@ -263,18 +257,9 @@ def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale
     check(
         not Path(path).is_dir(), f"{path} is a folder, and read takes a file; r2flow.data.opening.open_scans opens it."
     )
-    reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale)
-    if reflectance_scale is None:
-        reading = estimating_scale(reading, path)
+    reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale, estimate_scale=True)
     image = torch.from_numpy(open_scans(path, replace(reading, on_bad_scan="error", within_limits=True)).source[0])
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
-
-
-def estimating_scale(reading: Reading, spec: str | Path) -> Reading:
-    """Estimate full reflectance from each file of others whose sensor does not tell it."""
-    if own_reading(spec) is not None or parse(str(spec))[0].name != FOLDER:
-        return reading
-    return replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
 
 
 def own_reading(spec: str | Path) -> Reading | None:
