@@ -11,6 +11,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from r2flow.data.loader import FlowDataset
 from r2flow.data.opening import SOURCES, find_drives
 from r2flow.data.options import SourceOptions
 from r2flow.data.prepared import plan_files, prepare
-from r2flow.data.reading import Reading, read_scan
+from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import spread
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
@@ -75,16 +76,18 @@ def simulated_files(folder: Path, num: int) -> list[Path]:
 
 def measure_projection(paths: Sequence[Path], times: int) -> None:
     """Read and project a scan: ours, ours under the reference's convention, and the plain way."""
+    ours = Reading(HDL64E, reflectance=True)
+    reference = replace(ours, convention="reference")
     taken = by_turns(
         {
-            "read_scan": lambda i: read_scan(paths[i], HDL64E),
-            "read_scan, reference convention": lambda i: read_scan(paths[i], HDL64E, convention="reference"),
+            "read_image": lambda i: read_image(paths[i], ours),
+            "read_image, reference convention": lambda i: read_image(paths[i], reference),
             "plain numpy": lambda i: plain_projection(paths[i]),
         },
         times,
         len(paths),
     )
-    same = [plain_projection(path)[0] == read_scan(path, HDL64E, convention="reference")[0] for path in paths]
+    same = [plain_projection(path)[0] == read_image(path, reference)[0] for path in paths]
     points = int(np.mean([path.stat().st_size // 16 for path in paths]))
     print(f"\nread and project a scan of about {points} points ({len(paths)} scans, {times} turns)")
     show(taken, "plain numpy")

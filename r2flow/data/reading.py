@@ -74,12 +74,6 @@ class Projected(NamedTuple):
         return image.reshape(*shape, *values.shape[1:])
 
 
-def read_scan(path: str | Path, sensor: Sensor, **options: Any) -> np.ndarray:
-    """Read a scan file as a range image, (2, H, W), or (1, H, W) without `reflectance`; `options` as in `Reading`."""
-    reading = Reading(sensor, **{"reflectance": True, "on_bad_scan": "error", **options})
-    return read_projected(path, reading).image
-
-
 def read_projected(path: str | Path, reading: Reading) -> Projected:
     """Read a file of points as an image with the points of its pixels."""
     try:
@@ -117,7 +111,7 @@ def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPoint
 
 
 def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, np.ndarray | None]:
-    """The image of `read_scan`, and the semantic id of each pixel's return, (H, W) uint16, 0 for no return.
+    """The image of a scan file, and the semantic id of each pixel's return, (H, W) uint16, 0 for no return.
 
     The ids are None if the scan has no label file.
     """

@@ -15,7 +15,7 @@ from r2flow.data.opening import SOURCES, find_drives
 from r2flow.data.options import SourceOptions
 from r2flow.data.prepared import Plan, plan_files, prepare
 from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
-from r2flow.data.reading import Reading, read_scan
+from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import ScanFiles
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
@@ -374,7 +374,7 @@ def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
     assert "reflectance as n/256, exactly" in said
     source = prepared_in(out)
     assert len(source) == 6
-    raw = read_scan(kitti_360 / source.names[5], SMALL)
+    raw = read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))
     assert np.abs(source[5] - raw).max() <= 1e-3
 
 
@@ -419,7 +419,10 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
     assert "reading.columns=" in error
     scan = wide / "000000.npy"
     assert r2flow("show", scan, *columns, "--size", "4x16", "--format", "npy", "-o", tmp_path / "image")[0] == 0
-    np.testing.assert_array_equal(np.load(tmp_path / "image" / "000000.npy"), read_scan(numbered / "000000.bin", SMALL))
+    np.testing.assert_array_equal(
+        np.load(tmp_path / "image" / "000000.npy"),
+        read_image(numbered / "000000.bin", Reading(SMALL, reflectance=True)),
+    )
     assert r2flow("evaluate", wide, scan, "--size", "4x16", "--metrics", "jsd", *columns)[0] == 0
 
 

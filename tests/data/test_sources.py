@@ -1,10 +1,11 @@
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from r2flow.data.reading import Reading, read_scan
+from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import InMemory, ScanFiles, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
@@ -12,11 +13,11 @@ from r2flow.lidar.sensors import SENSORS
 from tests.conftest import numbers, write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
+STRICT = Reading(SENSOR, reflectance=True, on_bad_scan="error")
 
 
 def files(folder: Path, **options) -> ScanFiles:
-    reading = Reading(SENSOR, reflectance=True, **{"on_bad_scan": "error", **options})
-    return ScanFiles(sorted(folder.glob("*.bin")), reading)
+    return ScanFiles(sorted(folder.glob("*.bin")), replace(STRICT, **options))
 
 
 def test_skipping_takes_the_next_good_scan_of_the_same_block(numbered: Path, caplog):
@@ -51,7 +52,7 @@ def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, ca
     rows = np.array([[10, 0, -1, 0.5], [np.nan, 0, 0, 0.5], [10, np.inf, 0, 0.5]] + [[11, 2, -1, 0.5]] * 5, np.float32)
     rows.tofile(tmp_path / "scan.bin")
     with caplog.at_level(logging.WARNING):
-        image = read_scan(tmp_path / "scan.bin", SENSOR)
+        image = read_image(tmp_path / "scan.bin", STRICT)
     assert "scan.bin: points that are NaN, infinite or beyond 10000 m are dropped (2 here" in caplog.text
     assert (image[0] > 0).sum() == 2
 
@@ -59,21 +60,21 @@ def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, ca
 def test_a_scan_out_of_range_says_its_numbers(tmp_path: Path):
     write_scan(tmp_path / "far.bin", 200)
     with pytest.raises(InputError, match=r"far.bin: none of its 1 points lies within 1.45-80 m .* 205-205 m"):
-        read_scan(tmp_path / "far.bin", SENSOR)
+        read_image(tmp_path / "far.bin", STRICT)
 
 
 def test_missing_reflectance_names_the_key(tmp_path: Path):
     write_points(tmp_path / "scan.ply", np.array([[10, 0, -1]], np.float32))
     with pytest.raises(InputError, match=r"scan.ply has no reflectance.* encoding.reflectance=false"):
-        read_scan(tmp_path / "scan.ply", SENSOR)
-    assert read_scan(tmp_path / "scan.ply", SENSOR, reflectance=False).shape == (1, 16, 64)
+        read_image(tmp_path / "scan.ply", STRICT)
+    assert read_image(tmp_path / "scan.ply", replace(STRICT, reflectance=False)).shape == (1, 16, 64)
 
 
 def test_reflectance_out_of_scale_names_the_key(tmp_path: Path):
     write_scan(tmp_path / "scan.bin", 0, reflectance=235.0)
     with pytest.raises(InputError, match=r"found up to 235.*reflectance_scale=255"):
-        read_scan(tmp_path / "scan.bin", SENSOR)
-    image = read_scan(tmp_path / "scan.bin", SENSOR, reflectance_scale=255)
+        read_image(tmp_path / "scan.bin", STRICT)
+    image = read_image(tmp_path / "scan.bin", replace(STRICT, reflectance_scale=255))
     assert image[1].max() == pytest.approx(235 / 255)
 
 
