@@ -19,9 +19,6 @@ class Bar:
     """A progress bar with rate and time left, on standard error.
 
     Args:
-        doing: Activity, such as "sampling".
-        total: Number of units.
-        unit: Unit, such as "scans".
         shown: Whether to draw it; default: on a terminal, elsewhere a line every `EVERY` seconds.
         lines: Print lines also on a terminal, since bars of several processes would overwrite each other.
     """

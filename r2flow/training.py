@@ -122,7 +122,6 @@ class Result:
     Attributes:
         metrics: The last logged value of each metric, as `train/loss`.
         checkpoint: The last checkpoint, or None.
-        folder: The run's folder.
         step: Total number of optimiser steps.
         finished: Whether `trainer.max_steps` was reached; `trainer.max_time` can stop a run earlier.
     """

@@ -21,8 +21,6 @@ class Model:
 
     Attributes:
         about: Generated scans and training data.
-        sha256: SHA-256 of the file.
-        licence: Licence of the weights.
         page: Source of the file; None: comes with the package.
     """
 

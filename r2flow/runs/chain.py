@@ -28,7 +28,6 @@ class Link:
 
     Attributes:
         name: Name in the chain, and of the folder.
-        run_dir: Run folder.
         overrides: Command line of the run.
         parent: Name of the link that it starts from, if any.
     """

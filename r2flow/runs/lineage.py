@@ -23,7 +23,6 @@ class Parent:
     """The run that another run starts from.
 
     Attributes:
-        config: Config of the parent.
         path: Checkpoint of the parent, or its folder if it has none yet.
         step: Optimiser steps taken.
         weights: `weights_hash` of the averaged weights; None if the parent is not trained yet.
