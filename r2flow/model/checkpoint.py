@@ -24,7 +24,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
-from r2flow.model.published import FORMATS, format_of, inert, plain
+from r2flow.model.published import FORMATS, inert, plain
 from r2flow.model.sampling import sample
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
@@ -223,7 +223,7 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
 
 def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     """Build the generator of a file's content, on the CPU; see `load_checkpoint`."""
-    published = format_of(content)
+    published = next((known for _, known in FORMATS.items() if known.holds(content)), None)
     if published is not None:
         converted = published.read(content, path, averaged)
         config, weights, step, kind = converted.config, converted.weights, converted.step, "published"

@@ -154,8 +154,3 @@ FORMATS: Registry[Format] = Registry(
     lidm=lazy("r2flow.systems.latent.published:DIFFUSION"),
     lidm_autoencoder=lazy("r2flow.systems.latent.published:FIRST_STAGE"),
 )
-
-
-def format_of(content: Any) -> Format | None:
-    """The published format of a torch file's content, or None."""
-    return next((known for _, known in FORMATS.items() if known.holds(content)), None)

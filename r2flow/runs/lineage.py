@@ -141,11 +141,8 @@ def inherited(key: str, config: Mapping[str, Any]) -> str:
     mode = rule(key).inherited
     if mode != "with_pairs":
         return mode
-    return "always" if _on_pairs(config) else "unless_given"
-
-
-def _on_pairs(config: Mapping[str, Any]) -> bool:
-    return STAGES[config["stage"]["name"]].needs_pairs or config["data"]["name"] == "pairs"
+    on_pairs = STAGES[config["stage"]["name"]].needs_pairs or config["data"]["name"] == "pairs"
+    return "always" if on_pairs else "unless_given"
 
 
 def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:
