@@ -35,12 +35,7 @@ class Scene:
 
 
 class SceneBuilder:
-    """Collects the solids of a scene.
-
-    Attributes:
-        ground: The ground of the scene.
-        draws: Random number generator of the scene.
-    """
+    """Collects the solids of a scene."""
 
     def __init__(self, ground: Ground, draws: ScalarDraws) -> None:
         self.ground = ground
