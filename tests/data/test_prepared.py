@@ -419,10 +419,8 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
     assert "reading.columns=" in error
     scan = wide / "000000.npy"
     assert r2flow("show", scan, *columns, "--size", "4x16", "--format", "npy", "-o", tmp_path / "image")[0] == 0
-    np.testing.assert_array_equal(
-        np.load(tmp_path / "image" / "000000.npy"),
-        read_image(numbered / "000000.bin", Reading(SMALL, reflectance=True)),
-    )
+    expected = read_image(numbered / "000000.bin", Reading(SMALL, reflectance=True))
+    np.testing.assert_array_equal(np.load(tmp_path / "image" / "000000.npy"), expected)
     assert r2flow("evaluate", wide, scan, "--size", "4x16", "--metrics", "jsd", *columns)[0] == 0
 
 

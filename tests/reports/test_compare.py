@@ -173,10 +173,7 @@ def test_the_page_is_written_with_its_picture(tmp_path):
     written = {path.name: path for path in write_page(compare_page(groups), tmp_path / "out")}
     assert set(written) == {"compare.md", "compare.csv", "compare.json", "compare.png", "compare.pdf"}
     said = written["compare.md"].read_text()
-    for words in (
-        "| bare | 1 | rectify | hdit |",
-        "| run | train loss, last tenth |",
-    ):
+    for words in ("| bare | 1 | rectify | hdit |", "| run | train loss, last tenth |"):
         assert words in said, words
     rows = json.loads(written["compare.json"].read_text())["rows"]
     assert [row["name"] for row in rows] == ["bare", "full"]
