@@ -9,6 +9,7 @@ import yaml
 
 import r2flow as package
 from r2flow.data.opening import open_scans
+from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
@@ -79,8 +80,21 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
     assert torch.equal(detected, package.read(given / "000000.bin", "pandar64"))
     assert torch.equal(detected, open_scans(given / "000000.bin").source.batch([0])[0])
     assert open_scans(given, sensor="vlp16", size=(4, 64)).sensor.shape == (4, 64)
-    with pytest.raises(InputError, match="is a folder"):
-        package.read(given)
+    for wrong in (given, f"folder:{given}"):
+        with pytest.raises(InputError, match="is a folder"):
+            package.read(wrong)
+    for wrong in ("4x64", 4, (4,), (4.5, 64)):
+        with pytest.raises(InputError, match="size"):
+            open_scans(given, size=wrong)
+    with pytest.raises(InputError, match="not both"):
+        open_scans(given, Reading(SENSORS["hdl64e"]), sensor="vlp16")
+
+
+def test_a_thinned_scan_is_not_taken_for_another_sensors(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    quarter = Sensor("quarter", SENSORS["hdl64e_rings"].elevations[::4], columns=1024)
+    file = write_scans(tmp_path / "scans", quarter, 1, 1) / "000000.bin"
+    assert package.read(file).shape == (2, 64, 1024)
+    assert "they fit 'hdl32e'" in caplog.text  # the nearest of all
 
 
 def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, tmp_path: Path):

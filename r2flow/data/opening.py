@@ -106,6 +106,7 @@ def open_scans(
     """
     label = str(spec)
     options, file = parse(label)
+    check(reading is None or (sensor is None and size is None), "give a reading, or a sensor and a size, not both.")
     reading = reading or reading_for([label], sensor=sensor, size=size)
     if file is None:
         columns = None if reading.columns is None else list(reading.columns)
@@ -233,10 +234,11 @@ def _detected(spec: str, reading: Reading) -> str | None:
     drives = [] if file else SOURCES[FOLDER].find_drives(options)
     paths = [file] if file else [path for drive in drives for path in drive.scans]
     mismatch = mismatch_of(paths, reading, options.folder)
-    if mismatch and mismatch.name:
-        name, usual = mismatch.name, reading.sensor.name
-        log.warning("%s: read as %s, not %s: %s; --sensor names another", spec, name, usual, mismatch.seen)
-    return mismatch and mismatch.name
+    if mismatch is None or not mismatch.sure:
+        return None
+    name, usual = mismatch.name, reading.sensor.name
+    log.warning("%s: read as %s, not %s: %s; --sensor names another", spec, name, usual, mismatch.seen)
+    return name
 
 
 def _reading_of(model: Any) -> Reading:
@@ -255,7 +257,8 @@ def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale
         f"reflectance_scale must be a positive number, found {reflectance_scale}.",
     )
     check(
-        not Path(path).is_dir(), f"{path} is a folder, and read takes a file; r2flow.data.opening.open_scans opens it."
+        parse(str(path))[0].name != FOLDER or parse(str(path))[1],
+        f"{path} is a folder, and read takes a file; r2flow.data.opening.open_scans opens it.",
     )
     reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale, estimate_scale=True)
     image = torch.from_numpy(open_scans(path, replace(reading, on_bad_scan="error", within_limits=True)).source[0])

@@ -120,7 +120,7 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
     mismatch, sensor = mismatch_of(paths, reading, root), reading.sensor
     if mismatch is None:
         return
-    seen, name, hopeless = mismatch
+    seen, name, hopeless, _ = mismatch
     if hopeless and reading.within_limits:
         raise InputError(f"{root}: {seen}.")
     edges = sensor.row_edges

@@ -280,15 +280,16 @@ def smoothed(e: Tensor, hidden: Tensor, elevations: Tensor) -> Tensor:
     weights = []
     for step in steps:
         reach = int(3 * TOGETHER / max(step, 1e-3)) + 1
-        weights.append(torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=e.device) * step / TOGETHER) ** 2))
+        distance = torch.arange(-reach, reach + 1, dtype=torch.float64, device=e.device) * step / TOGETHER
+        weights.append(torch.exp(-0.5 * distance**2))  # float64: neither autocast nor TF32 rounds it
 
     def convolved(x: Tensor, down: Tensor, along: Tensor) -> Tensor:
         x = F.conv2d(x, down[None, None, :, None], padding=(len(down) // 2, 0))
         side = len(along) // 2
         return F.conv2d(F.pad(x, (side, side, 0, 0), "circular"), along[None, None, None])
 
-    variance = convolved(hidden.to(e), *(w**2 for w in weights))
-    return convolved(e * hidden, *weights) / variance.clamp(min=1e-12).sqrt()
+    variance = convolved(hidden.to(weights[0]), *(w**2 for w in weights))
+    return (convolved(e.double() * hidden, *weights) / variance.clamp(min=1e-12).sqrt()).to(e)
 
 
 def gain_of(space: ModelSpace, image: Tensor, known: Tensor) -> Tensor:

@@ -57,11 +57,12 @@ class Estimate(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """A mismatch of scans and sensor: description, matching built-in sensor, whether the scans have no beams."""
+    """A mismatch of scans and sensor: description, nearest built-in sensor, no beams at all, its beams exactly."""
 
     seen: str
     name: str | None
     hopeless: bool = False
+    sure: bool = False
 
 
 def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
@@ -93,7 +94,8 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
         distance = min(_distance(beams, np.asarray(table)) for table in tables)
     if share >= IN_VIEW and distance < OFF and not (distance > BEATEN and near < distance / 2):
         return None
-    return Doubt(f"they have {len(beams)} beams from {beams[0]:+.1f} to {beams[-1]:+.1f} degrees, {seen}", name)
+    seen = f"they have {len(beams)} beams from {beams[0]:+.1f} to {beams[-1]:+.1f} degrees, {seen}"
+    return Doubt(seen, name, sure=near < BEATEN)
 
 
 def nearest_sensor(elevations: np.ndarray) -> tuple[str | None, float]:

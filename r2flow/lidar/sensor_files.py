@@ -35,6 +35,8 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
 
 def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
     """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
+    if size is not None and not (isinstance(size, tuple | list) and [type(n) for n in size] == [int, int]):
+        raise InputError(f"a size is (rows, columns), found {size!r}.")
     if isinstance(sensor, Sensor):
         return sensor if size is None else sensor.resized(*size)
     sensor = str(sensor)

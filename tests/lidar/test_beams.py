@@ -257,7 +257,7 @@ def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
     with pytest.raises(InputError, match="cannot be told apart"):
         find_beams([lost])
     assert other_sensor([lost], SENSORS["hdl64e"]) is None
-    _, name, _ = other_sensor([lost], SENSORS["vlp16"])
+    name = other_sensor([lost], SENSORS["vlp16"]).name
     assert name is None
 
 
