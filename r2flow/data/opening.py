@@ -236,9 +236,8 @@ def _detected(spec: str, reading: Reading) -> str | None:
     mismatch = mismatch_of(paths, reading, options.folder)
     if mismatch is None or not mismatch.sure:
         return None
-    name, usual = mismatch.name, reading.sensor.name
-    log.warning("%s: read as %s, not %s: %s; --sensor names another", spec, name, usual, mismatch.seen)
-    return name
+    log.warning("%s: read as scans of %s, whose beams they have; --sensor names another", spec, mismatch.name)
+    return mismatch.name
 
 
 def _reading_of(model: Any) -> Reading:
