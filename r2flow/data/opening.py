@@ -231,8 +231,7 @@ def _detected(spec: str, reading: Reading) -> str | None:
     options, file = parse(spec)
     if options.name != FOLDER:
         return None
-    drives = [] if file else SOURCES[FOLDER].find_drives(options)
-    paths = [file] if file else [path for drive in drives for path in drive.scans]
+    paths = [file] if file else [path for drive in SOURCES[FOLDER].find_drives(options) for path in drive.scans]
     mismatch = mismatch_of(paths, reading, options.folder)
     if mismatch is None or not mismatch.sure:
         return None
@@ -255,10 +254,8 @@ def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale
         reflectance_scale is None or 0 < reflectance_scale < math.inf,
         f"reflectance_scale must be a positive number, found {reflectance_scale}.",
     )
-    check(
-        parse(str(path))[0].name != FOLDER or parse(str(path))[1],
-        f"{path} is a folder, and read takes a file; r2flow.data.opening.open_scans opens it.",
-    )
+    options, file = parse(str(path))
+    check(options.name != FOLDER or file, f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
     reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale, estimate_scale=True)
     image = torch.from_numpy(open_scans(path, replace(reading, on_bad_scan="error", within_limits=True)).source[0])
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])

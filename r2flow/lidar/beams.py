@@ -57,7 +57,10 @@ class Estimate(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """A mismatch of scans and sensor: description, nearest built-in sensor, no beams at all, its beams exactly."""
+    """What was `seen` in scans that do not fit a sensor; hopeless: they have no beams.
+
+    `name` is the nearest built-in sensor within `OFF`; sure: it is within `BEATEN`.
+    """
 
     seen: str
     name: str | None
