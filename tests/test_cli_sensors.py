@@ -1,5 +1,6 @@
 """`r2flow sensor` and a user's own sensors."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,8 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
     images = [np.load(out / f"show{forced}" / "000000.npy") for forced in ("", "--sensorhdl64e")]
     assert (images[0][0] > 0).sum() > 1.1 * (images[1][0] > 0).sum()  # hdl64e sees 92 % of the returns
     assert r2flow("show", given, "--sensor", "pandar64", "--out", out)[::2] == (0, "")
+    (given / "answers").mkdir()  # of `complete`, next to the scans: they stay the sensor's own
+    shutil.copy(out / "prepare" / "manifest.json", given / "answers")
     detected = package.read(given / "000000.bin")
     assert torch.equal(detected, package.read(given / "000000.bin", "pandar64"))
     assert torch.equal(detected, open_scans(given / "000000.bin").source.batch([0])[0])
@@ -115,6 +118,9 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     assert "reflectance" not in r2flow("evaluate", *given, "--json", tmp_path / "e.json")[2]
     r2flow("show", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 510, *npy)
     assert np.load(image)[1].max() == pytest.approx(raw.max() / 510, abs=0.01)  # what is given comes first
+    assert (
+        "below a tenth" in r2flow("show", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 5100, *npy)[2]
+    )
 
 
 @pytest.mark.parametrize(("file", "name"), [

@@ -19,6 +19,12 @@ from r2flow.lidar.sensors import Sensor
 
 AUTO = "auto"
 
+FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
+DARK = (
+    "reflectance stays below a tenth of full reflectance: give its value as --reflectance-scale, in training as "
+    "data.reading.reflectance_scale; r2flow sensor estimates it"
+)
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -137,6 +143,8 @@ def scaled_reflectance(path: str | Path, points: Points, scale: float | None) ->
     highest = float(np.nan_to_num(points.reflectance).max(initial=0))
     if scale is None:
         scale = 1.0 if highest <= 1 else max(highest, 255.0)
+    if 0 < highest < FAINT * scale:
+        warn_odd(Path(path), DARK, len(points.reflectance))
     scaled = points.reflectance / np.float32(scale)
     # NaN compares false and is refused, too.
     if not (float(scaled.max(initial=0)) <= 1 + 1e-3 and float(scaled.min(initial=0)) >= 0):

@@ -21,7 +21,7 @@ from torch import Tensor
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.errors import InputError
 from r2flow.lidar.beams import Doubt, other_sensor
-from r2flow.lidar.scan_files import read_points, read_range_image
+from r2flow.lidar.scan_files import read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import MANIFEST
 
@@ -91,15 +91,18 @@ class ScanSource(ABC):
 
 
 def made_here(root: str | Path) -> bool:
-    """Whether r2flow wrote the samples or simulated scans in a folder, its subfolders or the folder of a file."""
+    """Whether r2flow wrote the samples or simulated scans in a folder or the folder of a file.
+
+    Subfolders count if the folder itself holds no scan: answers are often written next to the scans.
+    """
     folder = Path(root).expanduser()
     if folder.is_file():
         folder = folder.parent
-    if not folder.is_dir():
-        return False
+    if not folder.is_dir() or (folder / MANIFEST).is_file():
+        return folder.is_dir()
     with os.scandir(folder) as entries:  # knows folders without a system call per file
-        places = [folder, *(Path(entry.path) for entry in entries if entry.is_dir())]
-    return any((place / MANIFEST).is_file() for place in places)
+        below = {entry.path: entry.is_dir() for entry in entries if entry.is_dir() or scan_ending(entry.name)}
+    return all(below.values()) and any(Path(place, MANIFEST).is_file() for place in below)
 
 
 def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> Doubt | None:

@@ -26,6 +26,7 @@ COLUMNS = 64  # image widths are multiples of it, so that every backbone can hal
 FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full reflectance
 IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
 OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
+MOST_VOID = 0.1  # share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16
 BEATEN = 0.5  # degrees: beyond it, a sensor does not match if another sensor is twice as near
 
 RINGS = "a ring number at each point"
@@ -96,9 +97,18 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
         tables += [other.elevations for name, other in SENSORS.items() if _family(name) == _family(sensor.name)]
         distance = min(_distance(beams, np.asarray(table)) for table in tables)
     if share >= IN_VIEW and distance < OFF and not (distance > BEATEN and near < distance / 2):
-        return None
+        void = _rows_between_beams(elevation, edges) if len(beams) >= len(sensor.elevations) else 0
+        seen = f"{void} of its {len(sensor.elevations)} rows lie between their beams and stay empty"
+        return Doubt(seen, None) if void > len(sensor.elevations) * MOST_VOID else None
     seen = f"they have {len(beams)} beams from {beams[0]:+.1f} to {beams[-1]:+.1f} degrees, {seen}"
     return Doubt(seen, name, sure=near < BEATEN)
+
+
+def _rows_between_beams(elevation: np.ndarray, edges: np.ndarray) -> int:
+    """The number of rows without returns between rows with returns."""
+    count = np.histogram(-elevation, -edges)[0]
+    seen = np.flatnonzero(count > 0.02 * np.median(count))
+    return int(seen[-1] - seen[0] + 1 - len(seen)) if len(seen) else 0
 
 
 def nearest_sensor(elevations: np.ndarray) -> tuple[str | None, float]:
