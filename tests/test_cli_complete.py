@@ -1,6 +1,7 @@
 """r2flow complete: as a user types it."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+import r2flow
 from r2flow.data.opening import open_scans
 from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading
@@ -315,10 +317,18 @@ def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):
         ("rellis_vlp32c/vel000104.bin", "32 beams"),
     ],
 )
-def test_real_scans_of_other_sensors_are_completed(complete, shared, tmp_path, scan, beams):
-    said = success(complete(shared / "real" / "other_sensors" / scan))
+def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_path, scan, beams):
+    file = shared / "real" / "other_sensors" / scan
+    said = success(complete(file))
     assert beams in said
     assert "1 scans written" in said
+    kept, given = (
+        int(number.replace(",", "")) for number in re.search(r"([\d,]+) of ([\d,]+) measured", said).groups()
+    )
+    assert 0 < kept <= given == np.count_nonzero(read_points(file).xyz.any(axis=1))
+    flow, (written,) = r2flow.load(run), (file for file in (tmp_path / "out").iterdir() if file.suffix != ".json")
+    (cloud,) = flow.points(flow.complete(file)[0])
+    assert len(cloud) == len(read_points(written).xyz)
 
 
 def test_the_errors_of_hidden_rays_stand_next_to_those_of_interpolation():
@@ -384,7 +394,7 @@ def test_the_model_is_chosen_by_what_is_missing(complete, tmp_path, mask, more, 
     write_points(tmp_path / "one.ply", *image_to_points(image, SENSORS["hdl64e"].resized(64, 512).rays()))
     said = success(complete(tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, model=None))
     assert f"the model {model}: " in said
-    assert f"of the image, {size}" in said
+    assert f"in each pixel of {size}" in said
     assert len(read_points(tmp_path / "out" / "one.ply").xyz) > 1000
 
 

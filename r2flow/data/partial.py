@@ -199,7 +199,7 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
             seen = points_through(points, fired, target, strength)
     if not seen.image[0].any():
         raise nothing_in_view(path, points, target)
-    return seen
+    return replace(seen, returns=int(points.xyz.any(axis=1).sum()))
 
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:

@@ -16,6 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.config import check_tree, learned
+from r2flow.data.opening import reading_for
+from r2flow.data.partial import open_partial
 from r2flow.errors import InputError, naming
 from r2flow.files import atomic_write, parse_json, telling
 from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
@@ -87,14 +89,25 @@ class Checkpoint:
         """
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
-    def complete(self, images: Tensor, state: Tensor | None = None, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
+    def complete(
+        self, images: Tensor | str | Path, state: Tensor | None = None, num: int = 1, seed: int = 0, **how: Any
+    ) -> Tensor:
         """Complete partial scans, (B, num, 2 or 1, H, W), in the format of `sample`.
 
         Args:
-            images: Range in metres and optionally reflectance, (B, 2 or 1, H, W).
-            state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`.
+            images: Range in metres and optionally reflectance, (B, 2 or 1, H, W), or a scan file of any sensor, or a
+                folder of them.
+            state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`. A file's
+                rays are not measured where no beam looks.
             how: Options of `r2flow.model.completion.complete`: name, steps, batch_size, ...
         """
+        if isinstance(images, str | Path):
+            scans, remarks = open_partial([str(images)], reading_for([], self))
+            seen = [scan.read() for scan in scans]
+            images = torch.from_numpy(np.stack([one.image for one in seen]))
+            state = torch.from_numpy(np.stack([one.state for one in seen]))
+            if remarks and isinstance(self.generator, TransferFlow):  # another sensor fills other rows
+                self = self.through(self.sensor, numbered=False)
         return torch.stack([completed.images for completed in complete(self, images, state, num, seed, **how)])
 
     def through(self, sensor: Sensor | str, numbered: bool = True) -> "Checkpoint":

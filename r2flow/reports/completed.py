@@ -88,11 +88,13 @@ def write_completed(
             raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, np.ndarray | None] = {}
+    kept = returns = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with ScanBar("completing", len(left) * job.num, len(left) * batches, "answers") as bar:
         for number in left:
             scan = scans[number]
             whole, given = hiding(scan, job, number)
+            kept, returns = kept + int((whole.state == Ray.RETURN).sum()), returns + whole.returns
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (completed,) = complete(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,
@@ -108,6 +110,9 @@ def write_completed(
             if not completed.evaluations.any():
                 print(f"{scan.name}: everything is known, so nothing was completed; see --fill-gaps and --mask")
             bar.set(len(done) * job.num)
+    if returns:
+        size = "x".join(map(str, checkpoint.sensor.shape))
+        print(f"{kept:,} of {returns:,} measured points are kept: in the view, the nearest in each pixel of {size}")
     return done
 
 
@@ -177,8 +182,7 @@ def remarks_on_files(checkpoint: Checkpoint, scans: Sequence[PartialScan]) -> li
     remarks = [f"completions of {ending} files are written as .ply" for ending in sorted(changed)]
     if not checkpoint.encoding.reflectance:
         remarks.append("the model is of range alone: answers have no reflectance")
-    size = "x".join(map(str, checkpoint.sensor.shape))
-    return [*remarks, f"completions have at most one point per pixel of the image, {size}"]
+    return remarks
 
 
 def answer_ending(checkpoint: Checkpoint, scan: PartialScan) -> str:
