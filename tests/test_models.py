@@ -1,8 +1,6 @@
 """Generators that have a name: those in the package, and those in the folder of models."""
 
 import hashlib
-import importlib
-import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -24,7 +22,7 @@ from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
 from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
 from r2flow.simulator import simulate
-from tests.conftest import ROOT, Trap
+from tests.conftest import ROOT
 
 PACKAGED = [name for name, model in MODELS.items() if model.page is None]
 
@@ -211,36 +209,3 @@ def test_the_files_of_the_release_are_the_models_that_they_are_named_after(tmp_p
 def test_torch_hub_gives_the_model_of_the_package():
     flow = torch.hub.load(str(ROOT), "street", source="local")
     assert torch.equal(flow.sample(1, steps=1), r2flow.load("street").sample(1, steps=1))
-
-
-@pytest.fixture
-def hub():
-    pytest.importorskip("huggingface_hub")
-    return importlib.import_module("r2flow.model.hub")
-
-
-def test_a_folder_for_the_hub_holds_the_flow_and_nothing_else(hub, tmp_path):
-    hub.HubFlow("street").save_pretrained(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"README.md", "model.safetensors"}
-    assert str(tmp_path) not in (tmp_path / "README.md").read_text()
-    back = hub.HubFlow.from_pretrained(str(tmp_path))
-    assert torch.equal(back.sample(1, steps=1), r2flow.load("street").sample(1, steps=1))
-
-
-def test_nothing_in_such_a_folder_is_unpickled(hub, tmp_path):
-    for name in ("pytorch_model.bin", "model.pt", "step-00000001.ckpt"):
-        (tmp_path / name).write_bytes(pickle.dumps(Trap()))
-    with pytest.raises(InputError, match="no checkpoint at"):
-        hub.HubFlow.from_pretrained(str(tmp_path))
-    (tmp_path / hub.FILE).write_bytes(pickle.dumps(Trap()))
-    with pytest.raises(InputError, match="not a readable .safetensors file"):
-        hub.HubFlow.from_pretrained(str(tmp_path))
-
-
-def test_what_from_pretrained_does_not_know_is_refused(hub, tmp_path):
-    hub.HubFlow("street").save_pretrained(tmp_path)
-    with pytest.raises(TypeError, match="stepps"):
-        hub.HubFlow.from_pretrained(str(tmp_path), stepps=3)
-    with pytest.raises(InputError, match="device must be auto, cpu"):
-        hub.HubFlow.from_pretrained(str(tmp_path), device="gpu")
-    assert hub.HubFlow.from_pretrained(str(tmp_path), device="auto").checkpoint.generator.space.sensor.name
