@@ -172,9 +172,13 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str
 
 
 def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
-    """Suggested commands after sampling a run to `out`: training on real scans, the next link, or evaluation."""
+    """Suggested commands after sampling a run to `out`: training on real scans, the next link, or evaluation.
+
+    A flow that went on from another one is evaluated first.
+    """
     plugins = "".join(f" --plugin {shlex.quote(str(name))}" for name in config.get("plugins") or ())
-    experiment = {"rectify": "reflow", "reflow": "distill"}.get(config["stage"]["name"])
+    stage = config["stage"]
+    experiment = {"rectify": None if stage.get("init") else "reflow", "reflow": "distill"}.get(stage["name"])
     if config["data"]["name"] == "simulated":
         then = "train data=kitti_raw data.root=FOLDER backbone=hdit_small"
     elif experiment:

@@ -48,12 +48,13 @@ def test_a_run_leaves_everything_in_its_folder_and_says_where(alone: tuple[Path,
 def test_next_is_what_has_not_been_done(alone: tuple[Path, str]):
     run, said = alone  # of a flow that was trained on scans in files
     assert f"r2flow train experiment=reflow stage.init={run.relative_to(run.parents[1])}" in said
-    for stage, data, words in (
-        ("rectify", "simulated", "data=kitti_raw data.root=FOLDER"),
-        ("reflow", "pairs", "experiment=distill stage.init=a"),
-        ("distill", "pairs", "r2flow evaluate REAL a"),
+    for stage, init, data, words in (
+        ("rectify", None, "simulated", "data=kitti_raw data.root=FOLDER"),
+        ("rectify", "street", "folder", "r2flow evaluate REAL a"),
+        ("reflow", "b", "pairs", "experiment=distill stage.init=a"),
+        ("distill", "b", "pairs", "r2flow evaluate REAL a"),
     ):
-        config = {"stage": {"name": stage}, "data": {"name": data}}
+        config = {"stage": {"name": stage, "init": init}, "data": {"name": data}}
         assert words in what_next(Path("a"), Path("a/samples"), config=config).splitlines()[-1]
 
 
