@@ -47,4 +47,4 @@ def print_contents(contents: dict[str, Any]) -> None:
     print_table([(key, str(value)) for key, value in summary.items()], ("", ""))
     print()
     config = flatten({key: value for key, value in contents["config"].items() if key != "published"})
-    print_table([(key, str(value)) for key, value in config], ("config", "value"))
+    print_table([(key, str(value)) for key, value in config if value is not None], ("config", "value"))
