@@ -27,7 +27,7 @@ FIXED = {
 }  # fmt: skip
 MEASURED = {
     "train_loss": "train loss, last tenth", "val_best": "val loss, best", "val_last": "val loss, last",
-    "straightness": "s / length^2",
+    "straightness": "bend",
 }  # fmt: skip
 
 
@@ -186,8 +186,8 @@ def tables(groups: Groups) -> dict[str, tuple[list[list[str]], list[str]]]:
 
 NOTES = (
     "Losses are those that were logged: of validation, with the averaged weights; compare them only between runs with "
-    "the same loss and the same data. s / length^2 is the last `curvature/s_normalised`; an untrained flow is straight "
-    "too. Several seeds: mean ± standard deviation."
+    "the same loss and the same data. Bend is the last `curvature/s_normalised`, s(t) over the squared path length; an "
+    "untrained flow is straight too. Several seeds: mean ± standard deviation."
 )
 
 

@@ -104,7 +104,7 @@ def summary(flow: Paths) -> dict[str, Any]:
 
 
 COLUMNS = {
-    "checkpoint": "checkpoint", "integral": "int s dt", "integral_normalised": "int s dt / length^2",
+    "checkpoint": "checkpoint", "integral": "int s dt", "integral_normalised": "bend: int s dt / length^2",
     "t_of_most": "t of the maximum", "first_tenth": "share in t < 0.1", "last_tenth": "share in t >= 0.9",
 }  # fmt: skip
 
