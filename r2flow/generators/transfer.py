@@ -28,6 +28,7 @@ FINEST = 1e-3  # smallest Laplace scale on log r
 FREE, SHIFT = 0.3, 0.02  # log r per unit of network output: of the free candidate, of a neighbour
 NEVER = -1e4  # logit of a missing candidate
 REFLECTANCE = 0.265  # mean reflectance of returns to which scans of other sensors are scaled: of simulated scans
+FOREIGN = 0.5  # share of the correction of reflectance that is taken for other sensors: best on three real scans
 TOGETHER = math.radians(1.5)  # correlation length of drawn answers: best panel on scans of KITTI raw and object
 WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0}  # loss weights
 
@@ -93,9 +94,9 @@ class TransferFlow(Flow):
 
         v = (E[x_1 | x_t] - x_t) / (1 - t).
 
-    A step that ends at t = 1 takes the candidate of least expected error instead, or no return if that is more likely:
-    one evaluation gives the median of each ray. The sampler `transport` draws diverse completions. Known rays are
-    returned bit for bit. Images can have any size and sensor (`at`).
+    A step that ends at t = 1 takes the candidate of least expected error instead, with the mean reflectance, or no
+    return if that is more likely: one evaluation gives the median of each ray. The sampler `transport` draws
+    diverse completions. Known rays are returned bit for bit. Images can have any size and sensor (`at`).
 
     Args:
         backbone: Name and options of a backbone for any size, as in conf/backbone/local.yaml.
@@ -151,7 +152,7 @@ class TransferFlow(Flow):
         ranges = torch.cat([about.ranges + SHIFT * shifts[:, :6], about.guess + FREE * shifts[:, 6:]], 1)
         scales = (scales - 4).clamp(max=2).exp() + FINEST
         nearest = about.strengths.gather(1, about.there.int().argmax(1, keepdim=True))
-        strengths = torch.cat([about.strengths, nearest], 1) + strength
+        strengths = torch.cat([about.strengths, nearest], 1) + strength * (FOREIGN if self.foreign else 1.0)
         returns = torch.where(about.sure != 0, -NEVER * about.sure, returns + 1)
         return Answers(logits, ranges, scales, returns, strengths.clamp(0, 1) if not self.training else strengths)
 
@@ -193,9 +194,9 @@ class TransferFlow(Flow):
         return self.answers(t, x.float(), about, condition["rows"])
 
     def _chosen(self, answers: Answers) -> Tensor:
-        best = answers.least_error()
-        r = self._within(answers.ranges.gather(1, best))
-        return encoded(self.space, r * (answers.returns > 0), answers.strengths.gather(1, best) * (answers.returns > 0))
+        r = self._within(answers.ranges.gather(1, answers.least_error()))
+        strength = (answers.logits.exp() * answers.strengths).sum(1, keepdim=True)
+        return encoded(self.space, r * (answers.returns > 0), strength * (answers.returns > 0))
 
     def _mean(self, answers: Answers) -> Tensor:
         p, q = answers.logits.exp(), answers.returns.sigmoid()

@@ -123,6 +123,14 @@ def answers() -> Answers:
     return Answers(logits.log_softmax(1), ranges, scales.abs() / 4 + 0.1, nothing[:, :1], nothing)
 
 
+def test_reflectance_is_the_mean_over_the_candidates(flow):
+    p = torch.tensor([0.25, 0.75, 0, 0, 0, 0, 0])[None, :, None, None]
+    strengths = torch.linspace(0.1, 0.7, 7)[None, :, None, None]
+    sure = Answers(p.clamp(min=1e-30).log(), 2 + 0 * p, 0 * p + 0.1, torch.ones(1, 1, 1, 1), strengths)
+    made = flow.space.decode(flow._chosen(sure))[0, :, 0, 0]
+    torch.testing.assert_close(made, torch.tensor([math.exp(2), 0.25 * 0.1 + 0.75 * 0.2]))
+
+
 def integral(answers: Answers, end: float, weight=lambda x: 1.0) -> float:
     """Of the density of log r times a weight, up to an end."""
 
