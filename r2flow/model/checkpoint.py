@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from r2flow.config import check_tree, learned
 from r2flow.data.opening import reading_for
 from r2flow.data.partial import open_partial
-from r2flow.errors import InputError, naming
+from r2flow.errors import InputError, check, naming
 from r2flow.files import atomic_write, parse_json, telling
 from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
 from r2flow.hashing import state_hash
@@ -102,6 +102,7 @@ class Checkpoint:
             how: Options of `r2flow.model.completion.complete`: name, steps, batch_size, ...
         """
         if isinstance(images, str | Path):
+            check(state is None, "a scan file has the states of its rays: give no state.")
             scans, remarks = open_partial([str(images)], reading_for([], self))
             seen = [scan.read() for scan in scans]
             images = torch.from_numpy(np.stack([one.image for one in seen]))
