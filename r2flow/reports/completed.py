@@ -213,7 +213,8 @@ def _draw(
     """Write `NAME.png` with two answers, `NAME.html` with more."""
     rays = checkpoint.sensor.rays()
     whole = [("the whole scan", truth.image)] if truth else []
-    answers = [(f"answer {number}", image) for number, image in enumerate(completed.images.numpy()[:SHOWN])]
+    shown = completed.images.numpy()[:SHOWN]
+    answers = [(f"answer {number}" if len(shown) > 1 else "answer", image) for number, image in enumerate(shown)]
     first, *_ = named = [("what is known", given.image), *answers, *whole]
     names, images = zip(*named, strict=True)
     write_page(out / f"{scan.name}.html", images, rays, names, title=scan.name)
