@@ -17,6 +17,7 @@ from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, step_of
 from r2flow.reports.outputs import what_next
+from r2flow.reports.training import read_curves
 from r2flow.runs.folder import read_config
 from r2flow.signals import LATER
 from tests.killing import wait_until
@@ -65,6 +66,13 @@ def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
     assert "checkpoint" in done.stdout
     assert "(single batches: too few to compare)" in done.stdout
     torch.testing.assert_close(weights(copied), before, rtol=0, atol=0)
+
+
+def test_a_run_from_weights_begins_with_their_validation_loss(train: Run, alone: tuple[Path, str], tmp_path: Path):
+    train("name=more", f"stage.init={alone[0]}", "trainer.max_steps=3")
+    before, after = (read_curves(run)["val/loss"][1] for run in (alone[0], tmp_path / "runs" / "more"))
+    assert len(after) == 2
+    assert after[0] == pytest.approx(before[-1], rel=1e-5)
 
 
 def stop_held(held: Path, by: int, command: list[str]) -> tuple[int, str]:
