@@ -286,10 +286,10 @@ def test_numeric_times_decide_the_number_of_steps():
     [
         ({"grid": ("a", "b")}, "grid"),
         ({"steps": 1.5}, "steps"),
-        ({"name": "dopri5", "tolerance": "x"}, "tolerance"),
-        ({"name": "sde", "finish": 1.5}, "finish"),
-        ({"name": "sde", "churn": -1.0}, "churn"),
-        ({"name": "jump"}, "map"),
+        ({"sampler": "dopri5", "tolerance": "x"}, "tolerance"),
+        ({"sampler": "sde", "finish": 1.5}, "finish"),
+        ({"sampler": "sde", "churn": -1.0}, "churn"),
+        ({"sampler": "jump"}, "map"),
         ({"condition": {"known": torch.ones(3, 1, 8, 32)}}, "condition"),
     ],
 )

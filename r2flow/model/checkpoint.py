@@ -85,7 +85,7 @@ class Checkpoint:
         """Scans 0 to num - 1 of a seed: range in metres and reflectance, (num, 2 or 1, H, W), 0 without a return.
 
         Args:
-            how: Options of `r2flow.model.sampling.sample`: name, steps, batch_size, region, ...
+            how: Options of `r2flow.model.sampling.sample`: sampler, steps, batch_size, region, ...
         """
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
@@ -99,7 +99,7 @@ class Checkpoint:
                 folder of them.
             state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`. A file's
                 rays are not measured where no beam looks.
-            how: Options of `r2flow.model.completion.complete`: name, steps, batch_size, ...
+            how: Options of `r2flow.model.completion.complete`: sampler, steps, batch_size, ...
         """
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")

@@ -90,15 +90,17 @@ def complete(
         batch_size: Answers per batch. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
         progress: Called after every network evaluation of a batch.
-        changes: `name` and fields of the sampler: steps, grid, ...
+        changes: Fields of the sampler: steps, grid, ...
 
     Raises:
         InputError: a generator that cannot complete scans, images or states that do not fit it, or values outside its
             sensor's range.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    named: dict[str, Any] = {"name": sampler, "several": num > 1, **changes}
-    how = sampler.changed(**changes) if isinstance(sampler, Sampler) else completing(generator, **named)
+    if isinstance(sampler, Sampler):
+        how = sampler.changed(**changes)
+    else:
+        how = completing(generator, sampler, several=num > 1, **changes)
     plain = generator.sampler if how.completes else how  # for a scan without a known ray
     images = torch.as_tensor(images).detach().float().cpu()
     if state is None:

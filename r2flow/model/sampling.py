@@ -68,7 +68,7 @@ def sample(
             whole image.
         precision: Precision of the network, see `Generator.forward`.
         progress: Called after every network evaluation of a batch.
-        changes: `name` and fields of the sampler (`Generator.choose`): steps, tolerance, grid, ...
+        changes: Fields of the sampler: steps, tolerance, grid, ...
 
     Raises:
         InputError: num or batch_size below 1, a sampler that the generator does not have, an invalid field
@@ -77,8 +77,7 @@ def sample(
     generator = source if isinstance(source, Generator) else source.generator
     if not (isinstance(num, Integral) and isinstance(batch_size, Integral) and num >= 1 and batch_size >= 1):
         raise InputError(f"needs at least one scan and a batch of at least one; found {num!r} and {batch_size!r}.")
-    named: dict[str, Any] = {"name": sampler, **changes}
-    chosen = sampler.changed(**changes) if isinstance(sampler, Sampler) else generator.choose(**named)
+    chosen = sampler.changed(**changes) if isinstance(sampler, Sampler) else generator.choose(sampler, **changes)
     for name, value in (condition or {}).items():
         if len(value) != num:
             raise InputError(f"the condition's {name} has {len(value)} scans, but num is {num}.")
