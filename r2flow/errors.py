@@ -57,11 +57,12 @@ def naming(path: str | Path) -> Iterator[None]:
 _warned: set[tuple[Path, str]] = set()  # folders and kinds of odd values
 
 
-def warn_odd(path: Path, kind: str, count: int) -> None:
+def warn_odd(path: Path, kind: str, points: int = 0) -> None:
     """Warn about odd values of a file, once per folder and kind in a process."""
     if (path.parent, kind) not in _warned:
         _warned.add((path.parent, kind))
-        log.warning("%s: %s (%d here; the folder's other files are not reported)", path, kind, count)
+        number = f" ({points:,} points; the folder's other files are not reported)" if points else ""
+        log.warning("%s: %s%s", path, kind, number)
 
 
 def explain_mistake(error: InputError | OSError) -> str:

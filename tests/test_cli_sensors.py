@@ -77,8 +77,10 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
     images = [np.load(out / f"show{forced}" / "000000.npy") for forced in ("", "--sensorhdl64e")]
     assert (images[0][0] > 0).sum() > 1.1 * (images[1][0] > 0).sum()  # hdl64e sees 92 % of the returns
     assert r2flow("show", given, "--sensor", "pandar64", "--out", out)[::2] == (0, "")
-    (given / "answers").mkdir()  # of `complete`, next to the scans: they stay the sensor's own
+    (given / "answers").mkdir()  # of `complete`, next to the scans: no scans, and the scans stay the sensor's own
     shutil.copy(out / "prepare" / "manifest.json", given / "answers")
+    shutil.copy(given / "000000.bin", given / "answers")
+    assert len(open_scans(given)) == 2
     detected = package.read(given / "000000.bin")
     assert torch.equal(detected, package.read(given / "000000.bin", "pandar64"))
     assert torch.equal(detected, open_scans(given / "000000.bin").source.batch([0])[0])

@@ -12,8 +12,9 @@ from pathlib import Path
 from r2flow.data.options import SourceOptions
 from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
-from r2flow.errors import InputError
+from r2flow.errors import InputError, warn_odd
 from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS, scan_ending
+from r2flow.store import MANIFEST
 
 log = logging.getLogger(__name__)
 
@@ -170,14 +171,20 @@ def folder(root: Path) -> list[Drive]:
     """Any folder of .bin, .pcd.bin, .pcd, .ply, .npy, .xyz, .las, .laz, .feather, .parquet, else of .csv, .txt, .npz.
 
     Each folder below it with such files is a drive. If a scan exists in several formats, one file is taken: its range
-    image, else the last by its ending.
+    image, else the last by its ending. Folders that r2flow wrote below a folder of other scans are left out: answers
+    would be taken for measurements.
     """
     below = sorted(Path(place) for place, _ in _walk(root))
+    made = {place for place in below if place != root and (place / MANIFEST).is_file()}
+    own = [place for place in below if made.isdisjoint((place, *place.parents))]
     for endings in (FIRM_ENDINGS, LOOSE_ENDINGS):
-        drives = [Drive(str(place.relative_to(root)), _one_of_each(_files(place, endings))) for place in below]
-        if any(drive.scans for drive in drives):
-            break
-    return drives
+        for places in (own, below):
+            drives = [Drive(str(place.relative_to(root)), _one_of_each(_files(place, endings))) for place in places]
+            if any(drive.scans for drive in drives):
+                if len(places) < len(below):
+                    warn_odd(min(made), "left out, since r2flow wrote it, as are other such folders below the scans")
+                return drives
+    return []
 
 
 def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:

@@ -144,7 +144,7 @@ def scaled_reflectance(path: str | Path, points: Points, scale: float | None) ->
     if scale is None:
         scale = 1.0 if highest <= 1 else max(highest, 255.0)
     if 0 < highest < FAINT * scale:
-        warn_odd(Path(path), DARK, len(points.reflectance))
+        warn_odd(Path(path), DARK)
     scaled = points.reflectance / np.float32(scale)
     # NaN compares false and is refused, too.
     if not (float(scaled.max(initial=0)) <= 1 + 1e-3 and float(scaled.min(initial=0)) >= 0):

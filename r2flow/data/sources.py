@@ -91,18 +91,15 @@ class ScanSource(ABC):
 
 
 def made_here(root: str | Path) -> bool:
-    """Whether r2flow wrote the samples or simulated scans in a folder or the folder of a file.
-
-    Subfolders count if the folder itself holds no scan: answers are often written next to the scans.
-    """
+    """Whether r2flow wrote the samples or simulated scans in a folder, in all folders in it, or next to a file."""
     folder = Path(root).expanduser()
     if folder.is_file():
         folder = folder.parent
     if not folder.is_dir() or (folder / MANIFEST).is_file():
         return folder.is_dir()
     with os.scandir(folder) as entries:  # knows folders without a system call per file
-        below = {entry.path: entry.is_dir() for entry in entries if entry.is_dir() or scan_ending(entry.name)}
-    return all(below.values()) and any(Path(place, MANIFEST).is_file() for place in below)
+        below = [Path(entry.path, MANIFEST) for entry in entries if entry.is_dir() or scan_ending(entry.name)]
+    return bool(below) and all(manifest.is_file() for manifest in below)
 
 
 def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> Doubt | None:
@@ -131,7 +128,7 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
     if name is not None and name != sensor.name:
         advice = f"they fit '{name}': sensor={name} in training, --sensor {name} in verbs"
     log.warning(
-        "%s: the scans do not look like those of sensor '%s', which sees %+.1f to %+.1f degrees: %s; %s",
+        "%s: read as scans of sensor '%s', which sees %+.1f to %+.1f degrees, but %s; %s",
         root, sensor.name, edges[0], edges[-1], seen, advice,
     )  # fmt: skip
 

@@ -90,7 +90,14 @@ class Checkpoint:
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
     def complete(
-        self, images: Tensor | str | Path, state: Tensor | None = None, num: int = 1, seed: int = 0, **how: Any
+        self,
+        images: Tensor | str | Path,
+        state: Tensor | None = None,
+        num: int = 1,
+        seed: int = 0,
+        *,
+        sensor: Sensor | str | None = None,
+        **how: Any,
     ) -> Tensor:
         """Complete partial scans, (B, num, 2 or 1, H, W), in the format of `sample`.
 
@@ -99,11 +106,13 @@ class Checkpoint:
                 folder of them.
             state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`. A file's
                 rays are not measured where no beam looks.
+            sensor: Sensor of the files, by name or YAML file; None: found by their beams.
             how: Options of `r2flow.model.completion.complete`: sampler, steps, batch_size, ...
         """
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")
-            scans, remarks = open_partial([str(images)], reading_for([], self))
+            source = None if sensor is None else named_sensor(sensor)
+            scans, remarks = open_partial([str(images)], reading_for([], self), source)
             seen = [scan.read() for scan in scans]
             images = torch.from_numpy(np.stack([one.image for one in seen]))
             state = torch.from_numpy(np.stack([one.state for one in seen]))

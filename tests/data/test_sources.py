@@ -53,7 +53,7 @@ def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, ca
     rows.tofile(tmp_path / "scan.bin")
     with caplog.at_level(logging.WARNING):
         image = read_image(tmp_path / "scan.bin", STRICT)
-    assert "scan.bin: points that are NaN, infinite or beyond 10000 m are dropped (2 here" in caplog.text
+    assert "scan.bin: points that are NaN, infinite or beyond 10000 m are dropped (2 points" in caplog.text
     assert (image[0] > 0).sum() == 2
 
 
