@@ -235,7 +235,7 @@ def _detected(spec: str, reading: Reading) -> str | None:
     mismatch = mismatch_of(paths, reading, options.folder)
     if mismatch is None or not mismatch.sure:
         return None
-    log.warning("%s: read as scans of %s, whose beams they have; --sensor names another", spec, mismatch.name)
+    log.warning("%s: read as scans of %s, whose beams are nearest; --sensor names another", spec, mismatch.name)
     return mismatch.name
 
 

@@ -142,7 +142,7 @@ def scaled_reflectance(path: str | Path, points: Points, scale: float | None) ->
         raise _no_reflectance(path)
     highest = float(np.nan_to_num(points.reflectance).max(initial=0))
     if scale is None:
-        scale = 1.0 if highest <= 1 else max(highest, 255.0)
+        scale = max(highest, 255.0) if highest > 1 else highest if 0 < highest < FAINT else 1.0
     if 0 < highest < FAINT * scale:
         warn_odd(Path(path), DARK)
     scaled = points.reflectance / np.float32(scale)
