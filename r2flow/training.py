@@ -282,6 +282,7 @@ def fit(run: Run) -> Result:
     with stopping.listening(), _quiet():
         run.data.setup()
         run.config["scans"] = run.data.fingerprint()
+        log.info("training on %s", run.config["scans"].partition(",")[0])
         run.stage.config = dict(run.config)
         if run.config["trainer"]["fast_dev_run"]:
             run.trainer.fit(run.stage, run.data)
