@@ -93,7 +93,7 @@ def test_a_lost_device_is_one_line(monkeypatch, tmp_path: Path, message: str):
         raise RuntimeError(message)
 
     trainer = SimpleNamespace(world_size=2, max_steps=4, is_global_zero=False, fit=fit)
-    run = SimpleNamespace(trainer=trainer, folder=tmp_path, config={"stage": {}}, data=None, stage=torch.nn.Linear(1, 1))
+    run = SimpleNamespace(trainer=trainer, folder=tmp_path, config={"stage": {}}, data=None, stage=torch.nn.ReLU())
     monkeypatch.setattr(r2flow.training, "open_run", lambda *_: None)
     with pytest.raises(InputError, match="device"):
         r2flow.training._fit_in_folder(run)

@@ -18,7 +18,6 @@ from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
 
 AUTO = "auto"
-
 FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
 DARK = (
     "reflectance stays below a tenth of full reflectance: give its value as --reflectance-scale, in training as "
