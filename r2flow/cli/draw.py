@@ -222,7 +222,7 @@ def complete(
     if checkpoint is None:
         print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
     sampler = completing(loaded.generator, several=num > 1, **how.given)
-    print(*remarks, *remarks_on_files(loaded, scans), sep="\n")
+    print("".join(f"{line}\n" for line in (*remarks, *remarks_on_files(loaded, scans))), end="")
     about = {
         "mask": given.mask and mask_identity(given.mask), "from": given.source,
         "reflectance_scale": given.reflectance_scale, "columns": given.columns,
