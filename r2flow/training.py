@@ -311,7 +311,7 @@ def _fit_in_folder(run: Run) -> int:
     if run.trainer.is_global_zero:
         log_config(run.trainer.loggers, run.config)
     try:
-        if last is None and run.config["stage"].get("init"):  # what a flow that goes on is compared with
+        if last is None and run.config["stage"].get("init"):  # what the end of the run is compared with
             run.trainer.validate(run.stage, run.data, verbose=False)
         run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
     except RuntimeError as error:

@@ -1,7 +1,7 @@
 """`r2flow sample`, `complete` and `interpolate`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -162,17 +162,14 @@ class PartialOptions:
 
     def open(self, model: str, device: str, what: Sequence[str]) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
         """The model, for another sensor if given, the scans as it takes them, and remarks on their sensor."""
-        from r2flow.data.opening import reading_for
-        from r2flow.data.partial import open_partial
         from r2flow.lidar.sensor_files import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
 
         loaded = load_checkpoint(model, choose_device(device))
         if self.to or self.size:
             loaded = loaded.through(named_sensor(self.to or loaded.sensor, rows_and_columns(self.size)))
-        reading = replace(reading_for([], loaded), columns=named_columns(self.columns))
-        sensor = None if self.source is None else named_sensor(self.source)
-        return loaded, *open_partial(what, reading, sensor, self.reflectance_scale, self.scans)
+        how = {"scale": self.reflectance_scale, "most": self.scans, "columns": named_columns(self.columns)}
+        return loaded.open_partial(what, self.source, **how)
 
 
 @app.command(epilog="Example: r2flow complete scan.pcd --from vlp16 --num 8 --out dense")
@@ -217,12 +214,11 @@ def complete(
     if free and name == DENSIFY and lack_sectors(scans, job):
         name = DEFAULT
         loaded, scans, remarks = given.open(name, device, what)
-    if remarks and isinstance(loaded.generator, TransferFlow):  # another sensor fills other rows
-        loaded = loaded.through(loaded.sensor, numbered=False)
     if checkpoint is None:
         print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
     sampler = completing(loaded.generator, several=num > 1, **how.given)
-    print("".join(f"{line}\n" for line in (*remarks, *remarks_on_files(loaded, scans))), end="")
+    for line in (*remarks, *remarks_on_files(loaded, scans)):
+        print(line)
     about = {
         "mask": given.mask and mask_identity(given.mask), "from": given.source,
         "reflectance_scale": given.reflectance_scale, "columns": given.columns,

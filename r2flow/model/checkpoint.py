@@ -6,7 +6,7 @@ import pickle
 import re
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from r2flow.config import check_tree, learned
 from r2flow.data.opening import reading_for
-from r2flow.data.partial import open_partial
+from r2flow.data.partial import PartialScan, open_partial
 from r2flow.errors import InputError, check, naming
 from r2flow.files import atomic_write, parse_json, telling
 from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
@@ -90,15 +90,9 @@ class Checkpoint:
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
     def complete(
-        self,
-        images: Tensor | str | Path,
-        state: Tensor | None = None,
-        num: int = 1,
-        seed: int = 0,
-        *,
-        sensor: Sensor | str | None = None,
-        **how: Any,
-    ) -> Tensor:
+        self, images: Tensor | str | Path, state: Tensor | None = None, num: int = 1, seed: int = 0, *,
+        sensor: Sensor | str | None = None, **how: Any,
+    ) -> Tensor:  # fmt: skip
         """Complete partial scans, (B, num, 2 or 1, H, W), in the format of `sample`.
 
         Args:
@@ -111,14 +105,22 @@ class Checkpoint:
         """
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")
-            source = None if sensor is None else named_sensor(sensor)
-            scans, remarks = open_partial([str(images)], reading_for([], self), source)
+            self, scans, _ = self.open_partial([str(images)], sensor)
             seen = [scan.read() for scan in scans]
             images = torch.from_numpy(np.stack([one.image for one in seen]))
             state = torch.from_numpy(np.stack([one.state for one in seen]))
-            if remarks and isinstance(self.generator, TransferFlow):  # another sensor fills other rows
-                self = self.through(self.sensor, numbered=False)
+        else:
+            check(sensor is None, "images are of the model's sensor: give no sensor, or a scan file.")
         return torch.stack([completed.images for completed in complete(self, images, state, num, seed, **how)])
+
+    def open_partial(
+        self, specs: Sequence[str], sensor: Sensor | str | None = None, **how: Any
+    ) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
+        """This model for the sensor of scans to complete, the scans, and remarks; see `r2flow.data.partial`."""
+        reading = replace(reading_for([], self), columns=how.pop("columns", None))
+        scans, remarks = open_partial(specs, reading, None if sensor is None else named_sensor(sensor), **how)
+        foreign = remarks and isinstance(self.generator, TransferFlow)  # another sensor fills other rows
+        return self.through(self.sensor, numbered=False) if foreign else self, scans, remarks
 
     def through(self, sensor: Sensor | str, numbered: bool = True) -> "Checkpoint":
         """The same model for another sensor's images; see `TransferFlow.at`."""

@@ -147,7 +147,9 @@ def hiding(scan: PartialScan, job: Job, number: int) -> tuple[Partial, Partial]:
     measured = whole.state != Ray.UNKNOWN
     for some, what in ((measured & kept, "nothing"), (measured & ~kept, "everything")):
         if not some.any():
-            raise InputError(f"{scan.name}: the mask keeps {what} that was measured; rows:N are the image's (--size).")
+            raise InputError(
+                f"{scan.name}: the mask keeps {what} that was measured; give another (rows:N counts rows of the image)."
+            )
     state = np.where(kept, whole.state, int(Ray.UNKNOWN)).astype(np.uint8)
     return whole, Partial(whole.image * kept, state, None if whole.xyz is None else whole.xyz * kept)
 

@@ -172,10 +172,7 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str
 
 
 def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
-    """Suggested commands after sampling a run to `out`: training on real scans, the next link, or evaluation.
-
-    A flow that went on from another one is evaluated first.
-    """
+    """Suggested commands after sampling a run to `out`: training on real scans, the next link, or evaluation."""
     plugins = "".join(f" --plugin {shlex.quote(str(name))}" for name in config.get("plugins") or ())
     stage = config["stage"]
     experiment = {"rectify": None if stage.get("init") else "reflow", "reflow": "distill"}.get(stage["name"])
