@@ -130,7 +130,7 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(complet
     assert (tmp_path / "out" / "one.npy").stat().st_mtime_ns == stamp
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")} == first
     assert "holds other answers: " in refusal(complete(*asked, "--num", 3))
-    kept = parse_mask("points:0.3")((8, 64), generator(3, "condition", 1))
+    kept = parse_mask("points:0.3")(np.ones((8, 64), bool), generator(3, "condition", 1))
     image, answer = np.load(tmp_path / "in" / "two.npy"), np.load(tmp_path / "out" / "two.npy")
     assert np.array_equal(image[:, kept], answer[:, kept])
 

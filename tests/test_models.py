@@ -56,7 +56,7 @@ AHEAD = {"drop_wrong": 0.6, "chamfer_m": 1.0, "mae_all_m": 1.0}  # of interpolat
 def test_densify_is_ahead_of_interpolation(name: str, size: tuple[int, int], task: str, most: dict[str, float]):
     sensor = build_sensor(name, *size)
     image = simulate(sensor, 77, 0).image
-    measured = parse_mask(task)(size, np.random.default_rng(0))
+    measured = parse_mask(task)(np.ones(size, bool), np.random.default_rng(0))
     state = ray_states(torch.from_numpy(image)[None], torch.from_numpy(measured))
     found = load_checkpoint("densify").through(sensor, numbered=name == "hdl64e")
     answer = found.complete(torch.from_numpy(image * measured)[None], state)[0, 0].numpy()

@@ -1,6 +1,6 @@
 """Partially measured scans: the state of each ray, and masks of measured rays.
 
-measured = parse_mask("rows:4")(images.shape[-2:], numpy.random.default_rng(0))
+measured = parse_mask("rows:4")(numpy.ones((64, 1024), bool), numpy.random.default_rng(0))
 state = ray_states(images, torch.from_numpy(measured))
 """
 
@@ -9,6 +9,7 @@ import inspect
 import math
 from collections.abc import Callable
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -61,39 +62,28 @@ def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
     return float(wide * len(state) / max(unknown.sum(), 1))
 
 
-Mask = Callable[[tuple[int, int], np.random.Generator], np.ndarray]  # (shape, generator) -> measured rays, (H, W) bool
+Mask = Callable[[np.ndarray, np.random.Generator], np.ndarray]  # measured rays, (H, W) bool -> those to keep, (H, W)
 
 
 def every_row(step: Count, first: Natural = 0) -> Mask:
-    """Rows first, first + step, first + 2 step, ..., as of a sensor with fewer beams."""
-
-    def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
-        measured = np.zeros(shape, dtype=bool)
-        measured[first::step] = True
-        return measured
-
-    return mask
+    """Measured rows first, first + step, first + 2 step, ..., as of a sensor with fewer beams."""
+    return lambda measured, draws: _rows(measured, lambda rows: rows[first::step])
 
 
 def random_rows(share: Share) -> Mask:
-    """A random share of the rows."""
-    return lambda shape, draws: np.repeat(_chosen(shape[0], share, draws)[:, None], shape[1], axis=1)
+    """A random share of the measured rows."""
+    return lambda measured, draws: _rows(measured, lambda rows: rows[_chosen(len(rows), share, draws)])
 
 
 def random_points(share: Share) -> Mask:
     """A random share of the rays."""
-    return lambda shape, draws: _chosen(math.prod(shape), share, draws).reshape(shape)
+    return lambda measured, draws: _chosen(measured.size, share, draws).reshape(measured.shape)
 
 
 def without_sector(first: float, last: float) -> Mask:
     """All rays except a sector from azimuth `first` counter-clockwise to `last`, in degrees."""
-
-    def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
-        measured = np.ones(shape, dtype=bool)
-        measured[:, region(shape, sector=(first, last)).columns.numpy()] = False
-        return measured
-
-    return mask
+    away = partial(region, sector=(first, last))
+    return lambda measured, draws: ~np.isin(np.indices(measured.shape)[1], away(measured.shape).columns)
 
 
 MASKS: Registry[Callable[..., Mask]] = Registry(
@@ -105,7 +95,7 @@ FORMS = "rows:4, rows:4,FIRST, random:0.5, points:0.1, sector:-30,30 or a .npy o
 def parse_mask(text: str) -> Mask:
     """Parse a mask: `NAME:NUMBERS` of `MASKS`, a .npy file, or the intersection of several masks joined by +."""
     parts = [_one_mask(part.strip()) for part in text.split("+")]
-    return lambda shape, draws: np.logical_and.reduce([part(shape, draws) for part in parts])
+    return lambda measured, draws: np.logical_and.reduce([part(measured, draws) for part in parts])
 
 
 def mask_identity(text: str) -> str:
@@ -132,17 +122,20 @@ def _one_mask(text: str) -> Mask:
 
 
 def _from_file(path: Path) -> Mask:
-    measured = read_numbers(path)
-    if measured.ndim != 2 or not np.isin(measured, (0, 1)).all():
-        raise InputError(f"the mask {path} must be an array (H, W) of booleans, found {measured.dtype} of "
-                         f"{measured.shape}.")  # fmt: skip
+    kept = read_numbers(path)
+    if kept.ndim != 2 or not np.isin(kept, (0, 1)).all():
+        raise InputError(f"the mask {path} must be an array (H, W) of booleans, found {kept.dtype} of {kept.shape}.")
 
-    def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
-        if measured.shape != tuple(shape):
-            raise InputError(f"the mask {path} is of {measured.shape}, the scans are of {tuple(shape)} rays.")
-        return measured.astype(bool)
+    def mask(measured: np.ndarray, draws: np.random.Generator) -> np.ndarray:
+        if kept.shape != measured.shape:
+            raise InputError(f"the mask {path} is of {kept.shape}, the scans are of {measured.shape} rays.")
+        return kept.astype(bool)
 
     return mask
+
+
+def _rows(measured: np.ndarray, choose: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    return np.isin(np.indices(measured.shape)[0], choose(np.flatnonzero(measured.any(1))))
 
 
 def _chosen(count: int, share: float, draws: np.random.Generator) -> np.ndarray:

@@ -143,13 +143,11 @@ def hiding(scan: PartialScan, job: Job, number: int) -> tuple[Partial, Partial]:
         whole = replace(whole, state=gaps.astype(np.uint8))
     if job.mask is None:
         return whole, whole
-    kept = job.mask(whole.state.shape, noise.generator(job.seed, "condition", number))
     measured = whole.state != Ray.UNKNOWN
+    kept = job.mask(measured, noise.generator(job.seed, "condition", number))
     for some, what in ((measured & kept, "nothing"), (measured & ~kept, "everything")):
         if not some.any():
-            raise InputError(
-                f"{scan.name}: the mask keeps {what} that was measured; give another (rows:N counts rows of the image)."
-            )
+            raise InputError(f"{scan.name}: the mask keeps {what} that was measured; give another.")
     state = np.where(kept, whole.state, int(Ray.UNKNOWN)).astype(np.uint8)
     return whole, Partial(whole.image * kept, state, None if whole.xyz is None else whole.xyz * kept)
 
@@ -221,6 +219,6 @@ def _draw(
     names, images = zip(*named, strict=True)
     write_page(out / f"{scan.name}.html", images, rays, names, title=scan.name)
     spread = completed.spread.numpy() if len(completed.images) > 1 else None
-    true = truth.image if truth else None
+    true = (truth.image, truth.state == Ray.UNKNOWN) if truth else None
     figure = completed_figure([first, *answers[:2]], given.state == Ray.UNKNOWN, rays, scan.name, spread, true)
     save_figure(figure, out / f"{scan.name}.png")

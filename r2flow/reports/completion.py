@@ -47,7 +47,7 @@ class Way:
 
 def measured_by(task: str, sensor: Sensor, number: int) -> np.ndarray:
     """Rays of scan `number` that a mask keeps, (H, W) bool; depends only on both."""
-    measured = parse_mask(task)(sensor.shape, noise.generator(0, "condition", number))
+    measured = parse_mask(task)(np.ones(sensor.shape, dtype=bool), noise.generator(0, "condition", number))
     if measured.all() or not measured.any():
         raise InputError(f"the task {task!r} hides {'no' if measured.all() else 'every'} ray; give another mask.")
     return measured
@@ -138,4 +138,5 @@ def pictured(truth: np.ndarray, shown: Sequence[tuple[Mapping[str, Any], np.ndar
     task = shown[0][0]["task"]
     measured = measured_by(task, sensor, 0)
     answers = [(row["method"], image) for row, image in shown if row["task"] == task]
-    return completed_figure([(f"measured, {task}", truth * measured), *answers], ~measured, sensor.rays(), truth=truth)
+    rows = [(f"measured, {task}", truth * measured), *answers]
+    return completed_figure(rows, ~measured, sensor.rays(), truth=(truth, np.zeros_like(measured)))

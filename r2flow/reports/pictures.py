@@ -67,7 +67,7 @@ def completed_figure(
     rays: Tensor,
     title: str = "",
     spread: np.ndarray | None = None,
-    truth: np.ndarray | None = None,
+    truth: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Figure:
     """Draw the known rays of a scan, its answers with their errors in metres, the truth and the answers' spread.
 
@@ -75,12 +75,14 @@ def completed_figure(
         rows: Name and image, (2 or 1, H, W), of each; the known rays first.
         unknown: Rays that were not measured, (H, W) bool; drawn in grey.
         spread: Standard deviation of the range in metres and share of answers with a return, (2, H, W).
-        truth: The whole scan, (2 or 1, H, W).
+        truth: The whole scan, (2 or 1, H, W), and its rays that were not measured, (H, W) bool.
     """
     shown: list[tuple[str, np.ndarray, np.ndarray | None]] = [(name, image, None) for name, image in rows]
+    grey = {0: unknown}
     if truth is not None:
-        answers = [(name, image, _error(image, truth, unknown)) for name, image in rows[1:]]
-        shown = [shown[0], *answers, ("truth", truth, None)]
+        answers = [(name, image, _error(image, truth[0], unknown)) for name, image in rows[1:]]
+        shown = [shown[0], *answers, ("truth", truth[0], None)]
+        grey[len(rows)] = truth[1]
     channels = max(len(image) for _, image, _ in shown)  # answers may have reflectance where the scan has none
     heights = [0.58 * (channels + (error is not None)) for *_, error in shown] + [0.62] * (spread is not None)
     figure, grid = _sheet(heights, space=0.2, top=0.34)
@@ -90,8 +92,8 @@ def completed_figure(
         strips[0].set_title(f"{name}: range, m{legend}", fontsize=7, loc="left", pad=2)
         if row == 1 and len(strips) > len(rows[0][1]):  # the scan has no reflectance
             strips[1].set_title("reflectance, estimated", fontsize=7, loc="left", pad=2)
-        for axes in strips if row == 0 else ():
-            axes.imshow(np.where(unknown[..., None], (0.6, 0.6, 0.6, 1), 0), aspect="auto", interpolation="nearest")
+        for axes in strips if row in grey else ():
+            axes.imshow(np.where(grey[row][..., None], (0.6, 0.6, 0.6, 1), 0), aspect="auto", interpolation="nearest")
     if spread is not None:
         names = ("deviation of the range, m", 5), ("share of answers with a return", 1)
         for (name, most), values, place in zip(names, spread, (grid[-1, 0], grid[-1, 1:]), strict=True):

@@ -94,7 +94,7 @@ def _measured(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
         mask = random_rows(0.15 + 0.6 * a)
     else:
         mask = random_points(0.03 * 27**a)
-    return mask(shape, draws)
+    return mask(np.ones(shape, dtype=bool), draws)
 
 
 class Transfer(SingleLoss):

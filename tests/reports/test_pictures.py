@@ -34,9 +34,10 @@ def test_the_error_of_an_answer_is_in_metres_where_hidden_rays_return_in_both():
     truth, answer = np.full_like(E, 10.0), np.full_like(E, 11.5)
     answer[:, :8], truth[:, 8:16] = 0, 0
     hidden = np.arange(len(E))[:, None] % 2 == np.ones_like(E)
-    figure = completed_figure(
-        [("known", image(truth * ~hidden)), ("answer", image(answer))], hidden, SENSOR.rays(), truth=image(truth)
-    )
+    rows = [("known", image(truth * ~hidden)), ("answer", image(answer))]
+    figure = completed_figure(rows, hidden, SENSOR.rays(), truth=(image(truth), unmeasured := E > -0.1))
+    greys = [axes.images[1].get_array()[..., 3] for axes in figure.axes if len(axes.images) == 2]
+    assert [grey.tolist() for grey in greys] == [*2 * [hidden.tolist()], *2 * [unmeasured.tolist()]]
     (axes,) = (axes for axes in figure.axes if axes.get_title("left").startswith("error"))
     shown = axes.images[0].get_array()
     assert (shown.mask == ~(hidden & (np.arange(64) >= 16))).all()

@@ -52,7 +52,7 @@ def scans() -> torch.Tensor:
 
 
 def measured(images: torch.Tensor, text: str = "rows:4") -> torch.Tensor:
-    mask = torch.from_numpy(parse_mask(text)(images.shape[-2:], noise.generator(0, "condition", 0)))
+    mask = torch.from_numpy(parse_mask(text)(np.ones(images.shape[-2:], bool), noise.generator(0, "condition", 0)))
     return ray_states(images, mask)
 
 
