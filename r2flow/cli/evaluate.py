@@ -224,7 +224,7 @@ def _judged(
             sets |= _sampled(name, flows[text], options)
         else:
             sets[name] = _open(text, reading, options.generated_split, options.num)
-    return {"generated": next(iter(sets.values()))} if len(sets) == 1 else sets
+    return sets
 
 
 def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[str, ScanSet]":

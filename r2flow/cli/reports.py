@@ -167,7 +167,7 @@ def completion(
     """Mask scans and complete them by models and by interpolation: errors against evaluations."""
     import numpy as np
 
-    from r2flow.data.opening import own_reading, usual_scale
+    from r2flow.data.opening import own_reading, parse, scale_of
     from r2flow.generators import TransferFlow
     from r2flow.inversion import real_scans
     from r2flow.lidar.sensor_files import named_sensor
@@ -193,7 +193,7 @@ def completion(
     masks = re.split(r"\s*,\s*(?=[a-z]+:)|\s+", tasks.strip()) if tasks else list(TASKS)
     for task in masks:
         measured_by(task, first.sensor, 0)
-    scale = reflectance_scale or usual_scale(real, first.sensor)
+    scale = reflectance_scale or scale_of(parse(real)[0], first.sensor.reflectance_scale)
     scans = real_scans(first, [real], scale, num, need_reflectance=False)
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
     check(truths, f"{real}: no scan has a return, so there is nothing to hide.")
@@ -261,8 +261,11 @@ def compare(
     for title, (cells, headings) in tables(groups).items():
         print_table(cells, headings, title)
         print()
-    if len({run.values["images"] for run in compared} - {None}) > 1:
-        print("the runs have seen different numbers of images: compare their curves at equal steps")
+    remarks = {"images": "numbers of images: compare their curves at equal steps"}
+    remarks |= dict.fromkeys(("stage", "data"), "stages or data: compare them by r2flow evaluate, not by their losses")
+    differing = [text for key, text in remarks.items() if len({run.values[key] for run in compared} - {None}) > 1]
+    for text in dict.fromkeys(differing):
+        print(f"the runs have different {text}")
     if out is not None:
         for path in write_page(compare_page(groups), out):
             print(path)

@@ -218,7 +218,7 @@ def reading_for(
     if reflectance_scale is None and estimate_scale and stored is None and name == FOLDER:
         reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
     elif reflectance_scale is None and specs:
-        reflectance_scale = usual_scale(specs[0], reading.sensor)
+        reflectance_scale = scale_of(parse(specs[0])[0], reading.sensor.reflectance_scale)
     requested = {
         "projection": projection, "convention": convention, "reflectance_scale": reflectance_scale,
         "columns": None if columns is None else tuple(columns),
@@ -272,13 +272,8 @@ def own_reading(spec: str | Path) -> Reading | None:
     return replace(Reading.of(described), reflectance=AUTO, within_limits=False)
 
 
-def usual_scale(spec: str | Path, sensor: Sensor) -> float:
-    """Default value of full reflectance in the files of a set of scans; 1 in files that r2flow wrote."""
-    return scale_of(parse(str(spec))[0], sensor.reflectance_scale)
-
-
 def scale_of(options: SourceOptions, of_sensor: float | None) -> float:
-    """As `usual_scale`; `of_sensor` is the value in files of the sensor, if known."""
+    """Default value of full reflectance in the files of a set of scans; `of_sensor`: that of the sensor, if known."""
     if options.name == FOLDER:
         return 1.0 if made_here(options.folder) else of_sensor or 1.0
     return SOURCES[options.name].reflectance_scale

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, usual_scale
+from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, scale_of
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread
@@ -125,8 +125,8 @@ def _files(
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
         estimated = full_reflectance(scans) or 0.0
         if same and fired.columns >= FEWER * target.columns:
-            known = parse(spec)[0].name != FOLDER or (source or target).reflectance_scale
-            usual = usual_scale(spec, source or target) if known else 0.0
+            of_sensor, options = (source or target).reflectance_scale, parse(spec)[0]
+            usual = scale_of(options, of_sensor) if options.name != FOLDER or of_sensor else 0.0
             full = scale or (1.0 if stored else max(usual, estimated)) or 1.0
             strict = scale is not None or full in FULL_REFLECTANCE
             by_points = partial(_read_points, reading=reading, fired=None, scale=full, strict=strict)

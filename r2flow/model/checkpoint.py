@@ -163,7 +163,8 @@ def find_checkpoint(path: str | Path) -> Path:
     if name in MODELS and (path.is_dir() or not path.exists()):
         return find_model(name)
     problem = f"no checkpoint at {path}."
-    hint = f"Give a checkpoint file, a run folder or a model ({', '.join(MODELS)}).{did_you_mean(name, [*MODELS])}"
+    known = [*MODELS, *(folder.name for folder in path.parent.glob("*/"))]
+    hint = f"Give a checkpoint file, a run folder or a model ({', '.join(MODELS)}).{did_you_mean(path.name, known)}"
     if path.is_dir():
         problem = f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt)."
         runs = sorted(str(folder.parent) for folder in path.glob(f"*/{FOLDER}") if checkpoints_of(folder.parent))

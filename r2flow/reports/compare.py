@@ -22,8 +22,8 @@ log = logging.getLogger(__name__)
 
 # Column -> heading: equal for all seeds, and averaged over seeds.
 FIXED = {
-    "stage": "stage", "backbone": "backbone", "parameters": "parameters", "gmac": "GMAC", "steps": "steps",
-    "images": "images",
+    "stage": "stage", "data": "data", "backbone": "backbone", "parameters": "parameters", "gmac": "GMAC",
+    "steps": "steps", "images": "images",
 }  # fmt: skip
 MEASURED = {
     "train_loss": "train loss, last tenth", "val_best": "val loss, best", "val_last": "val loss, last",
@@ -101,12 +101,13 @@ def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Cur
     checkpoints = checkpoints_of(path)
     logged = [int(steps[-1]) for name, (steps, _) in curves.items() if name.endswith("loss")]
     step = step_of(checkpoints[0]) if checkpoints else max(logged, default=None)
-    stage = config["stage"]
+    stage, data = config["stage"], config["data"]
     return {
         "stage": f"{stage['name']} {stage['steps']}" if "steps" in stage else str(stage["name"]),
+        "data": data["name"] if data["name"] == "pairs" else f"{data['name']} {data.get('root') or ''}".strip(),
         "backbone": (config["backbone"] or {}).get("name"),
         "steps": step,
-        "images": None if step is None else step * int(config["data"]["batch_size"]),
+        "images": None if step is None else step * int(data["batch_size"]),
         "train_loss": fmean(train[-max(len(train) // 10, 1) :]) if train else None,
         "val_best": min(validation, default=None),
         "val_last": validation[-1] if validation else None,

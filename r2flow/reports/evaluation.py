@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r2flow.data.sets import ScanSet
+from r2flow.errors import printable
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
@@ -254,6 +255,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
     measured = [m for c in comparisons for m in c.measured if m.figures and m.metric != "speed"]
     first = {m.metric: next(iter(m.figures)) for m in measured}
     columns = max(min(len(first), 4), 1)
+    titles = [printable(c.title).replace("$", r"\$") for c in comparisons]  # tick labels are set anew when drawn
     lines = max(math.ceil(len(first) / columns), 1)
     title = "Each metric's first figure, generated scans and real ones"
     figure = blank_figure(2.9 * columns + 1.0, (0.5 * len(comparisons) + 1.2) * lines, title)
@@ -270,7 +272,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
             axes.plot([value], [row], marker=style["marker"], color=style["color"], ms=7, ls="")
             if math.isnan(value):
                 axes.text(0.02, row, "none", transform=axes.get_yaxis_transform(), fontsize=8, va="center")
-        axes.set_yticks(range(len(comparisons)), [c.title for c in comparisons] if place % columns == 0 else [])
+        axes.set_yticks(range(len(comparisons)), titles if place % columns == 0 else [])
         axes.set(xlabel=label, ylim=(len(comparisons) - 0.5, -0.5))
         same = [m for m in measured if m.metric == metric and math.isfinite(m.figures.get(name, math.nan))]
         drawn = [value for m in same for value in (m.figures[name], *m.intervals.get(name, ()))] or [0.0]

@@ -173,7 +173,7 @@ def test_the_page_is_written_with_its_picture(tmp_path):
     written = {path.name: path for path in write_page(compare_page(groups), tmp_path / "out")}
     assert set(written) == {"compare.md", "compare.csv", "compare.json", "compare.png", "compare.pdf"}
     said = written["compare.md"].read_text()
-    for words in ("| bare | 1 | rectify | hdit |", "| run | train loss, last tenth |"):
+    for words in ("| bare | 1 | rectify | simulated | hdit |", "| run | train loss, last tenth |"):
         assert words in said, words
     rows = json.loads(written["compare.json"].read_text())["rows"]
     assert [row["name"] for row in rows] == ["bare", "full"]
@@ -215,9 +215,10 @@ def test_losses_have_a_logarithmic_axis_where_it_has_labels(values, scale):
     assert figure.axes[0].get_yscale() == scale
 
 
-@pytest.mark.parametrize("steps", [(40, 40), (40, 20)])
-def test_the_verb_tells_runs_of_different_lengths(r2flow, tmp_path, steps):
-    for name, step in zip("ab", steps, strict=True):
-        make_run(tmp_path / name, checkpoint=step)
+@pytest.mark.parametrize(("steps", "roots"), [((40, 40), "xx"), ((40, 20), "xx"), ((40, 40), "xy")])
+def test_the_verb_tells_runs_of_different_lengths_and_data(r2flow, tmp_path, steps, roots):
+    for name, step, root in zip("ab", steps, roots, strict=True):
+        make_run(tmp_path / name, {"data.root": root}, checkpoint=step)
     said = r2flow.said("compare", tmp_path / "a", tmp_path / "b")
     assert ("different numbers of images" in said) == (steps[0] != steps[1])
+    assert ("different stages or data" in said) == (roots[0] != roots[1])
