@@ -54,8 +54,8 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     return built
 
 
-def keep_checkpoints(folder: Path, every: Count = 100) -> list[Callback]:
-    """A checkpoint every `every` steps and one at the last step; the newest two are kept."""
+def keep_checkpoints(folder: Path, every: Count = 100, keep: Count = 2) -> list[Callback]:
+    """A checkpoint every `every` steps and one at the last step; the newest `keep` remain."""
     common: dict[str, Any] = {
         "dirpath": folder,
         "filename": "step-{step:08d}",
@@ -65,8 +65,8 @@ def keep_checkpoints(folder: Path, every: Count = 100) -> list[Callback]:
         "mode": "max",
     }
     # Without save_on_train_epoch_end, the checkpoint of the last step would wait for a validation that may not happen,
-    # and a third checkpoint would remain.
-    regular = ModelCheckpoint(every_n_train_steps=every, save_top_k=2, save_on_train_epoch_end=True, **common)
+    # and one checkpoint too many would remain.
+    regular = ModelCheckpoint(every_n_train_steps=every, save_top_k=keep, save_on_train_epoch_end=True, **common)
     final = ModelCheckpoint(every_n_epochs=1, save_on_train_epoch_end=True, save_top_k=1, **common)
     return [regular, final]
 

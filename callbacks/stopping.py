@@ -95,7 +95,7 @@ class Stopping(L.Callback):
                 trainer.save_checkpoint(
                     self.run_dir / FOLDER / f"step-{trainer.global_step:08d}.ckpt", weights_only=False
                 )
-                self._keep_two(trainer)
+                self._leave_newest(trainer)
             self._training = False
             environment = getattr(trainer.strategy, "cluster_environment", None)
             if not trainer.is_global_zero and isinstance(environment, LightningEnvironment):
@@ -104,15 +104,16 @@ class Stopping(L.Callback):
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._training = False
-        self._keep_two(trainer)
+        self._leave_newest(trainer)
 
     def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
         self._training = False
 
-    def _keep_two(self, trainer: L.Trainer) -> None:
+    def _leave_newest(self, trainer: L.Trainer) -> None:
         """Delete old checkpoints: ModelCheckpoint does not know of those saved here and would keep them."""
         if trainer.is_global_zero:
-            for old in checkpoints_of(self.run_dir)[2:]:
+            keep = max((getattr(one, "save_top_k", 0) for one in trainer.checkpoint_callbacks), default=2)
+            for old in checkpoints_of(self.run_dir)[keep:]:
                 old.unlink(missing_ok=True)
 
     def _leave(self, where: str) -> None:

@@ -58,7 +58,3 @@ def read(
     from r2flow.data.opening import read
 
     return read(path, sensor, reflectance_scale)
-
-
-def __dir__() -> list[str]:
-    return ["__version__", "load", "read"]

@@ -24,10 +24,10 @@ def test_the_averaged_weights_are_the_model(saved):
         assert loaded.step == 7
         assert loaded.format == "r2flow"
         assert loaded.sensor.shape == (8, 64)
-        assert not loaded.model.training
-        for name, value in loaded.model.state_dict().items():
+        assert not loaded.generator.backbone.training
+        for name, value in loaded.generator.backbone.state_dict().items():
             assert torch.equal(value, averaged[f"generator.backbone.{name}"])
-    for name, value in load_checkpoint(path, averaged=False).model.named_parameters():
+    for name, value in load_checkpoint(path, averaged=False).generator.backbone.named_parameters():
         assert torch.equal(value + 1, averaged[f"generator.backbone.{name}"])
 
 
@@ -37,7 +37,7 @@ def test_a_published_checkpoint_computes_what_its_authors_did(shared):
     assert loaded.format == "published"
     assert loaded.sensor.shape == (16, 192)
     with torch.no_grad():
-        output = loaded.model(case["t"], case["x"])
+        output = loaded.generator.backbone(case["t"], case["x"])
     assert (output - case["output"]).norm() / case["output"].norm() < 5e-5
 
 
@@ -180,7 +180,7 @@ def test_an_unfolding_checkpoint_brings_its_ring_angles(shared, tmp_path: Path):
     torch.save(content, tmp_path / "unfolding.pth")
     loaded = load_checkpoint(tmp_path / "unfolding.pth")
     torch.testing.assert_close(loaded.sensor.rays()[0, :, 0], rings, rtol=0, atol=1e-6)
-    torch.testing.assert_close(loaded.model.coords[0, 0, :, 0], rings, rtol=0, atol=0)
+    torch.testing.assert_close(loaded.generator.backbone.coords[0, 0, :, 0], rings, rtol=0, atol=0)
 
 
 def test_loading_and_sampling_import_nothing_that_they_do_not_need(saved):

@@ -323,8 +323,10 @@ def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_pa
     assert "1 scans written" in said
     assert f" of {np.count_nonzero(read_points(file).xyz.any(axis=1)):,} measured points are kept" in said
     flow, (written,) = r2flow.load(run), (file for file in (tmp_path / "out").iterdir() if file.suffix != ".json")
-    (cloud,) = flow.points(flow.complete(file)[0])
-    assert len(cloud) == len(read_points(written).xyz)
+    answer, points = flow.complete(file), read_points(file)
+    assert len(flow.points(answer[0])[0]) == len(read_points(written).xyz)
+    if points.reflectance is not None:
+        assert torch.equal(flow.complete(np.column_stack([points.xyz, points.reflectance])), answer)
 
 
 def test_the_errors_of_hidden_rays_stand_next_to_those_of_interpolation():

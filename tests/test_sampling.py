@@ -270,7 +270,7 @@ def test_a_model_of_range_alone_draws_range_alone():
     alone = network(reflectance=False)
     (ranges,) = sample(alone, 1, steps=2)
     assert ranges.images.shape == (1, 1, 8, 64)
-    assert alone.model.in_channels == 1
+    assert alone.generator.backbone.in_channels == 1
 
 
 def test_numeric_times_decide_the_number_of_steps():

@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import IO, Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from r2flow.data.opening import reading_for
 from r2flow.data.partial import PartialScan, open_partial
 from r2flow.errors import InputError, check, naming
 from r2flow.files import atomic_write, parse_json, telling
-from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
+from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensor_files import named_sensor
@@ -65,13 +66,6 @@ class Checkpoint:
         return f"Checkpoint({name}, {kind}, {size} {self.sensor.name}, step {self.step})"
 
     @property
-    def model(self) -> nn.Module:
-        """The network v(t, x) of a flow."""
-        if not isinstance(self.generator, RectifiedFlow):
-            raise InputError(f"{self.path} holds a {type(self.generator).__name__}, which has no network v(t, x).")
-        return self.generator.backbone
-
-    @property
     def sensor(self) -> Sensor:
         """Sensor of the images."""
         return self.generator.space.sensor
@@ -90,19 +84,23 @@ class Checkpoint:
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
     def complete(
-        self, images: Tensor | str | Path, state: Tensor | None = None, num: int = 1, seed: int = 0, *,
+        self, images: Tensor | np.ndarray | str | Path, state: Tensor | None = None, num: int = 1, seed: int = 0, *,
         sensor: Sensor | str | None = None, **how: Any,
     ) -> Tensor:  # fmt: skip
         """Complete partial scans, (B, num, 2 or 1, H, W), in the format of `sample`.
 
         Args:
-            images: Range in metres and optionally reflectance, (B, 2 or 1, H, W), or a scan file of any sensor, or a
-                folder of them.
-            state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`. A file's
-                rays are not measured where no beam looks.
-            sensor: Sensor of the files, by name or YAML file; None: found by their beams.
+            images: Range in metres and optionally reflectance, (B, 2 or 1, H, W), or the points of one scan of any
+                sensor, (N, 3 or 4): x ahead, y left, z up, reflectance, or a scan file, or a folder of them.
+            state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`. Rays of
+                points are not measured where no beam looks.
+            sensor: Sensor of the points, by name or YAML file; None: found by their beams.
             how: Options of `r2flow.model.completion.complete`: sampler, steps, batch_size, ...
         """
+        if isinstance(images, np.ndarray) and images.ndim == 2:
+            with TemporaryDirectory() as folder:
+                np.save(file := Path(folder, "points.npy"), images)
+                return self.complete(file, state, num, seed, sensor=sensor, **how)
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")
             self, scans, _ = self.open_partial([str(images)], sensor)
@@ -110,7 +108,8 @@ class Checkpoint:
             images = torch.from_numpy(np.stack([one.image for one in seen]))
             state = torch.from_numpy(np.stack([one.state for one in seen]))
         else:
-            check(sensor is None, "images are of the model's sensor: give no sensor, or a scan file.")
+            check(sensor is None, "images are of the model's sensor: give no sensor, or points or a scan file.")
+            images = torch.as_tensor(images)
         return torch.stack([completed.images for completed in complete(self, images, state, num, seed, **how)])
 
     def open_partial(

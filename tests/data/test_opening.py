@@ -153,9 +153,6 @@ class TestWhatR2FlowWrote:
             with pytest.raises(InputError, match="reflectance_scale must be"):
                 r2flow.read(tmp_path / "a.ply", "vlp16", wrong)
 
-    def test_the_front_door_shows_what_a_user_may_use(self):
-        assert dir(r2flow) == ["__version__", "load", "read"]
-
 
 class TestReflectance:
     """One rule: the first scan that has a return decides, and 0 throughout is none."""

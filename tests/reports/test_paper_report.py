@@ -73,6 +73,6 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
     (architecture,) = content["architectures"]
-    assert architecture["parameters"] == sum(p.numel() for p in network().model.parameters())
+    assert architecture["parameters"] == sum(p.numel() for p in network().generator.backbone.parameters())
     written = {path.stem for path in (tmp_path / "out").glob("*.png")}
     assert written == {"figure_3", "figure_5", "figure_6", "figure_7", "figure_8a", "figure_8b"}

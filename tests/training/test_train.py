@@ -108,14 +108,15 @@ def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(
     train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, by: int, code: int, workers: int
 ):
     # The regular checkpoints are those of steps 4, 8 and 12.
-    options = ["name=stopped", f"data.workers={workers}", "callbacks.checkpoint.every=4", "data.memory_gib=0"]
-    options += hold_at(5, tmp_path / "held")
+    options = ["name=stopped", f"data.workers={workers}", "callbacks.checkpoint={every: 4, keep: 3}"]
+    options += ["data.memory_gib=0", *hold_at(5, tmp_path / "held")]
     found, said = stop_held(tmp_path / "held", by, tiny(scans, *options))
     assert found == code, said
     assert lines_of(said) == ["stopped at step 6; the same command resumes from the last checkpoint"]
     run = tmp_path / "runs" / "stopped"
     assert [step_of(path) for path in checkpoints_of(run)] == [6, 4]
     train(*options)
+    assert [step_of(path) for path in checkpoints_of(run)] == [12, 8, 6]
     assert_bit_equal(alone[0], run)
 
 
