@@ -99,9 +99,8 @@ def test_notes_without_end_are_refused(tmp_path: Path, notes: str):
 
 
 def test_missing_files_and_other_torch_files(tmp_path: Path):
-    (tmp_path / "fine").mkdir()
-    with pytest.raises(InputError, match="no checkpoint at .* Did you mean 'fine'"):
-        load_checkpoint(tmp_path / "fien")
+    with pytest.raises(InputError, match=f"no checkpoint at .* Did you mean '{tmp_path.name}'"):
+        load_checkpoint(f"{tmp_path}s")
     with pytest.raises(InputError, match="holds no checkpoint"):
         load_checkpoint(tmp_path)
     torch.save({"weight": torch.zeros(3)}, tmp_path / "weights.pt")

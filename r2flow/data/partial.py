@@ -134,11 +134,11 @@ def _files(
             full = scale or (1.0 if stored else source and source.reflectance_scale) or estimated or 1.0
             by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
-            lines.append(_described(spec, replace(fired, name=name), target, turns=True))
+            lines += _described(spec, replace(fired, name=name), target, turns=True)
         if scale is None and full == estimated and full not in FULL_REFLECTANCE:
             log.warning("%s: reflectance is divided by %g, its largest; --reflectance-scale names another", spec, full)
     elif source and not source.same_image(target):
-        lines.append(_described(spec, source, target))
+        lines += _described(spec, source, target)
 
     def opened(path: Path) -> PartialScan:
         ending = scan_ending(path.name) or path.suffix
@@ -163,12 +163,12 @@ def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None
         content = name.encode if simulated else lambda: scans[number].tobytes()
         return PartialScan(name, ".npy", lambda: _seen(scans[number], stored.sensor, target), content)
 
-    lines = [] if stored.sensor.same_image(target) else [_described(spec, stored.sensor, target)]
+    lines = [] if stored.sensor.same_image(target) else _described(spec, stored.sensor, target)
     return [opened(number) for number in spread(len(scans), most or len(scans))], lines
 
 
-def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -> str:
-    """A line about the sensor, the number of measured rows and the omitted beams."""
+def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -> list[str]:
+    """Lines about the sensor, the number of measured rows, and the lost beams."""
     e = source.elevations
     rows = rows_of(np.asarray(e), target)
     beams = f"{source.name} with {len(e)} beams from {e[0]:+.1f} to {e[-1]:+.1f} degrees"
@@ -180,10 +180,13 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
     measured = f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows of {target.name} are measured"
     few = turns and source.columns < FEWER * target.columns
     turn = f", in the columns that its {source.columns} rays a turn meet" if few else ""
-    beyond = f", {int((rows < 0).sum())} beams look past its view" if (rows < 0).any() else ""
-    if beyond and source.name in SENSORS:
-        beyond += f" (--to {source.name} --size {4 * len(e)}x{source.columns} keeps all)"
-    return f"{spec}: {beams}; {measured}{turn}{beyond}"
+    lines = [f"{spec}: {beams}; {measured}{turn}"]
+    if lost := int((rows < 0).sum()):
+        lines.append(f"{spec}: {lost} of its {len(e)} beams look past the view of {target.name} and are lost")
+        if source.name in SENSORS:
+            size = f"{max(64, len(e))}x{SENSORS[source.name].columns}"
+            lines[-1] += f": --to {source.name} --size {size} keeps them"
+    return lines
 
 
 def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: float, strict: bool) -> Partial:

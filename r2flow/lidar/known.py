@@ -9,7 +9,6 @@ import inspect
 import math
 from collections.abc import Callable
 from enum import IntEnum
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -82,8 +81,7 @@ def random_points(share: Share) -> Mask:
 
 def without_sector(first: float, last: float) -> Mask:
     """All rays except a sector from azimuth `first` counter-clockwise to `last`, in degrees."""
-    away = partial(region, sector=(first, last))
-    return lambda measured, draws: ~np.isin(np.indices(measured.shape)[1], away(measured.shape).columns)
+    return lambda rays, draws: ~np.isin(np.indices(rays.shape)[1], region(rays.shape, sector=(first, last)).columns)
 
 
 MASKS: Registry[Callable[..., Mask]] = Registry(

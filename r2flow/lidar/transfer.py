@@ -162,7 +162,8 @@ def _without_return(azimuth: np.ndarray, steps: float) -> np.ndarray:
         return np.arange(round(steps)) * step
     ordered = np.sort(azimuth)
     gap = np.diff(ordered, append=ordered[0] + 2 * math.pi)
-    missing = np.maximum(np.rint(gap / step).astype(np.int64) - 1, 0)
+    three = gap + np.roll(gap, 1) + np.roll(gap, -1)  # where azimuths jitter, a wide gap lies next to a narrow one
+    missing = np.maximum(np.minimum(np.rint(gap / step) - 1, np.rint(three / step) - 3), 0).astype(np.int64)
     begin, gap, count = (np.repeat(values, missing) for values in (ordered, gap, missing))
     place = np.arange(len(begin)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
     return begin + gap * place / (count + 1)

@@ -97,9 +97,10 @@ class Checkpoint:
             sensor: Sensor of the points, by name or YAML file; None: found by their beams.
             how: Options of `r2flow.model.completion.complete`: sampler, steps, batch_size, ...
         """
-        if isinstance(images, np.ndarray) and images.ndim == 2:
+        if not isinstance(images, str | Path) and np.ndim(images) == 2:
+            check(images.shape[1] in (3, 4), f"points must be of (N, 3) or (N, 4), found {tuple(images.shape)}.")
             with TemporaryDirectory() as folder:
-                np.save(file := Path(folder, "points.npy"), images)
+                np.save(file := Path(folder, "points.npy"), np.asarray(images))
                 return self.complete(file, state, num, seed, sensor=sensor, **how)
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")
@@ -108,7 +109,7 @@ class Checkpoint:
             images = torch.from_numpy(np.stack([one.image for one in seen]))
             state = torch.from_numpy(np.stack([one.state for one in seen]))
         else:
-            check(sensor is None, "images are of the model's sensor: give no sensor, or points or a scan file.")
+            check(sensor is None, "images are of the model's sensor: give no sensor, or points of (N, 4).")
             images = torch.as_tensor(images)
         return torch.stack([completed.images for completed in complete(self, images, state, num, seed, **how)])
 

@@ -219,6 +219,8 @@ def _draw(
     names, images = zip(*named, strict=True)
     write_page(out / f"{scan.name}.html", images, rays, names, title=scan.name)
     spread = completed.spread.numpy() if len(completed.images) > 1 else None
+    unknown = given.state == Ray.UNKNOWN
+    linear = [("linear interpolation", interpolated(given.image, ~unknown))] if truth else []
     true = (truth.image, truth.state == Ray.UNKNOWN) if truth else None
-    figure = completed_figure([first, *answers[:2]], given.state == Ray.UNKNOWN, rays, scan.name, spread, true)
+    figure = completed_figure([first, *answers[:2], *linear], unknown, rays, scan.name, spread, true)
     save_figure(figure, out / f"{scan.name}.png")

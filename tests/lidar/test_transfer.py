@@ -23,11 +23,15 @@ def fired(elevations=BEAMS, steps: int = 1800) -> Sensor:
     return Sensor("fired", tuple(elevations), steps)
 
 
-def wall(firing: Sensor, lost=None, radius: float = RADIUS) -> Points:
+def azimuths(steps: int, jitter: float) -> np.ndarray:  # every eighth and the next one are off by shares of a step
+    shift = jitter * np.resize([-0.4, 0.3, 0, 0, 0, 0, 0, 0], steps)
+    return 2 * math.pi * (np.arange(steps) + 0.37 + shift) / steps - math.pi
+
+
+def wall(firing: Sensor, lost=None, radius: float = RADIUS, jitter: float = 0.0) -> Points:
     """The returns of every ray, but for those that `lost`, (beams, steps) bool, holds."""
     e = np.deg2rad(np.asarray(firing.elevations))[:, None]
-    a = (2 * math.pi * (np.arange(firing.columns) + 0.37) / firing.columns - math.pi)[None]
-    e, a = np.broadcast_arrays(e, a)
+    e, a = np.broadcast_arrays(e, azimuths(firing.columns, jitter))
     xyz = np.stack([radius * np.cos(a), radius * np.sin(a), radius * np.tan(e)], -1)
     kept = np.ones(a.shape, bool) if lost is None else ~lost
     return Points(xyz[kept].astype(np.float32))
@@ -64,15 +68,16 @@ def test_a_measured_row_has_the_range_of_its_beam_in_every_column():
     np.testing.assert_allclose(np.linalg.norm(seen.xyz, axis=0), seen.image[0], rtol=1e-6)
 
 
-def test_a_ray_that_did_not_come_back_is_empty_and_one_that_was_not_fired_is_unknown():
+@pytest.mark.parametrize("jitter", [0.0, 1.0])
+def test_a_ray_that_did_not_come_back_is_empty_and_one_that_was_not_fired_is_unknown(jitter):
     steps = 128  # half as many as the image has columns
     firing = fired(steps=steps)
     lost = np.zeros((16, steps), bool)
     lost[:, 40:44] = True
     lost[5, 60] = True
     lost[8] = True  # a beam without any return
-    seen = points_through(wall(firing, lost), firing, TARGET)
-    column = np.floor((1 - (2 * math.pi * (np.arange(steps) + 0.37) / steps - math.pi) / math.pi) / 2 * 256).astype(int)
+    seen = points_through(wall(firing, lost, jitter=jitter), firing, TARGET)
+    column = np.floor((1 - azimuths(steps, jitter) / math.pi) / 2 * 256).astype(int) % 256
     rows = rows_of(firing.elevations, TARGET)
     hit = np.zeros(256, bool)
     hit[column] = True

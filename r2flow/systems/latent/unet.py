@@ -70,14 +70,6 @@ class Attention(nn.Module):
         return x + self.proj_out(attended).view(x.shape)
 
 
-def _halve(channels: int) -> nn.Module:
-    return nn.Sequential(OrderedDict(op=CircularConv2d(channels, channels, stride=2)))
-
-
-def _double(channels: int) -> nn.Module:
-    return nn.Sequential(OrderedDict(enlarge=nn.Upsample(scale_factor=2), conv=CircularConv2d(channels, channels)))
-
-
 class Step(nn.Sequential):
     """Sequential layers; residual blocks are conditioned on time."""
 
@@ -131,7 +123,8 @@ class LatentUNet(nn.Module):
                 current = after
                 skips.append(current)
             if level < len(widths) - 1:
-                self.input_blocks.append(Step(_halve(current)))
+                halve = CircularConv2d(current, current, stride=2)
+                self.input_blocks.append(Step(nn.Sequential(OrderedDict(op=halve))))
                 skips.append(current)
         self.middle_block = Step(block(current, current), Attention(current, head_channels), block(current, current))
         self.output_blocks = nn.ModuleList()
@@ -140,7 +133,9 @@ class LatentUNet(nn.Module):
                 layers: list[nn.Module] = [block(current + skips.pop(), widths[level])]
                 current = widths[level]
                 layers += [Attention(current, head_channels)] if 2**level in attention else []
-                layers += [_double(current)] if level and index == blocks else []
+                if level and index == blocks:
+                    double = nn.Upsample(scale_factor=2)
+                    layers.append(nn.Sequential(OrderedDict(enlarge=double, conv=CircularConv2d(current, current))))
                 self.output_blocks.append(Step(*layers))
         self.out = nn.Sequential(norm(current), nn.SiLU(), zero_initialised(CircularConv2d(current, channels)))
 
