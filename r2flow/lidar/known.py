@@ -137,6 +137,4 @@ def _rows(measured: np.ndarray, choose: Callable[[np.ndarray], np.ndarray]) -> n
 
 
 def _chosen(count: int, share: float, draws: np.random.Generator) -> np.ndarray:
-    chosen = np.zeros(count, dtype=bool)
-    chosen[draws.permutation(count)[: round(share * count)]] = True
-    return chosen
+    return np.isin(np.arange(count), draws.permutation(count)[: round(share * count)])

@@ -100,7 +100,7 @@ class Checkpoint:
         if not isinstance(images, str | Path) and np.ndim(images) == 2:
             check(images.shape[1] in (3, 4), f"points must be of (N, 3) or (N, 4), found {tuple(images.shape)}.")
             with TemporaryDirectory() as folder:
-                np.save(file := Path(folder, "points.npy"), np.asarray(images))
+                np.save(file := Path(folder, "points.npy"), torch.as_tensor(images).cpu())
                 return self.complete(file, state, num, seed, sensor=sensor, **how)
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")

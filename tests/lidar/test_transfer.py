@@ -68,15 +68,15 @@ def test_a_measured_row_has_the_range_of_its_beam_in_every_column():
     np.testing.assert_allclose(np.linalg.norm(seen.xyz, axis=0), seen.image[0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("jitter", [0.0, 1.0])
-def test_a_ray_that_did_not_come_back_is_empty_and_one_that_was_not_fired_is_unknown(jitter):
+@pytest.mark.parametrize(("jitter", "returns"), [(0.0, 1), (1.0, 1), (0.0, 2)])
+def test_a_ray_that_did_not_come_back_is_empty_and_one_that_was_not_fired_is_unknown(jitter, returns):
     steps = 128  # half as many as the image has columns
     firing = fired(steps=steps)
     lost = np.zeros((16, steps), bool)
     lost[:, 40:44] = True
     lost[5, 60] = True
     lost[8] = True  # a beam without any return
-    seen = points_through(wall(firing, lost, jitter=jitter), firing, TARGET)
+    seen = points_through(Points(np.repeat(wall(firing, lost, jitter=jitter).xyz, returns, 0)), firing, TARGET)
     column = np.floor((1 - azimuths(steps, jitter) / math.pi) / 2 * 256).astype(int) % 256
     rows = rows_of(firing.elevations, TARGET)
     hit = np.zeros(256, bool)
