@@ -28,7 +28,6 @@ def network(name: str = "transfer_flow", reflectance: bool = True) -> Checkpoint
 
 
 def halved(images: torch.Tensor) -> torch.Tensor:
-    """The states where every second row is measured."""
     return ray_states(images, torch.arange(SHAPE[0])[:, None].expand(SHAPE) % 2 == 0)
 
 

@@ -100,7 +100,6 @@ def open_partial(
 def _files(
     folder: Path, paths: list[Path], spec: str, reading: Reading, source: Sensor | None, scale: float | None
 ) -> Opened:
-    """Scan files of one sensor."""
     target, lines = reading.sensor, list[str]()
     stored = own_reading(folder)
     source = source or (stored.sensor if stored else None)
@@ -109,12 +108,13 @@ def _files(
     by_points = read_image
     if points := [path for path in paths if path not in images]:
         scans = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
-        doubt = other_sensor(scans, source or target)
+        own = next((sensor for name, sensor in SENSORS.items() if name == target.name), target)
+        doubt = other_sensor(scans, source or own)
         if source and doubt and not stored:
             fits = f"; they fit --from {doubt.name}" if doubt.name else ""
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
-        if not source and not doubt and target.name in SENSORS and SENSORS[target.name].shape[0] < target.shape[0]:
-            source = SENSORS[target.name]  # fewer beams than rows of the completions
+        if not source and not doubt and own.shape[0] < target.shape[0]:
+            source = own  # fewer beams than rows of the completions
         rows = target.shape[0]
         same = doubt is None
         if source:
@@ -135,7 +135,8 @@ def _files(
             by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
-        if scale is None and full == estimated and full not in FULL_REFLECTANCE:
+        told = scale or (source and source.reflectance_scale)
+        if told is None and full == estimated and full not in FULL_REFLECTANCE:
             log.warning("%s: reflectance is divided by %g, its largest; --reflectance-scale names another", spec, full)
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)

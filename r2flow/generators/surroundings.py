@@ -12,7 +12,7 @@ from r2flow.lidar.space import ModelSpace
 
 NEIGHBOURS = 4
 FEATURES = 5 * NEIGHBOURS + 11  # of `Surroundings`
-ROW = 8  # size of the vector learned for each row
+ROW, STEEP = 8, 3.0  # size of the vector learned for each row, and gain of the elevation that follows it
 SAME = 2e-4  # radians: tolerance for rows of the same elevation
 
 
@@ -118,7 +118,7 @@ class RowFeatures(nn.Embedding):
         nearest = (elevations[..., None] - self.elevations.to(elevations)).abs().argmin(-1)
         number = (nearest + 1) * (same if known is None else same & known)[:, None]
         sizes = (steps / 0.007).log()[:, None].expand(*elevations.shape, 2)
-        each = torch.cat([super().forward(number), 3 * elevations[..., None], sizes], -1)
+        each = torch.cat([super().forward(number), STEEP * elevations[..., None], sizes], -1)
         return each.movedim(-1, 1)[..., None]
 
 

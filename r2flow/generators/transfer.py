@@ -16,7 +16,7 @@ from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
 from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, parts_of
 from r2flow.generators.flow import Conditioned, Flow
-from r2flow.generators.surroundings import FEATURES, RowFeatures, Surroundings, encoded, steps_of
+from r2flow.generators.surroundings import FEATURES, ROW, STEEP, RowFeatures, Surroundings, encoded, steps_of
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import NonNegative
 from r2flow.samplers import Jump
@@ -29,6 +29,7 @@ FREE, SHIFT = 0.3, 0.02  # log r per unit of network output: of the free candida
 NEVER = -1e4  # logit of a missing candidate
 REFLECTANCE = 0.265  # mean reflectance of returns to which scans of other sensors are scaled: of simulated scans
 FOREIGN = 0.5  # share of the correction of reflectance that is taken for other sensors: best on three real scans
+RAISED = math.radians(3)  # other sensors: low rays are not lost as those that the training sensor's own car hides
 TOGETHER = math.radians(1.5)  # correlation length of drawn answers: best panel on scans of KITTI raw and object
 WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0}  # loss weights
 
@@ -144,6 +145,11 @@ class TransferFlow(Flow):
         shape = len(x), -1, *x.shape[2:]
         inputs = torch.cat([x - about.start, about.features, rows.expand(*shape)], 1)
         output = self.backbone(t, inputs).float()
+        if self.foreign:
+            rows = rows.clone()
+            rows[:, ROW] += STEEP * RAISED
+            inputs = torch.cat([x - about.start, about.features, rows.expand(*shape)], 1)
+            output[:, -2] = self.backbone(t, inputs).float()[:, -2]
         logits, shifts, scales = output[:, :-2].chunk(3, 1)
         returns, strength = output[:, -2:].split(1, 1)
         bias = output.new_tensor([0, 0, 0, 0, 2, 1, 0])[:, None, None]

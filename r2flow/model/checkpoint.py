@@ -104,7 +104,9 @@ class Checkpoint:
                 return self.complete(file, state, num, seed, sensor=sensor, **how)
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")
-            self, scans, _ = self.open_partial([str(images)], sensor)
+            self, scans, remarks = self.open_partial([str(images)], sensor)
+            for lost in remarks[1:]:
+                warnings.warn(lost, stacklevel=2)
             seen = [scan.read() for scan in scans]
             images = torch.from_numpy(np.stack([one.image for one in seen]))
             state = torch.from_numpy(np.stack([one.state for one in seen]))
@@ -123,7 +125,7 @@ class Checkpoint:
         return self.through(self.sensor, numbered=False) if foreign else self, scans, remarks
 
     def through(self, sensor: Sensor | str, numbered: bool = True) -> "Checkpoint":
-        """The same model for another sensor's images; see `TransferFlow.at`."""
+        """This transfer flow for images of another sensor, by name, YAML file or `Sensor`; the weights are shared."""
         if not isinstance(self.generator, TransferFlow):
             raise InputError(f"{self.path} is a model of one sensor: leave --to, --sensor and --size out.")
         return replace(self, generator=self.generator.at(self.generator.space.through(named_sensor(sensor)), numbered))

@@ -151,7 +151,6 @@ def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = N
 
 
 def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[str, Any]:
-    """Metadata of the file."""
     flow = checkpoint.generator
     channels = ["range in metres", "reflectance of [0, 1]"][: 1 + flow.space.encoding.reflectance]
     scan = {

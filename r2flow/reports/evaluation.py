@@ -179,7 +179,6 @@ def evaluation_page(
 
 
 def _protocol(comparisons: Sequence[Comparison]) -> str:
-    """Text of the common protocol and sensor."""
     used = comparisons[0].measured[0].protocol
     points, (top, bottom) = used["points"], used["elevations"]
     return (

@@ -276,7 +276,6 @@ def _figure(panels: Sequence[tuple[str, Sequence[Row], str, str]], columns: int)
 
 
 def _by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
-    """Group rows by a key."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row[key], []).append(row)

@@ -54,7 +54,6 @@ def shown(value: Any) -> str:
 
 
 def _text(rows: Rows, columns: Columns) -> tuple[list[str], list[list[str]]]:
-    """Headings and cells."""
     if isinstance(columns, Mapping):
         return list(columns.values()), [[shown(row.get(key)) for key in columns] for row in rows]  # type: ignore[union-attr]
     return list(columns), [[shown(cell) for cell in row] for row in rows]

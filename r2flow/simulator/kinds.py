@@ -126,7 +126,6 @@ def _crossed(draws: ScalarDraws, main: Street) -> tuple[Street, ...]:
 
 
 def _drives(draws: ScalarDraws, main: Street) -> tuple[Patch, ...]:
-    """Paved drives and yards next to the street."""
     out = []
     for _ in range(draws.whole(1, 5)):
         length, width = draws.uniform(2.5, 9), draws.uniform(4, 10)

@@ -214,7 +214,6 @@ def furnish(b: SceneBuilder, street: Street, side: int) -> None:
 
 
 def _clutter(b: SceneBuilder, street: Street, side: int, edge: float) -> None:
-    """Small objects on the pavement."""
     draws = b.draws
     if draws.chance(0.25):
         start = draws.uniform(-30, 20)

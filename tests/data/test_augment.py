@@ -84,8 +84,3 @@ def test_an_image_depends_on_its_number_alone_and_is_left_as_it_was():
     np.testing.assert_array_equal(augment(IMAGE, 3, 5), first)
     assert not np.array_equal(augment(IMAGE, 4, 5), first)
     np.testing.assert_array_equal(IMAGE, before)
-
-
-def test_off_by_default():
-    assert not Augmentation()
-    assert all(Augmentation(**{kind: value}) for kind, value in KINDS.items())

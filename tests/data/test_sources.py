@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r2flow.data.reading import Reading, read_image
-from r2flow.data.sources import InMemory, ScanFiles, holdout_block, spread
+from r2flow.data.sources import InMemory, ScanFiles, holdout_block
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -97,8 +97,3 @@ def test_whole_drives_are_held_out_where_they_come_within_half_of_the_share():
     assert held(0.1, [0, 98]) == 10
     assert held(0.0, [0, 99]) == 0
     assert held(0.9, [0, 10]) == 90
-
-
-def test_few_of_many_are_spread_evenly():
-    assert spread(3, 8) == [0, 1, 2]
-    assert spread(100, 4) == [12, 37, 62, 87]

@@ -1,5 +1,6 @@
 """Flows from a scan with hidden rays to the whole scan."""
 
+import copy
 import math
 
 import numpy as np
@@ -11,7 +12,7 @@ from r2flow import noise
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.errors import InputError
 from r2flow.generators import TransferFlow, build_generator, condition_of
-from r2flow.generators.transfer import TOGETHER, Answers, smoothed
+from r2flow.generators.transfer import TOGETHER, Answers, Surroundings, smoothed
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.completion import completing
@@ -104,6 +105,17 @@ def test_the_intensities_of_another_sensor_may_have_any_scale(flow, scans):
     assert one[:, 1].max() > 0.1
 
 
+def test_the_returns_of_another_sensor_are_those_of_higher_rows(flow, scans):
+    other, state = copy.copy(flow), condition_of(flow.space, scans, measured(scans))
+    other.foreign, steps = True, torch.full((3, 2), 0.01)
+    about, elevations = Surroundings.of(flow.space, state, True, steps), flow.elevations.expand(3, -1)
+    rows, raised = (flow.rows(e, steps, torch.zeros(3) > 0) for e in (elevations, elevations + math.radians(3)))
+    t, x = torch.zeros(()), about.start
+    found, same, above = (f.answers(t, x, about, r) for f, r in ((other, rows), (flow, rows), (flow, raised)))
+    torch.testing.assert_close((found.ranges, found.returns), (same.ranges, above.returns))
+    assert not torch.equal(same.returns, above.returns)
+
+
 def test_a_turned_scan_has_a_turned_answer(flow, scans):
     state = measured(scans)
     noise_free = TransferFlow(flow.space, CONFIG["backbone"], sigma=0.0)
@@ -116,7 +128,6 @@ def test_a_turned_scan_has_a_turned_answer(flow, scans):
 
 @pytest.fixture
 def answers() -> Answers:
-    """Of one ray."""
     draw = torch.Generator().manual_seed(5)
     ranges, scales, logits = torch.randn(3, 1, 7, 1, 1, generator=draw, dtype=torch.float64)
     nothing = torch.zeros_like(logits)

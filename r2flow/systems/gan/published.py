@@ -50,7 +50,6 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 
 def _generator(model: Mapping[str, Any], out: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Name and options of our generator."""
     name, mapping, synthesis = GENERATORS[str(model["arch"])], model["mapping_kwargs"], model["synthesis_kwargs"]
     act = out["image"].get("act")
     if act not in (None, "nn.Tanh"):

@@ -84,13 +84,11 @@ class Attention(nn.Module):
 
 
 def _middle(channels: int) -> nn.Module:
-    """Residual block, attention, residual block."""
     blocks = ResidualBlock(channels, channels), ResidualBlock(channels, channels)
     return nn.Sequential(OrderedDict(block_1=blocks[0], attn_1=Attention(channels), block_2=blocks[1]))
 
 
 def _downsample(channels: int, stride: Size) -> nn.Module:
-    """A strided convolution."""
     return nn.Sequential(OrderedDict(conv=CircularConv2d(channels, channels, *DOWN[stride], stride=stride)))
 
 
