@@ -77,10 +77,6 @@ def test_a_sampler_that_draws_noise_on_the_way_is_refused():
         tableau(flow("efficient_unet", "flow_map").generator, build_sampler("renoise", steps=2))
 
 
-def snippets() -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sample.md").read_text(), flags=re.DOTALL)
-
-
 def test_the_noise_of_the_page_is_that_of_a_scan():
     assert torch.equal(standard_normal((2, 4, 8), 3, "evaluation", 5), Draws(3, [5]).start((2, 4, 8))[0])
 
@@ -163,7 +159,8 @@ def test_a_flow_map_goes_through_the_loop_and_the_page_s_program_runs(tmp_path, 
     assert apart.metres < 1e-3
     assert apart.rays == 0
     names: dict = {}
-    exec(next(code for code in snippets() if "InferenceSession" in code), names)
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sample.md").read_text(), flags=re.DOTALL)
+    exec(next(code for code in snippets if "InferenceSession" in code), names)
     scan, cloud = names["scan"][0], names["cloud"]
     np.testing.assert_allclose(np.linalg.norm(cloud, axis=1), scan[0][scan[0] > 0], rtol=1e-5, atol=1e-4)
     assert names["notes"]["evaluations"] == 3

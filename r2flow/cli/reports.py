@@ -261,11 +261,11 @@ def compare(
     for title, (cells, headings) in tables(groups).items():
         print_table(cells, headings, title)
         print()
-    remarks = {"images": "numbers of images: compare their curves at equal steps"}
-    remarks |= dict.fromkeys(("stage", "data"), "stages or data: compare them by r2flow evaluate, not by their losses")
-    differing = [text for key, text in remarks.items() if len({run.values[key] for run in compared} - {None}) > 1]
-    for text in dict.fromkeys(differing):
-        print(f"the runs have different {text}")
+    differ = {key for key in ("images", "stage", "data") if len({run.values[key] for run in compared} - {None}) > 1}
+    if "images" in differ:
+        print("the runs have seen different numbers of images: compare their curves at equal steps")
+    if differ - {"images"}:
+        print("the runs have different stages or data: compare them by r2flow evaluate, not by their losses")
     if out is not None:
         for path in write_page(compare_page(groups), out):
             print(path)

@@ -108,17 +108,16 @@ def _files(
     by_points = read_image
     if points := [path for path in paths if path not in images]:
         scans = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
-        own = next((sensor for name, sensor in SENSORS.items() if name == target.name), target)
+        own = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
         doubt = other_sensor(scans, source or own)
         if source and doubt and not stored:
             fits = f"; they fit --from {doubt.name}" if doubt.name else ""
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         if not source and not doubt and own.shape[0] < target.shape[0]:
             source = own  # fewer beams than rows of the completions
-        rows = target.shape[0]
         same = doubt is None
         if source:
-            same = source.shape[0] >= rows and source.resized(rows, target.columns).same_image(target)
+            same = source.shape[0] >= target.shape[0] and source.resized(*target.shape).same_image(target)
         try:
             fired = sensor_of(scans, source or (target if same else None))
         except InputError as error:
@@ -135,8 +134,8 @@ def _files(
             by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
-        told = scale or (source and source.reflectance_scale)
-        if told is None and full == estimated and full not in FULL_REFLECTANCE:
+        given = scale or (source and source.reflectance_scale)
+        if given is None and full == estimated and full not in FULL_REFLECTANCE:
             log.warning("%s: reflectance is divided by %g, its largest; --reflectance-scale names another", spec, full)
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)

@@ -64,6 +64,7 @@ def test_dropped_beams_are_whole_rows_and_dropped_rays_single_returns():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_switching_one_on_changes_no_other_draw(kind: str):
+    assert [bool(Augmentation()), bool(Augmentation(**{kind: KINDS[kind]}))] == [False, True]
     encoding = Encoding(SENSOR)
     plain = FlowDataset(SLOPE, encoding, 0, "training")[(7, 0)]
     changed = FlowDataset(SLOPE, encoding, 0, "training", Augmentation(**{kind: KINDS[kind]}))[(7, 0)]

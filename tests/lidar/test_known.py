@@ -85,6 +85,7 @@ def test_interpolation_keeps_what_is_measured_and_fills_the_rest(name):
     assert (found[:, measured] == image[:, measured]).all()
     assert ((found[0] > 0) == (image[0] > 0)).mean() > 0.9
     assert np.allclose(found[1][found[0] > 0], 0.25)
+    assert not INTERPOLATIONS[name](image, np.zeros(SHAPE, dtype=bool)).any()  # nothing is guessed from nothing
 
 
 def test_the_inverse_of_range_is_nearly_linear_on_the_ground():
