@@ -11,7 +11,7 @@ The same command, or the same config, resumes from the last checkpoint.
 import logging
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -189,16 +189,17 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     check_options("samples", SampleOptions, config["samples"])
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
-    drawn = sorted(key for key in map(key_of, asked) if f"{key}.".startswith("data.pairs."))
+    given = {key_of(text) for text in asked}
+    drawn = sorted(key for key in given if f"{key}.".startswith("data.pairs."))
     if drawn and config["data"]["name"] != PAIRS:
         raise InputError(f"{', '.join(drawn)} are of data=pairs, found data={config['data']['name']}: leave them out.")
     for key, scans in (("data", config["data"]), ("data.scans", config["data"].get("scans"))):
         if scans is not None:
-            _refuse_unread(key, scans)
+            _refuse_unread(key, scans, given)
     return config
 
 
-def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
+def _refuse_unread(key: str, data: Mapping[str, Any], given: Collection[str]) -> None:
     """Refuse options that the set of scans under this key would ignore."""
     name, defaults = data.get("name"), {**asdict(SourceOptions()), **resolve({})}
     options = defaults.keys() - {"name"}
@@ -209,7 +210,8 @@ def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
     elif name == MIXED:
         what, unread = "each of data.parts has its own", {"split", "drives"}
     elif name is not None and isinstance(SOURCES[name], Layout | Prepared):
-        what, unread = "scans in files are no simulated scenes", {"scenes"}
+        of_experiment = key == "data" and "data.scenes" not in given  # for its simulated scans
+        what, unread = "scans in files are no simulated scenes", set[str]() if of_experiment else {"scenes"}
     else:
         return
     wrong = sorted(f"{key}.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option])

@@ -158,7 +158,7 @@ SCALES = {
 )
 def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: Path, tmp_path: Path, folder):
     data, prepared = shared / "real" / "other_sensors" / folder, tmp_path / "my" / "prepared"
-    mine = tmp_path / "conf" / "sensor" / "mine.yaml"
+    mine = tmp_path / "my sensor.yaml"
     code, _, error = r2flow("sensor", data, "--out", mine)
     assert (code, error) == (0, "")
     assert read_sensor(mine).reflectance_scale == SCALES[folder]
@@ -166,6 +166,6 @@ def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: 
     assert (code, error) == (0, "")
     small = [part for part in TINY if not part.startswith(("data", "sensor."))]
     for given in (["data=prepared", f"data.root={prepared}"], ["data=folder", f"data.root={data}"]):
-        own = [*given, "--config-dir", str(tmp_path / "conf"), "sensor=mine", "data.batch_size=1"]
+        own = [*given, f"sensor='{mine}'", "data.batch_size=1"]
         done = in_process(tmp_path, [*own, *small, "trainer.max_steps=1", "trainer.fast_dev_run=true"])
         assert "WARNING" not in done.stderr

@@ -182,10 +182,10 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
     turn = f", in the columns that its {source.columns} rays a turn meet" if few else ""
     lines = [f"{spec}: {beams}; {measured}{turn}"]
     if lost := int((rows < 0).sum()):
-        lines.append(f"{spec}: {lost} of its {len(e)} beams look past the view of {target.name} and are lost")
+        lines.append(f"{spec}: {lost} of its {len(e)} beams look past the view of {target.name} and are not used")
         if source.name in SENSORS:
             size = f"{max(64, len(e))}x{SENSORS[source.name].columns}"
-            lines[-1] += f": --to {source.name} --size {size} keeps them"
+            lines[-1] += f": --to {source.name} --size {size} uses them"
     return lines
 
 
@@ -202,7 +202,11 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
             seen = points_through(points, fired, target, strength)
     if not seen.image[0].any():
         raise nothing_in_view(path, points, target)
-    return replace(seen, returns=int(points.xyz.any(axis=1).sum()))
+    assert seen.xyz is not None
+    r = np.linalg.norm(points.xyz, axis=1)
+    rows, used = (np.ascontiguousarray(xyz).view("V12")[:, 0] for xyz in (points.xyz, seen.xyz.reshape(3, -1).T))
+    others = (r >= target.min_range) & (r <= target.max_range) & ~np.isin(rows, used)
+    return replace(seen, others=Points(points.xyz[others], None if strength is None else strength[others]))
 
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:

@@ -14,7 +14,7 @@ from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
-from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, parts_of
+from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator, parts_of
 from r2flow.generators.flow import Conditioned, Flow
 from r2flow.generators.surroundings import FEATURES, ROW, STEEP, RowFeatures, Surroundings, encoded, steps_of
 from r2flow.lidar.space import ModelSpace
@@ -120,6 +120,13 @@ class TransferFlow(Flow):
         self.elevations, self.numbered = space.rays[0, :, 0], True
         self.foreign = False  # whether the scans are of another sensor than the training scans
         self.run_by(Jump(steps=1))
+
+    def start_from(self, parent: Generator) -> None:
+        """Copy a transfer flow's weights; for a sensor with other beams, each row starts from the shared vector."""
+        weights = parent.state_dict()
+        if isinstance(parent, TransferFlow) and not torch.equal(self.rows.elevations, parent.rows.elevations):
+            weights["rows.weight"] = weights["rows.weight"][:1].expand_as(self.rows.weight)
+        self._take(parent, {**weights, "backbone.coords": self.backbone.coords})
 
     def at(self, space: ModelSpace, numbered: bool = True) -> Self:
         """This flow for another sensor; it shares the weights.

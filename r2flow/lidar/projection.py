@@ -205,10 +205,5 @@ def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, endings: S
         if path.suffix == ".npy":
             save_array(path, image)
         else:
-            write_cloud(path, image, rays)
-
-
-def write_cloud(path: Path, image: np.ndarray, rays: Tensor, measured: np.ndarray | None = None) -> None:
-    """Write the points of a range image (`image_to_points`)."""
-    xyz, reflectance = image_to_points(image, rays, measured)
-    write_points(path, xyz, reflectance if len(image) > 1 else None)
+            xyz, reflectance = image_to_points(image, rays)
+            write_points(path, xyz, reflectance if len(image) > 1 else None)

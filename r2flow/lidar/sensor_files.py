@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -50,10 +51,14 @@ def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> S
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
     """Write a sensor as a YAML file that begins with a comment, such as the source of the numbers."""
-    options = {key: value for key, value in asdict(sensor).items() if value is not None}
-    options |= {key: list(value) for key, value in options.items() if isinstance(value, tuple)}
-    options |= {"rows": None, "rays": "centre"}
+    options = {key: value for key, value in options_of_sensor(sensor).items() if key == "rows" or value is not None}
     units = "Elevations in degrees, the top row first, a row each where rows is null; ranges and height in metres."
     with atomic_write(path, "w") as file:
         file.writelines(f"# {line}\n" for line in (*comment.splitlines(), units))
         yaml.safe_dump(options, file, default_flow_style=None, sort_keys=False, width=100)
+
+
+def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
+    """The options of `build_sensor` for a sensor, and the ray convention of a model."""
+    options = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(sensor).items()}
+    return {**options, "rows": None, "rays": "centre"}

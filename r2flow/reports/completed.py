@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from r2flow import noise
 from r2flow.data.partial import PartialScan
@@ -18,8 +19,8 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
-from r2flow.lidar.projection import write_cloud
-from r2flow.lidar.scan_files import WRITTEN
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import WRITTEN, write_points
 from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import common_mae
 from r2flow.model.checkpoint import Checkpoint
@@ -88,13 +89,14 @@ def write_completed(
             raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, np.ndarray | None] = {}
-    kept = returns = 0
+    used = others = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with ScanBar("completing", len(left) * job.num, len(left) * batches, "answers") as bar:
         for number in left:
             scan = scans[number]
             whole, given = hiding(scan, job, number)
-            kept, returns = kept + int((whole.state == Ray.RETURN).sum()), returns + whole.returns
+            used += 0 if scan.image else int((given.state == Ray.RETURN).sum())
+            others += 0 if given.others is None else len(given.others.xyz)
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (completed,) = complete(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,
@@ -110,9 +112,10 @@ def write_completed(
             if not completed.evaluations.any():
                 print(f"{scan.name}: everything is known, so nothing was completed; see --fill-gaps and --mask")
             bar.set(len(done) * job.num)
-    if returns:
+    if used:
         size = "x".join(map(str, checkpoint.sensor.shape))
-        print(f"{kept:,} of {returns:,} measured points are kept: in the view, the nearest in each pixel of {size}")
+        more = f", and {others:,} more kept" if others else ""
+        print(f"{used:,} measured points are used, the nearest in each pixel of {size}{more}")
     return done
 
 
@@ -204,7 +207,14 @@ def _write(
         if scan.image:
             save_array(path, image)
         else:
-            write_cloud(path, image, checkpoint.sensor.rays(), measured)
+            xyz, reflectance = image_to_points(image, checkpoint.sensor.rays(), measured)
+            if given.others is not None:
+                strength = given.others.reflectance
+                if strength is None:
+                    strength = reflectance[cKDTree(xyz).query(given.others.xyz)[1]]
+                xyz = np.concatenate([xyz, given.others.xyz])
+                reflectance = np.concatenate([reflectance, strength])
+            write_points(path, xyz, reflectance if len(image) > 1 else None)
 
 
 def _draw(

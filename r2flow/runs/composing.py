@@ -20,7 +20,7 @@ from hydra.core.override_parser.types import OverrideType, Sweep
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
-from r2flow.config import flatten
+from r2flow.config import flatten, override
 from r2flow.errors import InputError
 from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
 
@@ -171,7 +171,11 @@ MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~
 
 
 def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
-    """Convert overrides for Hydra: `KEY={name: NAME, ...}` replaces the whole value, since NAME has its own options."""
+    """Convert overrides for Hydra.
+
+    `KEY={name: NAME, ...}` replaces the whole value, since NAME has its own options; `sensor=FILE.yaml` becomes the
+    options in the file.
+    """
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
     converted: list[str] = []
     parser = OverridesParser.create()
@@ -196,6 +200,12 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
             problem = f" leaves the run without its {key}: give one of {', '.join(choices(key))}"
         elif parsed.is_delete() and key.partition(".")[0] not in MAY_GO:
             problem = f": every run has its {key}; give {key}=VALUE"
+        elif key == "sensor" and str(value).endswith((".yaml", ".yml")):
+            from r2flow.lidar.sensor_files import options_of_sensor, read_sensor
+
+            options = options_of_sensor(read_sensor(str(value)))
+            converted += [override(f"++sensor.{name}", option) for name, option in options.items()]
+            continue
         else:
             named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
             replaced = named and parsed.type == OverrideType.CHANGE

@@ -116,6 +116,17 @@ def test_the_returns_of_another_sensor_are_those_of_higher_rows(flow, scans):
     assert not torch.equal(same.returns, above.returns)
 
 
+def test_a_flow_for_another_sensor_starts_as_the_parents_answer_to_any_sensor(flow, scans):
+    other, images = built(sensor={"name": "vlp16", "rows": 16, "columns": 64}), scans[:, :1].repeat(1, 1, 2, 2)
+    torch.nn.init.zeros_(other.backbone.answer.weight)
+    other.start_from(flow)
+    state = measured(images)
+    mine, parents = (f.space.decode(answered(f, images, state).x)[:, 0] for f in (other, flow.at(other.space)))
+    both = (mine > 0) & (parents > 0)
+    assert both.float().mean() > 0.5
+    assert torch.equal(mine[both], parents[both])
+
+
 def test_a_turned_scan_has_a_turned_answer(flow, scans):
     state = measured(scans)
     noise_free = TransferFlow(flow.space, CONFIG["backbone"], sigma=0.0)

@@ -101,6 +101,11 @@ def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
     assert run.config["encoding"]["levels"] == run.stage.generator.space.encoding.levels == 50
 
 
+def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(scans: Path, tmp_path: Path):
+    asked = ["experiment=densify", "data=folder", f"data.root={scans}", f"run_dir={tmp_path / 'run'}"]
+    assert build(compose(asked), asked).data.options.name == "folder"
+
+
 def test_a_named_choice_has_options_of_its_own():
     assert compose(["stage.time={name: logit_normal, mean: 2.0}"])["stage"]["time"] == {
         "name": "logit_normal",
