@@ -28,7 +28,8 @@ from r2flow.errors import InputError, check
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.registry import Registry
+from r2flow.models import MODELS
+from r2flow.registry import Registry, did_you_mean
 from r2flow.store import MANIFEST, read_manifest
 
 log = logging.getLogger(__name__)
@@ -152,8 +153,9 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
     if path.is_file():
         return SourceOptions(FOLDER, str(path.parent)), path
     if not path.exists():
+        hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
         raise InputError(
-            f"{path} does not exist. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run."
+            f"{path} does not exist. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run.{hint}"
         )
     if _manifest(path).get("format") == "r2flow scans":
         return SourceOptions(PREPARED, str(path)), None
