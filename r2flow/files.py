@@ -53,6 +53,12 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
             temporary.unlink()
 
 
+def write_file(path: str | Path, content: str | bytes) -> None:
+    """Write a whole file atomically."""
+    with atomic_write(path, "w" if isinstance(content, str) else "wb") as file:
+        file.write(content)
+
+
 def save_array(path: str | Path, array: np.ndarray) -> None:
     """Write a .npy file atomically."""
     with atomic_write(path) as file:

@@ -31,7 +31,7 @@ from safetensors.numpy import save
 
 from r2flow.config import at_most_three, differences
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, parse_json, read_json
+from r2flow.files import parse_json, read_json, write_file
 from r2flow.lidar.scan_files import FIRM_ENDINGS
 from r2flow.signals import end_with_parent, out_of_reach
 
@@ -98,8 +98,7 @@ class Store:
     def write_manifest(self, **notes: Any) -> None:
         """Write or overwrite the manifest: the recipe and `notes`."""
         content = {"format": f"r2flow {self.kind}", "recipe": self.described, **notes}
-        with atomic_write(self.folder / MANIFEST, "w") as file:
-            json.dump({**content, "checksum": checksum(content)}, file, indent=1)
+        write_file(self.folder / MANIFEST, json.dumps({**content, "checksum": checksum(content)}, indent=1))
 
     def has(self, item: int) -> bool:
         """Whether an item exists; reads only the header of its file."""
@@ -119,8 +118,7 @@ class Store:
         (path,) = self.files(item)
         if path.is_symlink() and not path.exists():
             path.unlink()
-        with atomic_write(path) as file:
-            file.write(save(dict(tensors), metadata={"r2flow": json.dumps(note)}))
+        write_file(path, save(dict(tensors), metadata={"r2flow": json.dumps(note)}))
 
     def read(self, item: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Read tensors and notes of an item and verify its checksum.
@@ -139,8 +137,7 @@ class Store:
     def head(self, item: int) -> dict[str, Any]:
         """Read the notes of an item; raises the exceptions of `read`."""
         with self._opened(item) as (_, note):
-            notes: dict[str, Any] = note["notes"]
-            return notes
+            return dict(note["notes"])
 
     @contextmanager
     def _opened(self, item: int) -> Iterator[tuple[Any, dict[str, Any]]]:

@@ -12,7 +12,7 @@ from r2flow.evaluation.measuring import MetricResult, Work, gather_real, measure
 from r2flow.evaluation.protocols import Rules
 from r2flow.evaluation.references import baseline_sets, reference_sets
 from r2flow.evaluation.statistics import Cache, Statistics
-from r2flow.files import atomic_write, read_json
+from r2flow.files import read_json, write_file
 from r2flow.metrics.base import ScanMetric
 from r2flow.processes import place
 from r2flow.store import checksum
@@ -95,8 +95,7 @@ class Comparer:
             if other.source.drawn:
                 results.append(speed_result(real, other))
             if path is not None and place()[0] == 0:
-                with atomic_write(path, "w") as file:
-                    json.dump([asdict(result) for result in results], file)
+                write_file(path, json.dumps([asdict(result) for result in results]))
         return Comparison(name, real, other, results, time.monotonic() - start, kind)
 
     def _path(self, real: ScanSet, other: ScanSet) -> Path | None:

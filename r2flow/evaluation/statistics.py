@@ -13,7 +13,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from r2flow.data.sets import ScanSet
-from r2flow.files import atomic_write, cache_folder
+from r2flow.files import cache_folder, write_file
 from r2flow.metrics.base import ScanMetric
 from r2flow.model.checkpoint import read_tensors
 
@@ -60,8 +60,7 @@ class Cache:
         notes = {"key": key, "scans": str(statistics.scans), "empty": str(statistics.empty)}
         data = save({name: value.contiguous() for name, value in statistics.states.items()}, metadata=notes)
         try:
-            with atomic_write(self.path(key)) as file:
-                file.write(data)
+            write_file(self.path(key), data)
         except OSError as error:
             log.warning("statistics are not cached: %s: %s", self.folder, error.strerror or error)
 

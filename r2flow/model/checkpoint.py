@@ -20,7 +20,7 @@ from r2flow.config import check_tree, learned
 from r2flow.data.opening import reading_for
 from r2flow.data.partial import PartialScan, open_partial
 from r2flow.errors import InputError, check, naming
-from r2flow.files import atomic_write, parse_json, telling
+from r2flow.files import parse_json, telling, write_file
 from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
@@ -340,9 +340,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
         weights |= {n: weights[n].half() for n, value in parameters if value.ndim > 1 and value.numel() > SMALL}
     notes = {"config": learned(checkpoint.config), "step": checkpoint.step, **checkpoint.generator.drawing()}
     # Under one key, since the order of several metadata keys is not fixed.
-    data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})
-    with atomic_write(path) as file:
-        file.write(data)
+    write_file(path, save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})}))
 
 
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:

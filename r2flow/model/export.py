@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from r2flow import __version__
 from r2flow.errors import InputError, require
-from r2flow.files import atomic_write
+from r2flow.files import write_file
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.space import ModelSpace
@@ -145,8 +145,7 @@ def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = N
     notes = _notes(checkpoint, how, steps)
     with _quiet():
         data, any_batch = write(flow, steps, notes)
-    with atomic_write(path) as file:
-        file.write(data)
+    write_file(path, data)
     return Exported(path, any_batch, notes)
 
 
@@ -260,8 +259,7 @@ def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None 
     """Compare the first scans of seed 0 by the file and by the flow."""
     flow = checkpoint.generator
     noise = Draws(0, range(num if exported.any_batch else 1)).start(flow.noise_shape)
-    x_1 = flow(noise, sampler=sampler).x
-    expected, _ = Decoded(flow.space)(x_1)
+    expected, _ = Decoded(flow.space)(flow(noise, sampler=sampler).x)
     exported_scans = run(exported.path, noise)["scan"]
     returned, returned_exported = expected[:, 0] > 0, exported_scans[:, 0] > 0
     both = returned & returned_exported

@@ -22,7 +22,7 @@ from matplotlib.ticker import LogLocator
 
 import r2flow
 from r2flow.errors import InputError, printable
-from r2flow.files import atomic_write
+from r2flow.files import write_file
 from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row
 
@@ -88,24 +88,20 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
     }
     for ending, content in contents.items():
         written.append(out / f"{page.name}.{ending}")
-        with atomic_write(written[-1], "w") as file:
-            file.write(content)
+        write_file(written[-1], content)
     return written
 
 
 def write_json(page: Page, path: Path) -> None:
     """Write only the JSON of a page."""
-    with atomic_write(path, "w") as file:
-        file.write(_json(page, provenance(page)))
+    write_file(path, _json(page, provenance(page)))
 
 
-def prepare_folder(out: str | Path) -> Path:
+def prepare_folder(out: Path) -> None:
     """Create the folder, to fail before measuring if it is not writable."""
-    out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     if not os.access(out, os.W_OK):
         raise InputError(f"{out} cannot be written to; give another --out.")
-    return out
 
 
 def provenance(page: Page) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from r2flow.config import flatten, key_of, override, rule
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, read_json
+from r2flow.files import read_json, write_file
 from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.runs.folder import read_config
 from r2flow.signals import LATER, code_of, listening
@@ -112,8 +112,7 @@ def is_finished(link: Link) -> bool:
 
 def note(folder: Path, *links: Link) -> None:
     """Record in a folder the finished links that it holds or, for a report, compares."""
-    with atomic_write(folder / RECORD, "w") as file:
-        json.dump([_record(link) for link in links], file, indent=2)
+    write_file(folder / RECORD, json.dumps([_record(link) for link in links], indent=2))
 
 
 def is_noted(folder: Path, *links: Link) -> bool:

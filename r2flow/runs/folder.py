@@ -14,7 +14,7 @@ from torch import Tensor
 
 from r2flow.config import at_most_three, check_tree, differences, flatten, rule
 from r2flow.errors import InputError, check
-from r2flow.files import atomic_write
+from r2flow.files import write_file
 from r2flow.model.checkpoint import FOLDER, checkpoints_of, read_checkpoint, step_of
 
 log = logging.getLogger(__name__)
@@ -71,8 +71,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
-    with atomic_write(Path(run, CONFIG), "w") as file:
-        yaml.safe_dump(dict(config), file, sort_keys=False)
+    write_file(Path(run, CONFIG), yaml.safe_dump(dict(config), sort_keys=False))
 
 
 def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor] | None = None) -> Path | None:

@@ -22,7 +22,7 @@ import numpy as np
 from torch import Tensor
 
 from r2flow.errors import InputError, printable
-from r2flow.files import atomic_write
+from r2flow.files import write_file
 from r2flow.reports.pictures import HEIGHTS, RANGES, class_colours, colours
 
 MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB
@@ -103,9 +103,7 @@ def most_images(shape: Sequence[int]) -> int:
 
 def write_page(path: str | Path, *args: Any, **options: Any) -> Path:
     """Write the `page` of these arguments atomically."""
-    content = page(*args, **options)
-    with atomic_write(path, "w") as file:
-        file.write(content)
+    write_file(path, page(*args, **options))
     return Path(path)
 
 
