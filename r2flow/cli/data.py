@@ -35,9 +35,7 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Scan i depends only on the seed and i.")] = 0,
     format: Annotated[str, typer.Option(help="Formats, of bin,ply,pcd,npy (range images).")] = "bin",
     labels: Annotated[bool, typer.Option("--labels", help="Write SemanticKITTI .label files.")] = False,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. Default: one per core.", show_default=False)
-    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one per core.")] = None,
 ) -> None:
     """Simulate scans of street scenes. The same command resumes an interrupted run."""
     from r2flow.lidar.sensor_files import named_sensor
@@ -124,8 +122,7 @@ def sensor(
         raise InputError(f"{out} exists; give another --out, or --overwrite to replace it.")
     name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
     name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
-    folders = [scans_of(path) for path in scans]
-    paths = [folder[index] for folder in folders for index in spread(len(folder), most)]
+    paths = [folder[index] for folder in map(scans_of, scans) for index in spread(len(folder), most)]
     points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
     mine, beams, steps = estimate_sensor(points, name)
     e, middle = mine.elevations, len(mine.elevations) // 2
@@ -153,9 +150,7 @@ def unpack(
     out: OutOption,
     topic: Annotated[str | None, typer.Option(help="Topic of the point clouds, required if several.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Take every Nth message.")] = 1,
-    most: Annotated[
-        int | None, typer.Option("--num", min=1, help="Maximum number of scans to write.", show_default=False)
-    ] = None,
+    most: Annotated[int | None, typer.Option("--num", min=1, help="Maximum number of scans to write.")] = None,
 ) -> None:
     """Write the PointCloud2 messages of a recording as scan files, named by time in ns.
 

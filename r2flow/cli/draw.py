@@ -71,9 +71,7 @@ def sample(
     draw: DrawOptions,
     how: SamplerOptions,
     part: RegionOptions,
-    model: Annotated[
-        str | None, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)
-    ] = None,
+    model: Annotated[str | None, typer.Argument(help="A model, a run folder or a checkpoint file.")] = None,
     precision: PrecisionOption = "32-true",
     format: Annotated[str | None, typer.Option(help="Formats, of ply,bin,npy. Default: all possible.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of scans to draw as pictures.")] = 8,
@@ -156,8 +154,7 @@ class PartialOptions:
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
     scans: Annotated[
-        int | None,
-        typer.Option("--scans", min=1, help="Maximum number of scans per folder, evenly spaced. Default: all."),
+        int | None, typer.Option(min=1, help="Maximum number of scans per folder, evenly spaced. Default: all.")
     ] = None
 
     def open(self, model: str, device: str, what: Sequence[str]) -> "tuple[Checkpoint, list[PartialScan], list[str]]":

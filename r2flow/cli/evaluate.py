@@ -83,7 +83,7 @@ class EvaluateOptions:
     workers: Annotated[int, typer.Option(min=0, help="Additional processes that read scans.")] = 2
     device: DeviceOption = "auto"
     json: Annotated[Path | None, typer.Option("--json", help="JSON file for all results with their protocols.")] = None
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page.", show_default=False)] = None
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page.")] = None
 
     def check(self, named: Sequence[str], sampled: Sequence[str]) -> None:
         """Refuse incompatible options before reading any scan."""
@@ -102,15 +102,12 @@ class EvaluateOptions:
 )
 @grouped
 def evaluate(
-    real: Annotated[str, typer.Argument(help=f"Real scans: {SETS}.", show_default=False)],
+    real: Annotated[str, typer.Argument(help=f"Real scans: {SETS}.")],
     options: EvaluateOptions,
     how: ReadingOptions,
     generated: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="Sets of generated scans, as REAL, or runs, checkpoints or models to sample.",
-            show_default=False,
-        ),
+        typer.Argument(help="Sets of generated scans, as REAL, or runs, checkpoints or models to sample."),
     ] = None,
 ) -> None:
     """Evaluate generated scans against real scans: distances with their protocols and sensor.
@@ -232,10 +229,9 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
     from r2flow.evaluation.sets import sampled_set
 
     names = options.sampler.split(",") if options.sampler else [None]
-    steps = numbers("steps", options.steps, int) if options.steps else [None]
-    samplers = _samplers(flow.generator, names, steps, options.tolerance)
+    steps = numbers("steps", options.steps) if options.steps else [None]
     sets = {}
-    for sampler in samplers:
+    for sampler in _samplers(flow.generator, names, steps, options.tolerance):
         line = f"{label}, {sampler.name}" if len(names) > 1 else label
         count = getattr(sampler, "steps", None)
         name = f"{line}, {count} step{'s' * (count > 1)}" if count and len(steps) > 1 else line

@@ -1,7 +1,6 @@
 """Options shared by verbs, and their parsing; a verb takes a dataclass of options as one parameter."""
 
 import inspect
-import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from r2flow.model.checkpoint import Checkpoint
 
 CheckpointOption = Annotated[
-    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
+    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.")
 ]
 DeviceOption = Annotated[str, typer.Option(help="Device: auto, cpu, cuda, cuda:1, ...")]
 PrecisionOption = Annotated[
@@ -167,12 +166,12 @@ class DrawOptions:
     device: DeviceOption = "auto"
 
 
-def numbers(option: str, text: str, kind: type = float) -> list[Any]:
-    """Parse positive numbers: '4,8' to [4, 8]."""
+def numbers(option: str, text: str) -> list[int]:
+    """Parse positive whole numbers: '4,8' to [4, 8]."""
     try:
-        values = [kind(part) for part in text.split(",")]
+        values = [int(part) for part in text.split(",")]
     except ValueError:
         values = [0]
-    if not all(0 < value < math.inf for value in values):
+    if min(values) <= 0:
         raise InputError(f"--{option} must be positive numbers separated by commas, found {text!r}.")
     return values

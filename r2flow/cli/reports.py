@@ -36,9 +36,7 @@ def finish(page: "Page", out: Path, parts: Sequence[str]) -> None:
     """Write a page; print the given parts and the paths of its files."""
     from r2flow.reports.pages import write_page
 
-    written = write_page(page, out)
-    print("\n\n".join(parts), end="\n\n")
-    print(*written, sep="\n")
+    print("\n\n".join(parts), "", *write_page(page, out), sep="\n")
 
 
 @report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")
@@ -97,7 +95,7 @@ def solvers(
     where = choose_device(draw.device)
     methods = samplers.split(",") if samplers else measuring.METHODS
     names = [] if problems == "none" else problems.split(",") if problems else list(PROBLEMS)
-    most = numbers("budgets", budgets, int)
+    most = numbers("budgets", budgets)
     chosen, subjects, flow = measuring.configurations(methods, most), measuring.problem_subjects(names), None
     if not chosen or not (names or model):
         raise InputError("nothing to measure: give a model, more --budgets, or leave --problems none out.")
@@ -105,8 +103,7 @@ def solvers(
     if loaded is not None:
         as_flow(loaded.generator, "report solvers")
     prepare_folder(out)
-    log = logging.getLogger("r2flow.flow")
-    log.setLevel(logging.ERROR)  # the report counts failed scans
+    logging.getLogger("r2flow.flow").setLevel(logging.ERROR)  # the report counts failed scans
     if loaded is not None:
         with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
             flow = measuring.checkpoint_subject(
@@ -267,5 +264,4 @@ def compare(
     if differ - {"images"}:
         print("the runs have different stages or data: compare them by r2flow evaluate, not by their losses")
     if out is not None:
-        for path in write_page(compare_page(groups), out):
-            print(path)
+        print(*write_page(compare_page(groups), out), sep="\n")

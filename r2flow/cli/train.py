@@ -27,7 +27,7 @@ def train(context: typer.Context) -> int:
 @app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs runs/r2flow_1rf --num 1000000")
 @grouped
 def pairs(
-    model: Annotated[str, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)],
+    model: Annotated[str, typer.Argument(help="A model, a run folder or a checkpoint file.")],
     how: SamplerOptions,
     num: Annotated[int, typer.Option(min=1, help="Total number of pairs.")] = 1000,
     out: Annotated[

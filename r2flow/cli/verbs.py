@@ -65,8 +65,7 @@ def _run() -> None:
             sys.exit(0)
         code = app(arguments, prog_name="r2flow", standalone_mode=False)
     except (InputError, OSError) as error:
-        print(f"error: {explain_mistake(error)}", file=sys.stderr)
-        sys.exit(2)
+        message = explain_mistake(error)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not any(words in str(error) for words in FULL):
             raise
@@ -74,12 +73,13 @@ def _run() -> None:
         more = f" for {size[1]} more" if size else ""
         batched = any(word.startswith("--batch-size") for word in sys.argv)
         less = "a smaller --batch-size" if batched else "smaller batches or images"
-        print(f"error: the memory has no room{more}; give {less}.", file=sys.stderr)
-        sys.exit(2)
+        message = f"the memory has no room{more}; give {less}."
     except USAGE_ERROR as error:
-        print(f"error: {_usage(error.format_message())} See --help.", file=sys.stderr)
-        sys.exit(2)
-    sys.exit(code if isinstance(code, int) else 0)
+        message = f"{_usage(error.format_message())} See --help."
+    else:
+        sys.exit(code if isinstance(code, int) else 0)
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)
 
 
 def _usage(message: str) -> str:

@@ -110,7 +110,7 @@ def view(
         names = "--sensor, --size, --projection, --convention, --reflectance-scale and --columns"
         raise InputError(f"--sequence, {names} are of scans; found none.")
     check(not (sequence and times), "--sequence and --times both use the slider; give one of them.")
-    counts = numbers("steps", steps, int) if steps else []
+    counts = numbers("steps", steps) if steps else []
     check(not times or len(counts) <= 1, f"--times takes one number of --steps, found {steps}.")
     panels: list[Panel] = []
     frames: list[str] = []
