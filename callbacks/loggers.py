@@ -19,14 +19,6 @@ PROJECT = "r2flow"
 Picture = Callable[[Any, str, np.ndarray, int], None]
 
 
-def _csv(run_dir: Path) -> Logger:
-    return CSVLogger(run_dir, name="metrics")
-
-
-def _tensorboard(run_dir: Path) -> Logger:
-    return TensorBoardLogger(run_dir, name="tensorboard", version="", default_hp_metric=False)
-
-
 def _wandb(run_dir: Path) -> Logger:
     """W&B logger; resumes the run of an existing folder `run-DATE-ID`."""
     require("loggers=[wandb]", "wandb", "wandb")
@@ -52,7 +44,11 @@ def _mlflow(run_dir: Path) -> Logger:
 _STORES: set[str] = set()
 
 LOGGERS: Registry[Callable[[Path], Logger]] = Registry(
-    "logger", csv=_csv, tensorboard=_tensorboard, wandb=_wandb, mlflow=_mlflow
+    "logger",
+    csv=lambda run_dir: CSVLogger(run_dir, name="metrics"),
+    tensorboard=lambda run_dir: TensorBoardLogger(run_dir, name="tensorboard", version="", default_hp_metric=False),
+    wandb=_wandb,
+    mlflow=_mlflow,
 )
 
 # Functions that log a picture, (H, W, 3) uint8, by class of logger; other loggers do not take pictures.
