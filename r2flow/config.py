@@ -150,8 +150,7 @@ def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     fixed: dict[str, Any] = {}
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
-            inner = learned(value, f"{prefix}{key}.")
-            if inner:
+            if inner := learned(value, f"{prefix}{key}."):
                 fixed[key] = inner
         elif rule(f"{prefix}{key}").resume == "fixed":
             groups = isinstance(value, Sequence) and value and all(isinstance(group, Mapping) for group in value)

@@ -171,8 +171,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
     """
     check_keys(config)
     if parent is None:
-        parent_checkpoint = find_parent(config)
-        parent = parent_checkpoint and parent_checkpoint[0]
+        parent, _ = find_parent(config) or (None, None)
     config = _checked(config, asked, parent)
     if config["encoding"].get("reflectance", AUTO) == AUTO:
         config["encoding"]["reflectance"] = True  # decided when the scans are read

@@ -85,8 +85,7 @@ class Nearest:
     @property
     def distances(self) -> np.ndarray:
         """Distance of each scan to its nearest training scan, (N,)."""
-        distances: np.ndarray = self.squared.double().sqrt().cpu().numpy()
-        return distances
+        return np.asarray(self.squared.double().sqrt().cpu())
 
     def match(self, place: int, training: ScanSet) -> np.ndarray:
         """Image of the nearest training scan of the scan at `place`, aligned with that scan."""

@@ -133,9 +133,7 @@ def measure(
             "real": real[name].scans, "real_chosen": real[name].chosen, "real_empty": real[name].empty,
             "generated": len(generated), "generated_empty": empty,
         }  # fmt: skip
-        settings: dict[str, Any] = {
-            **protocol.describe(), **asdict(metric.protocol), **described, "sizes": sizes
-        }  # fmt: skip
+        settings: dict[str, Any] = {**protocol.describe(), **asdict(metric.protocol), **described, "sizes": sizes}
         intervals: dict[str, tuple[float, float]] = {}
         if draws and not metric.resamples:
             remarks.append(f"{name} has no bootstrap interval.")

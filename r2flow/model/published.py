@@ -122,7 +122,6 @@ NAMES = (
     *(f"builtins.{name}" for name in ("bool", "dict", "float", "int", "list", "str")),
     "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint",
 )
-CONTENT, VALUE = "_content", "_val"
 
 
 def inert() -> Any:
@@ -135,9 +134,9 @@ def plain(value: Any) -> Any:
     if not isinstance(value, Inert):
         return value
     state = vars(value)
-    if VALUE in state:
-        return state[VALUE]
-    content = state.get(CONTENT)
+    if "_val" in state:
+        return state["_val"]
+    content = state.get("_content")
     if isinstance(content, dict):
         return {key: plain(node) for key, node in content.items()}
     return [plain(node) for node in content] if isinstance(content, list) else content

@@ -95,10 +95,8 @@ def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
     """Validation scans of a run, (N, 2 or 1, H, W) in metres and reflectance."""
     config = read_config(run) or flow.config  # the folder's config has the current path of the scans
-    data = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **config["data"])
-    _, held = data.sources()
-    numbers = track(range(len(held)), "reading held-out scans", "scans")
-    return np.stack([held[i] for i in numbers])
+    _, held = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **config["data"]).sources()
+    return np.stack([held[i] for i in track(range(len(held)), "reading held-out scans", "scans")])
 
 
 def bend(flow: Checkpoint, num: int) -> float:

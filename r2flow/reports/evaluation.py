@@ -340,6 +340,5 @@ def copies_figure(nearest: Mapping[str, Nearest], training: ScanSet, pairs: int 
         number = int(copies.numbers[place])
         draw_range(left, copies.scans.source[number], label=False)
         draw_range(right, copies.match(place, training), label=False)
-        title = f"{name} {number}: {shown(float(copies.distances[place]))} away"
-        left.set_title(title, fontsize=8, pad=2)
+        left.set_title(f"{name} {number}: {shown(float(copies.distances[place]))} away", fontsize=8, pad=2)
     return figure

@@ -78,8 +78,7 @@ def interpolation(
     panels = [first, Panel("between", images[chosen], rays), last]
     write_panels(Path(out, "interpolation.html"), panels, captions, "Interpolation")
     figures = {"interpolation": interpolation_figure(pair.numpy(), images, weights, rays, names)}
-    device = str(checkpoint.generator.device)
-    return Page("interpolation", "Interpolation", text, rows, figures, device=device)
+    return Page("interpolation", "Interpolation", text, rows, figures, device=str(checkpoint.generator.device))
 
 
 def interpolation_figure(

@@ -17,7 +17,6 @@ from r2flow.inversion import interpolate_scans
 from r2flow.lidar.projection import image_to_points
 from r2flow.metrics.birds_eye import EXTENT, birds_eye_histogram, js_distance
 from r2flow.model.checkpoint import Checkpoint, weights_hash
-from r2flow.model.sampling import sample
 from r2flow.progress import track
 from r2flow.reports.backbones import cost
 from r2flow.reports.curvature import curvature_figure, curvature_text, measure_paths, trajectories_figure
@@ -88,8 +87,7 @@ def paper_page(
     if real is not None and len(real) > 1 and flows and flows[0].role not in SYSTEMS.values():
         figures["figure_3"] = between_figure(flows[0].checkpoint, real)
     samples = {
-        run.label: np.concatenate([batch.images.nan_to_num(0.0).numpy() for batch in sample(run.checkpoint, num)])
-        for run in track(runs, "sampling", "generators")
+        run.label: run.checkpoint.sample(num).nan_to_num(0.0).numpy() for run in track(runs, "sampling", "generators")
     }
     scans = None if real is None else np.stack([real.spread(num).source[i] for i in range(min(num, len(real)))])
     figures["figure_5"] = birds_eye_figure(

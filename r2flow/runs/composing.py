@@ -116,7 +116,6 @@ def plain(config: DictConfig) -> dict[str, Any]:
 def add_choices(group: str) -> None:
     """Add a Hydra choice for each registry entry of a group without a YAML file, from its constructor's options."""
     module, table, given_by_run = REGISTRIES[group]
-    store = ConfigStore.instance()
     for name, entry in getattr(import_module(module), table).items():
         if (CONF / group / f"{name}.yaml").is_file():
             continue
@@ -127,7 +126,7 @@ def add_choices(group: str) -> None:
             if group == "stage":
                 node = {"init": None, **node}
             node = {"name": name, **node}
-        store.store(name, node, group=group)
+        ConfigStore.instance().store(name, node, group=group)
 
 
 def with_choices(compose: Callable[[], T]) -> T:
@@ -220,7 +219,6 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
 def explain(error: Exception) -> str:
     """Shorten an error of Hydra to one line, with the nearest existing key."""
     text = str(error)
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
     unknown = re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text)
     if unknown:
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
@@ -242,13 +240,12 @@ def explain(error: Exception) -> str:
     if several:
         key, values = several.groups()
         return f"{key}={values} is several values: for a sweep add -m, for a list give {key}=[{values}]."
-    return " ".join(lines[:2])
+    return " ".join([line.strip() for line in text.splitlines() if line.strip()][:2])
 
 
 def known_keys() -> list[str]:
     """All keys and groups of the default config."""
     with _hydra():
-        settings = OmegaConf.to_container(hydra.compose("train"), resolve=False)
-    assert isinstance(settings, dict)
-    leaves = (key.split(".") for key, _ in flatten({str(key): value for key, value in settings.items()}))
+        settings: Any = OmegaConf.to_container(hydra.compose("train"), resolve=False)
+    leaves = (key.split(".") for key, _ in flatten(settings))
     return list(dict.fromkeys(".".join(leaf[: n + 1]) for leaf in leaves for n in range(len(leaf))))

@@ -158,8 +158,7 @@ def _run_hydra(arguments: Sequence[str], job: Task) -> None:
         job(config)
 
     decorated = hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(task)
-    resolver = functools.partial(job_folder, tuple(arguments))
-    OmegaConf.register_new_resolver("job_folder", resolver, replace=True)
+    OmegaConf.register_new_resolver("job_folder", functools.partial(job_folder, arguments), replace=True)
 
     def composed() -> None:
         sys.argv = [original[0], *arguments]
@@ -209,8 +208,7 @@ def _job(
 
 def _config_folders() -> list[str]:
     """Folders given by `--config-dir`, for child processes."""
-    sources = HydraConfig.get().runtime.config_sources
-    return [source.path for source in sources if source.provider == "command-line"]
+    return [source.path for source in HydraConfig.get().runtime.config_sources if source.provider == "command-line"]
 
 
 def _restart(command: Sequence[str]) -> list[str]:
@@ -297,8 +295,7 @@ def _check_links(links: Sequence[Any]) -> None:
         if link.parent is not None:
             before = configs[link.parent]
             steps = before["trainer"]["max_steps"]
-            path = Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt")
-            parent = Parent(before, path, steps)
+            parent = Parent(before, Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt"), steps)
         try:
             configs[link.name] = check(configs[link.name], link.overrides, parent)
         except InputError as error:
