@@ -32,11 +32,10 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
         InputError: unknown model, unusable file or unavailable device.
     """
     from r2flow.devices import choose_device
-    from r2flow.errors import InputError
+    from r2flow.errors import check
     from r2flow.model.checkpoint import load_checkpoint  # slow, imports torch
 
-    if not isinstance(name, str | os.PathLike):
-        raise InputError(f"a model has a name, a run folder or a file; found {name!r}.")
+    check(isinstance(name, str | os.PathLike), f"a model has a name, a run folder or a file; found {name!r}.")
     return load_checkpoint(name, choose_device(str(device), "device"))
 
 

@@ -16,7 +16,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.registry import Registry, UnknownName
 
 GROUP = "r2flow.plugins"
@@ -35,8 +35,7 @@ def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
             others.append(argument)
             continue
         name = value if equals else next(rest, "")
-        if not name:
-            raise InputError("--plugin needs the name of a module, or a path ending in .py.")
+        check(name, "--plugin needs the name of a module, or a path ending in .py.")
         names.append(name)
     return others, names
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import typer
 
 from r2flow.devices import choose_device as choose_device  # re-exported for verbs
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
@@ -172,6 +172,5 @@ def numbers(option: str, text: str) -> list[int]:
         values = [int(part) for part in text.split(",")]
     except ValueError:
         values = [0]
-    if min(values) <= 0:
-        raise InputError(f"--{option} must be positive numbers separated by commas, found {text!r}.")
+    check(min(values) > 0, f"--{option} must be positive numbers separated by commas, found {text!r}.")
     return values

@@ -332,8 +332,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     from safetensors.torch import save
 
     path = Path(path)
-    if path.suffix != ".safetensors":
-        raise InputError(f"{path}: a checkpoint is written as .safetensors.")
+    check(path.suffix == ".safetensors", f"{path}: a checkpoint is written as .safetensors.")
     weights = {name: value.detach().cpu().contiguous() for name, value in checkpoint.generator.state_dict().items()}
     if half:
         parameters = checkpoint.generator.named_parameters()

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.generators import Flow, Generator, Sampler, condition_of
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
@@ -56,8 +56,7 @@ def completing(generator: Generator, name: str | None = None, *, several: bool =
     completer = completers.get(name or next(iter(completers)))
     how = build_sampler({"name": name, **changes}) if completer is None else completer.changed(**changes)
     how.check(generator)
-    if not how.completes:
-        raise InputError(f"sampler {how.name} takes no condition: give mmps, replace or repaint.")
+    check(how.completes, f"sampler {how.name} takes no condition: give mmps, replace or repaint.")
     return how
 
 

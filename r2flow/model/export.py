@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow import __version__
-from r2flow.errors import InputError, require
+from r2flow.errors import InputError, check, require
 from r2flow.files import write_file
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
 from r2flow.lidar.projection import unproject
@@ -182,8 +182,7 @@ def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) 
 def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> tuple[bytes, bool]:
     require("an .onnx", "export", "onnx", "onnxscript")
     size = sum(value.numel() * value.element_size() for value in flow.state_dict().values())
-    if size > LARGEST:
-        raise InputError(f"an .onnx holds at most 2 GiB, and these weights are {size:,} bytes: use --to pt2.")
+    check(size <= LARGEST, f"an .onnx holds at most 2 GiB, and these weights are {size:,} bytes: use --to pt2.")
     from r2flow.model.onnx_graphs import sampler_graph, to_onnx
 
     program, any_batch = _traced(flow.backbone, _network_inputs(flow, (2,) if how is None else ()))

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.generators import Condition, Generator, Sampler
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.region import Region
@@ -79,8 +79,7 @@ def sample(
         raise InputError(f"needs at least one scan and a batch of at least one; found {num!r} and {batch_size!r}.")
     chosen = sampler.changed(**changes) if isinstance(sampler, Sampler) else generator.choose(sampler, **changes)
     for name, value in (condition or {}).items():
-        if len(value) != num:
-            raise InputError(f"the condition's {name} has {len(value)} scans, but num is {num}.")
+        check(len(value) == num, f"the condition's {name} has {len(value)} scans, but num is {num}.")
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
         batch_condition = condition and {name: value[first : numbers.stop] for name, value in condition.items()}

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from r2flow import noise
 from r2flow.data.partial import PartialScan
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.files import atomic_write, save_array
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
@@ -149,8 +149,7 @@ def hiding(scan: PartialScan, job: Job, number: int) -> tuple[Partial, Partial]:
     measured = whole.state != Ray.UNKNOWN
     kept = job.mask(measured, noise.generator(job.seed, "condition", number))
     for some, what in ((measured & kept, "nothing"), (measured & ~kept, "everything")):
-        if not some.any():
-            raise InputError(f"{scan.name}: the mask keeps {what} that was measured; give another.")
+        check(some.any(), f"{scan.name}: the mask keeps {what} that was measured; give another.")
     state = np.where(kept, whole.state, int(Ray.UNKNOWN)).astype(np.uint8)
     return whole, Partial(whole.image * kept, state, None if whole.xyz is None else whole.xyz * kept)
 

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 import r2flow
-from r2flow.errors import InputError, printable
+from r2flow.errors import check, printable
 from r2flow.files import write_file
 from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row
@@ -100,8 +100,7 @@ def write_json(page: Page, path: Path) -> None:
 def prepare_folder(out: Path) -> None:
     """Create the folder, to fail before measuring if it is not writable."""
     out.mkdir(parents=True, exist_ok=True)
-    if not os.access(out, os.W_OK):
-        raise InputError(f"{out} cannot be written to; give another --out.")
+    check(os.access(out, os.W_OK), f"{out} cannot be written to; give another --out.")
 
 
 def provenance(page: Page) -> dict[str, Any]:

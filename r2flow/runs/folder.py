@@ -110,9 +110,8 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     old = read_config(run)
     if old is None or not checkpoints_of(run):
         return
-    later = ("scans", "parent", "encoding.reflectance", "encoding.levels", "data.pairs.parent")
-    compared = [{k: v for k, v in flatten(side) if not f"{k}.".startswith(tuple(f"{group}." for group in later))}
-                for side in (old, config)]  # fmt: skip
+    later = ("scans.", "parent.", "encoding.reflectance.", "encoding.levels.", "data.pairs.parent.")
+    compared = [{k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config)]
     differing = contradictions(*compared)
     if differing:
         raise InputError(_another_config(run, differing))
