@@ -26,7 +26,7 @@ from r2flow.errors import check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.progress import track
-from r2flow.registry import check_options
+from r2flow.registry import construct
 from r2flow.signals import outlive_the_signal
 
 log = logging.getLogger(__name__)
@@ -56,9 +56,7 @@ class ScanDataModule(L.LightningDataModule):
         self.batch_size = self.options.batch_size
         self.parts = self.options.sets
         self.sensors = [sensor if part.sensor is None else build_sensor(**part.sensor) for part in self.parts]
-        augment = self.options.augment or {}
-        check_options("data.augment", Augmentation, augment)
-        self.augment = Augmentation(**augment)
+        self.augment = construct("data.augment", Augmentation, self.options.augment)
         self.validation = self.options.validation_options
         self.further: Further | None = None
         self.names: list[str] = []
@@ -68,11 +66,10 @@ class ScanDataModule(L.LightningDataModule):
         self.scans: ScanSource | None = None  # next to pairs
 
     def _pair_options(self) -> PairOptions:
-        options = self.options.pairs or {}
-        check_options("data.pairs", PairOptions, options)
+        options = construct("data.pairs", PairOptions, self.options.pairs)
         check(not self.augment, "data.augment changes scans, and an augmented pair is not a flow's pair; leave it out.")
         check(self.validation.data is None, "data.validation.data cannot be held out from pairs; leave it out.")
-        return PairOptions(**options)
+        return options
 
     @property
     def pair_store(self) -> PairStore:

@@ -10,7 +10,7 @@ from r2flow.errors import InputError
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
-from r2flow.registry import Bound, Count, Natural, NonNegative, Portion, Positive, Seed, check_options
+from r2flow.registry import Bound, Count, Natural, NonNegative, Portion, Positive, Seed, check_options, construct
 from r2flow.samplers import build_sampler
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # names in `r2flow.data.opening.SOURCES`
@@ -137,8 +137,7 @@ class DataOptions(SourceOptions):
     @property
     def validation_options(self) -> ValidationOptions:
         """`validation`, checked."""
-        check_options("data.validation", ValidationOptions, self.validation or {})
-        return ValidationOptions(**(self.validation or {}))
+        return construct("data.validation", ValidationOptions, self.validation)
 
     # The following properties need the `data` of `r2flow.data.resolving.resolve`.
 

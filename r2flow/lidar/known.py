@@ -18,7 +18,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.region import region
 from r2flow.lidar.scan_files import read_numbers
-from r2flow.registry import Count, Natural, Registry, Share, check_options
+from r2flow.registry import Count, Natural, Registry, Share, construct
 
 
 class Ray(IntEnum):
@@ -115,8 +115,7 @@ def _one_mask(text: str) -> Mask:
         options = inspect.signature(mask).bind(*values).arguments
     except (ValueError, TypeError):
         raise InputError(f"the mask {text!r} lacks its numbers: give {FORMS}.") from None
-    check_options(f"the mask {text!r}", mask, options)
-    return mask(**options)
+    return construct(f"the mask {text!r}", mask, options)
 
 
 def _from_file(path: Path) -> Mask:

@@ -12,7 +12,7 @@ from r2flow.errors import InputError, check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Convention, Sensor, build_sensor
-from r2flow.registry import check_options
+from r2flow.registry import check_options, construct
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,7 @@ def build_space(config: Mapping[str, Any]) -> ModelSpace:
     check({"sensor", "encoding"} <= config.keys(), "the config of a model needs 'sensor' and 'encoding'.")
     options = dict(config["sensor"])
     convention: Convention = options.pop("rays", "centre")
-    check_options("sensor", build_sensor, options)
-    sensor = build_sensor(**options)
+    sensor = construct("sensor", build_sensor, options)
     check_options("sensor.rays", sensor.rays, {"convention": convention})
     check_options("encoding", Encoding, config["encoding"], given=1)
     return ModelSpace(sensor, Encoding(sensor, **config["encoding"]), sensor.rays(convention))

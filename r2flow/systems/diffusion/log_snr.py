@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
+from r2flow.flow.path import expand_time
 from r2flow.registry import Positive, Registry
 
 LogSNR = Callable[[Tensor], Tensor]
@@ -98,8 +99,7 @@ def alpha_sigma(log_snr: Tensor) -> tuple[Tensor, Tensor]:
 
 def for_images(log_snr: Tensor, z: Tensor) -> Tensor:
     """Reshape and cast lambda, () or (B,), to broadcast with z, (B, ...)."""
-    log_snr = log_snr.to(z)
-    return log_snr.reshape(-1, *(1,) * (z.ndim - 1)) if log_snr.ndim else log_snr
+    return expand_time(log_snr.to(z), z)
 
 
 def straight_time(log_snr: Tensor) -> Tensor:

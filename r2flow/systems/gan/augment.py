@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r2flow.backbones.layers import at_least_float32
 from r2flow.noise import generator
 from r2flow.processes import summed
 from r2flow.registry import Natural, NonNegative, Portion, Registry
@@ -133,8 +134,7 @@ class AdaptiveAugment(nn.Module):
     def forward(self, x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
         """Transform x (B, C, H, W) in at least float32; twice differentiable."""
         with torch.autocast(x.device.type, enabled=False):
-            x = x.to(torch.promote_types(x.dtype, torch.float32))
-            return coloured(transformed(x, *affine(draws, x.shape[-2], x.shape[-1])), draws)
+            return coloured(transformed(at_least_float32(x), *affine(draws, x.shape[-2], x.shape[-1])), draws)
 
 
 def affine(draws: Mapping[str, Draw], height: int, width: int) -> tuple[Tensor, Tensor]:

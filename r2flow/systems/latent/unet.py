@@ -29,7 +29,7 @@ def cosines_and_sines(t: Tensor, channels: int) -> Tensor:
     """Concatenated cos(f_i t) and sin(f_i t), with f_i = 10^(-4 i / (C / 2)) and step numbers t, (B,)."""
     half = channels // 2
     frequencies = torch.exp(-math.log(1e4) / half * torch.arange(half, device=t.device, dtype=torch.float32))
-    phase = at_least_float32(t.to(torch.promote_types(t.dtype, torch.float32)))[:, None] * frequencies
+    phase = at_least_float32(t)[:, None] * frequencies
     return torch.cat([phase.cos(), phase.sin()], dim=1)
 
 
