@@ -202,13 +202,13 @@ class PreparedScans(ScanSource):
     """A source of prepared scans.
 
     Args:
-        numbers: Numbers of scans in the data set; scans left out in preparation are skipped. None takes all.
+        numbers: Numbers of scans in the data set; scans left out in preparation are skipped.
     """
 
-    def __init__(self, folder: Path, numbers: Sequence[int] | None = None, reflectance: bool = True) -> None:
+    def __init__(self, folder: Path, numbers: Sequence[int], reflectance: bool) -> None:
         self.folder, self.reflectance = folder, reflectance
         self.recipe, self._drives = read_prepared(folder)
-        self.store, entries = Store(folder, KIND, self.recipe), []
+        self.store, entries = Store(folder, KIND, self.recipe), dict[int, tuple[int, int, int]]()
         if reflectance and self.recipe["levels"] is None:
             raise InputError(f"{folder} holds scans without reflectance. Set encoding.reflectance=false.")
         for shard, numbers_of_shard in enumerate(shards_of(self.recipe)):
@@ -219,12 +219,9 @@ class PreparedScans(ScanSource):
             except Damaged as error:
                 raise self._damaged(shard, error) from None
             rows = [number for number in numbers_of_shard if number not in left_out]
-            entries += [(number, shard, row) for row, number in enumerate(rows)]
+            entries |= {number: (number, shard, row) for row, number in enumerate(rows)}
         #: Rows of (number in the data set, shard, row of the shard).
-        self.rows = np.array(entries, dtype=np.int64).reshape(-1, 3)
-        if numbers is not None:
-            place = {int(number): row for row, number in enumerate(self.rows[:, 0])}
-            self.rows = self.rows[[place[number] for number in numbers if number in place]]
+        self.rows = np.array([entries[n] for n in numbers if n in entries], dtype=np.int64).reshape(-1, 3)
         self._values = [codes.values for codes in codes_of(self.recipe)[: 1 + reflectance]]
         self._shards: dict[int, list[Any]] = {}
 

@@ -262,12 +262,10 @@ class SimulatedScans(MadeScans):
 class InMemory(ScanSource):
     """Named images in memory, (N, 2 or 1, H, W)."""
 
-    def __init__(self, images: np.ndarray, names: Sequence[str]) -> None:
-        self.images, self._names = images, names
+    names: Sequence[str] = ()
 
-    @property
-    def names(self) -> Sequence[str]:
-        return self._names
+    def __init__(self, images: np.ndarray, names: Sequence[str]) -> None:
+        self.images, self.names = images, names
 
     def subset(self, indices: Sequence[int]) -> "InMemory":
         return InMemory(self.images[list(indices)], [self.names[i] for i in indices])

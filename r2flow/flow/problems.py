@@ -158,12 +158,12 @@ class Rotating(Problem):
         self.speed = 2 * math.pi * turns
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        first, second = _halves(x)
+        first, second = x.flatten(1).chunk(2, 1)
         return self.speed * torch.cat([-second, first], 1).view(x.shape)
 
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
         x_0, t = _exact(x_0, t)
-        first, second = _halves(x_0)
+        first, second = x_0.flatten(1).chunk(2, 1)
         angle = self.speed * t.view(-1, 1)
         c, s = angle.cos(), angle.sin()
         return torch.cat([c * first - s * second, s * first + c * second], 1).view(x_0.shape)
@@ -237,11 +237,6 @@ def _exact(x_0: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor]:
     """x_0 and t in float64, t broadcastable with x_0."""
     x_0 = x_0.double()
     return x_0, expand_time(torch.as_tensor(t, dtype=torch.float64, device=x_0.device), x_0)
-
-
-def _halves(x: Tensor) -> tuple[Tensor, Tensor]:
-    first, second = x.flatten(1).chunk(2, 1)
-    return first, second
 
 
 PROBLEMS: Registry = Registry(

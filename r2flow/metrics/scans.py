@@ -52,11 +52,7 @@ class Scans:
         r = images[:, :1]
         self.images = torch.where((r > MASK[0]) & (r < MASK[1]), images, torch.zeros_like(images))
         self.sensor = sensor
-
-    @cached_property
-    def features(self) -> dict[Any, Tensor]:
-        """Cached features of networks, by network."""
-        return {}
+        self.features: dict[Any, Tensor] = {}  # of networks, by network
 
     def __len__(self) -> int:
         return len(self.images)

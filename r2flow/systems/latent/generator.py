@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -76,9 +76,7 @@ class LatentDiffusion(Generator):
     @property
     def unet(self) -> LatentUNet:
         """The network eps(z, t)."""
-        network = self.model["diffusion_model"]
-        assert isinstance(network, LatentUNet)
-        return network
+        return cast(LatentUNet, self.model["diffusion_model"])
 
     def expected(self, z: Tensor, t: Tensor) -> Tensor:
         """Expected latents given z (B, ...) at step t, ()."""

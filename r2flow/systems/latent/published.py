@@ -6,6 +6,7 @@ Image size and width of attention heads are read from the published `config.yaml
 
 import logging
 from collections.abc import Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +77,7 @@ def _step(content: Mapping[str, Any]) -> int:
 
 def _counted(names: Mapping[str, Tensor], form: str) -> int:
     """Count the consecutive names form.format(0), form.format(1), ..."""
-    count = 0
-    while form.format(count) in names:
-        count += 1
-    return count
+    return next(number for number in count() if form.format(number) not in names)
 
 
 def _autoencoder(state: Mapping[str, Tensor]) -> dict[str, Any]:
