@@ -113,8 +113,7 @@ class Sampler(ABC):
 
     def changed(self, **options: Any) -> Self:
         """A copy with the options that are not None."""
-        options = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in options.items()}
-        options = {key: value for key, value in options.items() if value is not None}
+        options = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
         check_options(f"sampler '{self.name}'", type(self), {**self._fields(), **options})
         grid = getattr(self, "grid", None)
         if isinstance(grid, tuple) and options.get("steps", len(grid) - 1) != len(grid) - 1:

@@ -60,8 +60,7 @@ def draw_scene(rng: np.random.Generator) -> Scene:
 def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> SimulatedScan:
     """Scan a scene with a sensor at its default height above the scene's origin."""
     rays = Rays(lasers_of(sensor), sensor.columns, sensor.height)
-    image, labels = report(sensor, rays, cast(scene, rays, rng), scene.rig, rng)
-    return SimulatedScan(image, labels)
+    return SimulatedScan(*report(sensor, rays, cast(scene, rays, rng), scene.rig, rng))
 
 
 __all__ = ["REVISION", "Scene", "SimulatedScan", "draw_scene", "observe", "simulate"]

@@ -102,9 +102,7 @@ def _streets(draws: ScalarDraws, kind: Kind, straight: bool) -> tuple[Street, ..
         pavement=draws.uniform(*kind.pavement),
         lines=lines,
     )
-    if not draws.chance(kind.crossing):
-        return (main,)
-    return _crossed(draws, main)
+    return _crossed(draws, main) if draws.chance(kind.crossing) else (main,)
 
 
 def _crossed(draws: ScalarDraws, main: Street) -> tuple[Street, ...]:

@@ -58,8 +58,7 @@ def car(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -
     for i in (-1, 1):
         for j in (-1, 1):
             place = _beside(x, y, yaw, i * length * 0.30, j * (width / 2 - 0.10))
-            wheel = Boxes(*place, yaw, 0.60, 0.22, ground, ground + 0.62)
-            b.add(wheel, label, "rubber")
+            b.add(Boxes(*place, yaw, 0.60, 0.22, ground, ground + 0.62), label, "rubber")
 
 
 def truck(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -> None:
@@ -185,8 +184,7 @@ def fence(b: SceneBuilder, x: float, y: float, yaw: float, length: float) -> Non
     ground, style = b.level(x, y), b.draws.unit()
     height = b.draws.uniform(0.9, 1.9)
     if style < 0.35:
-        wall = Boxes(x, y, yaw, length, 0.25, ground - 0.5, ground + min(height, 1.4))
-        b.add(wall, "fence", "concrete")
+        b.add(Boxes(x, y, yaw, length, 0.25, ground - 0.5, ground + min(height, 1.4)), "fence", "concrete")
         return
     closed = 1.0 if style < 0.6 else b.draws.uniform(0.25, 0.7)
     b.add(Boxes(x, y, yaw, length, 0.04, ground, ground + height), "fence", "wood", closed=closed)

@@ -260,5 +260,4 @@ def guard(b: SceneBuilder, main: Street) -> None:
         for u in range(-80, 80, 8):
             x, y, heading = main.place(u + 4, side * (main.half_width + 0.8))
             ground = b.level(x, y)
-            rail = Boxes(x, y, heading, 8.1, 0.12, ground + 0.45, ground + 0.78)
-            b.add(rail, "fence", "metal", albedo=0.4)
+            b.add(Boxes(x, y, heading, 8.1, 0.12, ground + 0.45, ground + 0.78), "fence", "metal", albedo=0.4)

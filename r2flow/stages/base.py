@@ -92,8 +92,7 @@ class Stage(L.LightningModule):
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout uses torch's global generator: seeding it by position makes a resumed run draw the same numbers.
-        position = batch_idx * self.trainer.world_size + self.global_rank
-        seed_torch(self.seed, "dropout", position)
+        seed_torch(self.seed, "dropout", batch_idx * self.trainer.world_size + self.global_rank)
 
     def configure_optimizers(self) -> Any:
         return self.optimizers_for(self.generator.parameters())
@@ -170,8 +169,7 @@ class SingleLoss(Stage):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         # A low-discrepancy sequence over [0, 1) instead of random times reduces the variance over few scans.
-        u = golden_sequence(batch["k"])
-        loss = self.regression_loss(batch, u)
+        loss = self.regression_loss(batch, golden_sequence(batch["k"]))
         self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)
 
 

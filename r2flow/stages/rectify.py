@@ -44,8 +44,6 @@ class Rectify(SingleLoss):
         return None
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        x_0, x_1 = batch["x_0"], batch["x_1"]
         t = self.time(u)
-        x_t, u_t = interpolate(x_0, x_1, t)
-        v: Tensor = self.generator.velocity(t, x_t, self.condition(batch))
-        return self.loss(v, u_t).mean()
+        x_t, u_t = interpolate(batch["x_0"], batch["x_1"], t)
+        return self.loss(self.generator.velocity(t, x_t, self.condition(batch)), u_t).mean()

@@ -33,5 +33,4 @@ class MatchScore(SingleLoss):
         """Mean loss over images at the noise levels selected by u in [0, 1), (B,)."""
         network = self.generator.network
         labels = (u * len(network.sigmas)).to(torch.int64)
-        x = (batch["x_1"] + 1) / 2
-        return score_loss(network, x, batch["x_0"], labels, network.sigmas, self.power).mean()
+        return score_loss(network, (batch["x_1"] + 1) / 2, batch["x_0"], labels, network.sigmas, self.power).mean()
