@@ -69,8 +69,7 @@ class Prepared(SourceKind):
         return f"the scans in {options.folder} have no reflectance" if self.levels_of(options) is None else None
 
     def levels_of(self, options: SourceOptions) -> int | None:
-        levels: int | None = read_prepared(Path(options.folder).expanduser())[0]["levels"]
-        return levels
+        return read_prepared(Path(options.folder).expanduser())[0]["levels"]
 
 
 SOURCES: Registry[SourceKind] = Registry(

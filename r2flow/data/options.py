@@ -56,8 +56,7 @@ class SourceOptions:
 
     @property
     def on_bad_scan(self) -> str:
-        action: str = self.chosen.get("on_bad_scan", "error")
-        return action
+        return self.chosen.get("on_bad_scan", "error")
 
     @property
     def folder(self) -> str:

@@ -201,12 +201,11 @@ class PairSource:
         (path,) = self.store.files(shard)
         try:
             with safe_open(path, framework="pt") as file:
-                values: Tensor = file.get_slice(name)[offset].float()
+                return file.get_slice(name)[offset].float()
         except (SafetensorError, OSError) as error:
             raise InputError(
                 f"{path} was lost or damaged while it was in use ({error}). The same command makes it again."
             ) from None
-        return values
 
 
 class PairDataset(Dataset[Item]):

@@ -52,8 +52,7 @@ class Reading:
     def described(self) -> dict[str, Any]:
         """All fields as plain values, for manifests."""
         values = {f.name: getattr(self, f.name) for f in fields(self)} | {"sensor": self.sensor.described()}
-        plain: dict[str, Any] = json.loads(json.dumps(values))  # turns tuples into lists
-        return plain
+        return json.loads(json.dumps(values))  # turns tuples into lists
 
     @classmethod
     def of(cls, described: Mapping[str, Any]) -> "Reading":

@@ -39,7 +39,4 @@ def build_generator(config: Mapping[str, Any]) -> Generator:
     with torch.device("cpu"):  # geometry needs real values, even if the weights are on the meta device
         space = build_space(config)
     check("backbone" in config, "the config has no 'backbone'.")
-    generator: Generator = GENERATORS.build(
-        config.get("generator") or {"name": "rectified_flow"}, space, config["backbone"]
-    )
-    return generator
+    return GENERATORS.build(config.get("generator") or {"name": "rectified_flow"}, space, config["backbone"])

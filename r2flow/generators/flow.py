@@ -142,8 +142,7 @@ class RectifiedFlow(NetworkFlow):
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         assert condition is None
-        v: Tensor = self.backbone(t, x)
-        return v
+        return self.backbone(t, x)
 
 
 class Conditioned:

@@ -28,8 +28,7 @@ class FlowMap(RectifiedFlow):
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
         """u(x, t, s), (B, C, H, W), the mean velocity from time t to time s, of shape () or (B,)."""
         assert condition is None
-        u: Tensor = self.backbone(t, x, s)
-        return u
+        return self.backbone(t, x, s)
 
     def map(self, condition: Condition | None = None) -> MeanVelocity:
         """u(t, x, s) under a condition."""

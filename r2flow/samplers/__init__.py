@@ -89,5 +89,4 @@ def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
     """Build a sampler from name and fields, or from a text (`parse_sampler`). `steps` follows from a grid of times."""
     options = parse_sampler(options) if isinstance(options, str) else options
     check(isinstance(options, Mapping), f"a sampler needs a 'name' and its fields, found {options!r}.")
-    sampler: Sampler = SAMPLERS.build(_with_steps({k: v for k, v in {**options, **fields}.items() if v is not None}))
-    return sampler
+    return SAMPLERS.build(_with_steps({k: v for k, v in {**options, **fields}.items() if v is not None}))

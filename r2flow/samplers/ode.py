@@ -56,8 +56,7 @@ class FixedSteps(OnGrid, ODESampler):
 
     def evaluations(self, generator: Any) -> int:
         final = int(bool(self.finish) and self.steps > 1)
-        multistep: int = SOLVERS[self.method].cost(self.steps - final)  # type: ignore[union-attr]
-        return multistep + final
+        return SOLVERS[self.method].cost(self.steps - final) + final  # type: ignore[union-attr]
 
     def options(self) -> dict[str, Any]:
         return {"method": self.method, "steps": self.steps, "grid": self.times_or_name}

@@ -33,8 +33,7 @@ def powered(value: Tensor) -> Tensor:
 
 def unpowered(norm: np.ndarray) -> np.ndarray:
     """The norm of order `NORM` from that of the powered values."""
-    result: np.ndarray = (norm ** (2 / NORM)).astype(np.float32).astype(np.float64)
-    return result
+    return (norm ** (2 / NORM)).astype(np.float32).astype(np.float64)
 
 
 def weighted(weights: Sequence[float | Tensor], k: Sequence[Tensor]) -> Tensor:

@@ -228,8 +228,7 @@ class _Krylov:
         augmented[0, m] = 1
         for i in range(m, m + order - 1):
             augmented[i, i + 1] = 1
-        result: np.ndarray = torch.linalg.matrix_exp(augmented)[:m, -1].numpy()
-        return result
+        return torch.linalg.matrix_exp(augmented)[:m, -1].numpy()
 
     def combination(self, order: int, h: float) -> np.ndarray:
         """phi_order(h J) b in the basis."""

@@ -97,8 +97,7 @@ class StepController:
         """
         pole = ~(dy <= size)
         self.factor[pole] = SHRINK
-        good: np.ndarray = (error <= 1) & np.isfinite(dk) & ~pole
-        return good
+        return (error <= 1) & np.isfinite(dk) & ~pole
 
     def rougher(self, least: float, by: float) -> np.ndarray:
         """Whether the third difference exceeds `least`, and `by` times its extrapolation from the last step, (B,)."""

@@ -60,8 +60,7 @@ class Diffusion(NetworkFlow):
 
     def predict(self, z: Tensor, log_snr: Tensor) -> Tensor:
         """y, (B, C, H, W), of states z and log-SNRs of shape () or (B,)."""
-        y: Tensor = self.backbone(log_snr.float(), z)
-        return y
+        return self.backbone(log_snr.float(), z)
 
     def denoise(self, z: Tensor, log_snr: Tensor) -> Tensor:
         """Expected data given z, clamped."""

@@ -41,8 +41,7 @@ class Gan(Generator):
         self, z: Tensor, uniform: Tensor | None = None, shift: Tensor | None = None, truncation: float = 1.0
     ) -> dict[str, Tensor]:
         """Outputs of the network, see `LatentGenerator`."""
-        made: dict[str, Tensor] = self.network(z, self.angle, truncation=truncation, uniform=uniform, shift=shift)
-        return made
+        return self.network(z, self.angle, truncation=truncation, uniform=uniform, shift=shift)
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
         return draws.step((1, *self.space.shape[1:]), j)

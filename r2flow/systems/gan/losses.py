@@ -92,5 +92,4 @@ def blurred(x: Tensor, sigma: float) -> Tensor:
     if reach == 0:
         return x
     taps = torch.exp2(-((torch.arange(-reach, reach + 1) / sigma) ** 2))
-    blur: Tensor = Filter(taps.tolist()).to(x.device)(x)
-    return blur
+    return Filter(taps.tolist()).to(x.device)(x)

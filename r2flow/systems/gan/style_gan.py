@@ -316,5 +316,4 @@ class Discriminator(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        scores: Tensor = self.epilogue(self.layers(x))
-        return scores
+        return self.epilogue(self.layers(x))
