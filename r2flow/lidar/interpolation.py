@@ -30,7 +30,9 @@ def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse"
         columns = image.shape[2]
         ring = np.concatenate([filled] * 3, axis=2), np.concatenate([done] * 3, axis=1)
         wide = _along(*ring, rule, extend=True)[0][..., columns : 2 * columns]
-        filled = _rows_beyond(np.where(done, filled, wide), done)
+        filled, empty = np.where(done, filled, wide), ~done.any(1)
+        rows = np.flatnonzero(~empty)  # a row without known rays takes the nearest filled row
+        filled[:, empty] = filled[:, rows[np.abs(np.flatnonzero(empty)[:, None] - rows).argmin(1)]]
     return filled.astype(np.float32)
 
 
@@ -39,15 +41,6 @@ INTERPOLATIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "linear": partial(interpolated, rule="linear"),
     "linear, 1/r": interpolated,
 }
-
-
-def _rows_beyond(image: np.ndarray, done: np.ndarray) -> np.ndarray:
-    """Replace each row without known rays by the nearest filled row."""
-    empty = ~done.any(1)
-    if empty.any() and done.any():
-        rows = np.flatnonzero(~empty)
-        image[:, empty] = image[:, rows[np.abs(np.flatnonzero(empty)[:, None] - rows).argmin(1)]]
-    return image
 
 
 def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = False) -> tuple[np.ndarray, np.ndarray]:

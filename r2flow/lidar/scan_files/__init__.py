@@ -155,9 +155,9 @@ def write_points(
         raise InputError(f"{path}: scans are written as {', '.join(WRITTEN)}, and as .bin only with a reflectance.")
     assert ring is None or ending == ".ply"
     columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "intensity": reflectance, "ring": ring}
-    columns = {name: column for name, column in columns.items() if column is not None}
+    given = {name: column for name, column in columns.items() if column is not None}
     with np.errstate(over="ignore"):  # float32 overflow is infinite
-        table = np.column_stack([column for column in columns.values() if column is not None]).astype("<f4")
+        table = np.column_stack([*given.values()]).astype("<f4")
     assert np.isfinite(table).all(), "a coordinate or reflectance is NaN or infinite"
     with atomic_write(path) as file:
         if ending == ".npy":
@@ -165,7 +165,7 @@ def write_points(
         elif ending == ".bin":
             file.write(table.tobytes())
         else:
-            {".pcd": write_pcd, ".ply": write_ply}[ending](file, table, tuple(columns))
+            {".pcd": write_pcd, ".ply": write_ply}[ending](file, table, tuple(given))
 
 
 def scan_ending(name: str) -> str:

@@ -88,16 +88,6 @@ def _middle(channels: int) -> nn.Module:
     return nn.Sequential(OrderedDict(block_1=blocks[0], attn_1=Attention(channels), block_2=blocks[1]))
 
 
-def _downsample(channels: int, stride: Size) -> nn.Module:
-    return nn.Sequential(OrderedDict(conv=CircularConv2d(channels, channels, *DOWN[stride], stride=stride)))
-
-
-def _upsample(channels: int, stride: Size) -> nn.Module:
-    """Bilinear interpolation with aligned corners, then a convolution."""
-    enlarge = nn.Upsample(scale_factor=stride, mode="bilinear", align_corners=True)
-    return nn.Sequential(OrderedDict(enlarge=enlarge, conv=CircularConv2d(channels, channels, *UP[stride])))
-
-
 class Level(nn.Module):
     """Residual blocks of one resolution, optionally with attention after each and a resampling to the next level."""
 
@@ -112,10 +102,12 @@ class Level(nn.Module):
         super().__init__()
         self.block = nn.ModuleList(ResidualBlock(*pair, shape) for pair in pairwise(widths))
         self.attn = nn.ModuleList(Attention(width) for width in widths[1:] if attends)
+        last = widths[-1]
         if down is not None:
-            self.downsample = _downsample(widths[-1], down)
+            self.downsample = nn.Sequential(OrderedDict(conv=CircularConv2d(last, last, *DOWN[down], stride=down)))
         if up is not None:
-            self.upsample = _upsample(widths[-1], up)
+            enlarge = nn.Upsample(scale_factor=up, mode="bilinear", align_corners=True)
+            self.upsample = nn.Sequential(OrderedDict(enlarge=enlarge, conv=CircularConv2d(last, last, *UP[up])))
 
     def forward(self, x: Tensor) -> Tensor:
         for index, block in enumerate(self.block):
