@@ -312,8 +312,7 @@ class Attention(nn.Module):
         """q, k and v, each (B, H, W, N, D), q and k scaled and rotated."""
         qkv = self.qkv_proj(self.norm(x, condition)).unflatten(-1, (3, self.heads, -1))
         qk, v = qkv[..., :2, :, :], qkv[..., 2, :, :]
-        q, k = rotate(self._normalised(qk), table).to(v.dtype).unbind(-3)
-        return q, k, v
+        return *rotate(self._normalised(qk), table).to(v.dtype).unbind(-3), v
 
     def _normalised(self, qk: Tensor) -> Tensor:
         """q and k, (..., N, D), normalised to length sqrt(s); in float32, since s amplifies their rounding."""

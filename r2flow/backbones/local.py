@@ -66,5 +66,4 @@ class _Block(nn.Module):
         zero_initialised(self.second)
 
     def forward(self, x: Tensor) -> Tensor:
-        h: Tensor = self.second(F.silu(self.first(F.silu(x))))
-        return x + h
+        return x + self.second(F.silu(self.first(F.silu(x))))

@@ -101,8 +101,7 @@ class RowFeatures(nn.Embedding):
 
     def known(self, elevations: Tensor) -> Tensor:
         """Whether all rows of elevations (B, H) have a learned vector, (B,) bool."""
-        difference = (elevations[..., None] - self.elevations.to(elevations)).abs()
-        return (difference.amin(-1) < SAME).all(1)
+        return ((elevations[..., None] - self.elevations.to(elevations)).abs().amin(-1) < SAME).all(1)
 
     def forward(  # type: ignore[override]
         self, elevations: Tensor, steps: Tensor, known: Tensor | None = None

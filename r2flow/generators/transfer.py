@@ -109,8 +109,7 @@ class TransferFlow(Flow):
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any], sigma: NonNegative = 0.25) -> None:
         super().__init__(space)
         self.sigma = sigma
-        channels = space.shape[0]
-        inputs = channels + FEATURES + RowFeatures.FEATURES
+        inputs = space.shape[0] + FEATURES + RowFeatures.FEATURES
         self.backbone = build_backbone(backbone, space.rays, inputs, 3 * CANDIDATES + 2)
         if not self.backbone.any_size:
             raise InputError(

@@ -163,8 +163,7 @@ def weighted_root(rows: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     mean = torch.stack([weights[at] @ x for at, x in blocks(rows, BLOCK)]).sum(0) / n
     parts = ((x - mean) * weights[at, None].sqrt() for at, x in blocks(rows, BLOCK))
     if int((weights > 0).sum()) < len(mean):
-        centred = torch.cat(list(parts))[weights > 0]
-        return mean, centred.T / (n - 1).sqrt()
+        return mean, torch.cat(list(parts))[weights > 0].T / (n - 1).sqrt()
     scatter = mean.new_zeros(len(mean), len(mean))
     for x in parts:
         scatter.addmm_(x.T, x)

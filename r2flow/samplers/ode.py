@@ -30,8 +30,7 @@ class ODESampler(Sampler):
         **options: Any,
     ) -> Solution:
         """Solve from x at t_0, (B, ...), to t_1; for the options see `r2flow.flow.solvers.solve`."""
-        how = {**self.options(), **options}
-        return solve(generator.field(condition), x, t_0, t_1, progress=progress, **how)
+        return solve(generator.field(condition), x, t_0, t_1, progress=progress, **(self.options() | options))
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         end = self.solve(generator, noise, condition=condition, progress=progress)

@@ -146,8 +146,7 @@ def thicket(b: SceneBuilder, x: float, y: float) -> None:
     """Tall trees whose leaves reach the ground."""
     draws = b.draws
     height = draws.uniform(2.0, 4.0)
-    near = math.hypot(x, y) < 40
-    count, clump = (draws.whole(14, 22), 0.9) if near else (draws.whole(6, 9), 1.4)
+    count, clump = (draws.whole(14, 22), 0.9) if math.hypot(x, y) < 40 else (draws.whole(6, 9), 1.4)
     z = b.level(x, y) + height * 0.9
     _clumps(b, x, y, z, draws.uniform(2.0, 3.6), height, clump, count, draws.uniform(0.5, 1.6))
 

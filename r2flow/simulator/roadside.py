@@ -99,9 +99,8 @@ def green(b: SceneBuilder, street: Street, side: int, u: float, length: float, e
 
 def _gap(b: SceneBuilder, street: Street, side: int, u: float, gap: float, lateral: float) -> None:
     """A gap between two houses: a gate or wall, with trees behind."""
-    draws = b.draws
     x, y, heading = street.place(u + gap / 2, side * (lateral + 0.5))
-    if draws.chance(0.4) and free(b, x, y, gap / 2):
+    if b.draws.chance(0.4) and free(b, x, y, gap / 2):
         objects.fence(b, x, y, heading, gap * 0.9)
     green(b, street, side, u, gap, lateral + 2)
 
@@ -178,9 +177,7 @@ def park(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:
     while u < stop:
         u += step + draws.uniform(0, 0.15 * step)
         x, y, heading = street.place(u, lateral + draws.normal(0, 0.12))
-        if not _clear(b, street, x, y, 5.0) or math.hypot(x, y) < CLEAR or _driven(b, x, y):
-            continue
-        if not draws.chance(taken):
+        if not _clear(b, street, x, y, 5.0) or math.hypot(x, y) < CLEAR or _driven(b, x, y) or not draws.chance(taken):
             continue
         along = heading + (0 if side < 0 else math.pi)
         if draws.chance(0.04) and not nose_in:
@@ -201,8 +198,7 @@ def furnish(b: SceneBuilder, street: Street, side: int) -> None:
             if draws.chance(0.7):
                 objects.pole(b, x, y)
             if draws.chance(0.5):
-                shift = draws.uniform(-1, 1)
-                sx, sy, _ = street.place(u + shift, side * (edge + 0.2))
+                sx, sy, _ = street.place(u + draws.uniform(-1, 1), side * (edge + 0.2))
                 objects.sign(b, sx, sy, heading + (math.pi if side < 0 else 0) + draws.normal(0, 0.15))
             if alley:
                 tx, ty, _ = street.place(u + spacing / 2, side * (edge + 0.3))

@@ -144,8 +144,7 @@ class Cylinders(NamedTuple):
         on_top = z - self.top[k] > away - self.radius[k]
         below = self.bottom[k] - z > away - self.radius[k]
         side = np.where(on_top | below, 0, 1 / np.maximum(away, 1e-6))
-        nz = on_top.astype(np.float32) - below
-        return _round(u * side, v * side, nz)
+        return _round(u * side, v * side, on_top.astype(np.float32) - below)
 
 
 class Blobs(NamedTuple):

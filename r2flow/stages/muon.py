@@ -29,11 +29,9 @@ class Muon(torch.optim.AdamW):
 
     def __init__(self, parameters: Iterable[Tensor], rate: float, momentum: float = 0.95, **options: Any) -> None:
         weights = list(parameters)
-        matrices = [p for p in weights if is_hidden_matrix(p)]
-        others = [p for p in weights if not is_hidden_matrix(p)]
         groups: list[dict[str, Any]] = [
-            {"params": others, "momentum": None},
-            {"params": matrices, "lr": rate, "momentum": momentum},
+            {"params": [p for p in weights if not is_hidden_matrix(p)], "momentum": None},
+            {"params": [p for p in weights if is_hidden_matrix(p)], "lr": rate, "momentum": momentum},
         ]
         super().__init__([group for group in groups if group["params"]], **options)
 

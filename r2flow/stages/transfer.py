@@ -79,8 +79,7 @@ class Tasks:
 
 def coarser(space: ModelSpace, x: Tensor) -> Tensor:
     """Downsample a scan in model space, (C, H, W), by 2 rows and 4 columns, keeping the nearest return of a block."""
-    image = space.decode(x[None])[0]
-    blocks = image.unflatten(1, (-1, 2)).unflatten(3, (-1, 4)).movedim(2, 3).flatten(3)
+    blocks = space.decode(x[None])[0].unflatten(1, (-1, 2)).unflatten(3, (-1, 4)).movedim(2, 3).flatten(3)
     r = torch.where(blocks[:1] > 0, blocks[:1], torch.inf)
     return space.encoding.encode(blocks.gather(3, r.argmin(3, keepdim=True).expand(len(blocks), -1, -1, 1))[..., 0])
 

@@ -140,9 +140,8 @@ def _with_global_error(
 
 def _at_rest(x: Tensor, global_error: bool, knots: int) -> Solution:
     """The solution of an empty interval or an empty batch."""
-    solution = Solution.build(x, np.zeros(len(x)), 0, 0, False, finite(x).cpu().numpy())
     return replace(
-        solution,
+        Solution.build(x, np.zeros(len(x)), 0, 0, False, finite(x).cpu().numpy()),
         knots=torch.stack([x] * knots, 1) if knots else None,
         global_error=torch.zeros(len(x), dtype=torch.float64) if global_error else None,
     )

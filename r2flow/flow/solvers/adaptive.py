@@ -70,8 +70,7 @@ def _step(
     v: Evaluations, control: StepController, method: EmbeddedMethod, x: Tensor, k_1: Tensor, tolerance: float
 ) -> tuple[Tensor, Tensor]:
     """Try one step of every scene. Returns new states and velocities, unchanged for rejected steps."""
-    times = control.propose()
-    *stages, h = torch.from_numpy(times).to(x.device, x.dtype)
+    *stages, h = torch.from_numpy(control.propose()).to(x.device, x.dtype)
     k, y = [k_1], x
     for t, row in zip(stages, method.rows, strict=True):
         previous_y, y = y, torch.addcmul(x, weighted(row, k), expand_time(h, x))

@@ -92,8 +92,7 @@ class _Scene:
             self.tolerance = attainable(self.limits, self.v.precision)
             self.roundoff = torch.finfo(self.v.precision).eps
             # Differences of a noisy velocity (dropout, sampling inside the network) do not approximate J.
-            again = self.velocity(self.t, self.u)
-            if _rms(again - f) > math.sqrt(self.roundoff) * _rms(f):
+            if _rms(self.velocity(self.t, self.u) - f) > math.sqrt(self.roundoff) * _rms(f):
                 return False
             h = self._first_step(f)
             while self.t != self.t_end and f.isfinite().all():

@@ -84,8 +84,7 @@ class LearnGan(Stage):
 
         draws = BatchDraws(self.seed, batch, FAKE)
         with torch.no_grad():
-            made = self.make(draws.normal(self.generator.noise_shape), draws)
-            fake = self.shown(made, images, draws)
+            fake = self.shown(self.make(draws.normal(self.generator.noise_shape), draws), images, draws)
             seen = self.shown(real, images, BatchDraws(self.seed, batch, REAL))
         of_real, of_fake = self.discriminator(seen), self.discriminator(fake)
         wrong = discriminator_loss(of_real, of_fake)

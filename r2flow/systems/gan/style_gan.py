@@ -140,8 +140,7 @@ class Level(nn.Module):
         x = self.bias_act1(self.conv1(x, w))
         if not self.first:
             x = self.bias_act2(self.conv2(x, w))
-        made = self.head(x, w)
-        return x, {name: o + self.resample(so_far[name]) if so_far else o for name, o in made.items()}
+        return x, {name: o + self.resample(so_far[name]) if so_far else o for name, o in self.head(x, w).items()}
 
 
 class Synthesis(nn.Module):
