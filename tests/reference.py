@@ -2,7 +2,7 @@
 
 import json
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -118,3 +118,13 @@ def assert_gradients(model: nn.Module, x: Tensor, output: Tensor, case: dict[str
     for name, parameter in model.named_parameters():
         expected = case["grad_param_norms"][name]
         assert abs(parameter.grad.norm().item() - expected) <= 1e-3 * expected + 1e-6, name
+
+
+def backbone_outputs(name: str, case: dict[str, Any]) -> Iterator[tuple[Tensor, Tensor]]:
+    """What a backbone computes and what is published, at times of their own and at one time; gradients are compared."""
+    model, x = backbone_of(name, case), case["x"].clone().requires_grad_()
+    output = model(case["t"], x)
+    yield output, case["output"]
+    assert_gradients(model, x, output, case)
+    with torch.no_grad():
+        yield model(case["t_scalar"], case["x"][:1]), case["output_t_scalar"]
