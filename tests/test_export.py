@@ -15,7 +15,7 @@ from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.export import NOTES, compare, export, tableau
-from r2flow.noise import Draws, standard_normal
+from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import ROOT, tiny_options
 
@@ -77,14 +77,10 @@ def test_a_sampler_that_draws_noise_on_the_way_is_refused():
         tableau(flow("efficient_unet", "flow_map").generator, build_sampler("renoise", steps=2))
 
 
-def test_the_noise_of_the_page_is_that_of_a_scan():
-    assert torch.equal(standard_normal((2, 4, 8), 3, "evaluation", 5), Draws(3, [5]).start((2, 4, 8))[0])
-
-
-@pytest.mark.parametrize("sampler", [build_sampler("dopri5"), build_sampler("torchdiffeq", method="rk4")])
-def test_a_sampler_without_a_fixed_number_of_steps_is_refused(sampler, tmp_path):
+@pytest.mark.parametrize("sampler", ["dopri5", "torchdiffeq:method=rk4", "sde:steps=2", "mmps:steps=2"])
+def test_a_sampler_that_is_no_fixed_number_of_steps_of_the_ode_is_refused(sampler, tmp_path):
     with pytest.raises(InputError, match="cannot be exported"):
-        export(flow("efficient_unet"), tmp_path / "flow.pt2", sampler)
+        export(flow("efficient_unet"), tmp_path / "flow.pt2", build_sampler(sampler))
     assert not [*tmp_path.iterdir()]
 
 

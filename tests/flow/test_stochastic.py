@@ -14,7 +14,6 @@ from r2flow.flow.solvers import named_grid
 from r2flow.generators import USUAL, build_generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.region import Region
-from r2flow.model.export import tableau
 from r2flow.model.sampling import draw
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
@@ -123,9 +122,6 @@ def test_what_needs_the_ode_says_so():
         flow(x_0, sampler=build_sampler("sde", steps=2))
     with pytest.raises(InputError, match="paths"):
         flow.solve(x_0, sampler=build_sampler("sde", churn=2, steps=2))
-    for method in ("sde", "mmps"):
-        with pytest.raises(InputError, match="cannot be exported"):
-            tableau(flow, build_sampler(method, steps=2))
 
 
 def test_another_sampler_has_its_own_defaults_and_the_number_of_steps():
