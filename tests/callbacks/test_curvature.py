@@ -22,7 +22,11 @@ from r2flow.reports.training import read_curves
 from tests.conftest import quiet_trainer
 from tests.fields import Field
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*")
+
 SHAPE = (2, 4, 8)
+# Of 1, 2 and 3 at steps 2 and 3: the average copies 1, takes 1 - 2^(-2/3) of it and the rest of 2, then half of 3.
+AVERAGES = 1 + 2 ** (-2 / 3), (1 + 2 ** (-2 / 3) + 3) / 2
 
 
 class Shrinking(nn.Module):
@@ -82,22 +86,18 @@ def exact(a: float, n: int) -> tuple[float, float]:
     return variance * sum(norms) / 2, variance / mean**2
 
 
-@pytest.mark.filterwarnings("ignore:.*")
 def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
     ema = EMA(decay=0.5, every=1, warmup_steps=0)
     fit(tmp_path, [ema, Curvature(seed=7, every=2, num=2, steps=4)], steps=3)
     curves = read_curves(tmp_path, ("curvature/s", "curvature/s_normalised", "train/loss"))
     assert curves["curvature/s"][0].tolist() == [2, 3]  # every second step, and the last
     assert curves["train/loss"][0].tolist() == [1, 2, 3]
-    # By hand: the average copies 1, then takes 1 - 2^(-2/3) = 0.370 of it and 0.630 of 2, then half of 3.
-    second = 1 + 2 ** (-2 / 3)
-    for index, a in enumerate((second, (second + 3) / 2)):
+    for index, a in enumerate(AVERAGES):
         s, normalised = exact(a, 4)
         assert curves["curvature/s"][1][index] == pytest.approx(s, rel=1e-4)
         assert curves["curvature/s_normalised"][1][index] == pytest.approx(normalised, rel=1e-4)
 
 
-@pytest.mark.filterwarnings("ignore:.*")
 def test_training_does_not_notice(tmp_path):
     plain = fit(tmp_path / "plain", [])
     measured = fit(tmp_path / "measured", [Curvature(seed=0, every=2)])
@@ -105,7 +105,6 @@ def test_training_does_not_notice(tmp_path):
     assert torch.equal(plain.velocity.a, measured.velocity.a)
 
 
-@pytest.mark.filterwarnings("ignore:.*")
 def test_a_step_of_several_batches_is_measured_once(tmp_path):
     fit(tmp_path, [Curvature(seed=0, every=2)], steps=4, accumulate_grad_batches=3)
     with (tmp_path / "metrics" / "version_0" / "metrics.csv").open() as file:
@@ -142,7 +141,6 @@ class Drawn(Stage):
         self.generator = Field(self.velocity, SPACE.shape, SPACE)
 
 
-@pytest.mark.filterwarnings("ignore:.*")
 def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_path, monkeypatch):
     sheets = []
     real = pictures.contact_sheet
@@ -152,17 +150,14 @@ def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_pat
     fit(tmp_path, callbacks, steps=3, stage=Drawn(), logger=logger)
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == ["step-00000002.png", "step-00000003.png"]
     noise = torch.stack([standard_normal(SPACE.shape, 7, "evaluation", i) for i in range(2)])
-    # The average copies 1, takes 1 - 2^(-2/3) of it and the rest of 2, then half of 3; Euler gives x_0 (1 - a/4)^4.
-    second = 1 + 2 ** (-2 / 3)
-    for a, (images, _, titles) in zip((second, (second + 3) / 2), sheets, strict=True):
-        expected = SPACE.decode(noise * (1 - a / 4) ** 4).numpy()
+    for a, (images, _, titles) in zip(AVERAGES, sheets, strict=True):
+        expected = SPACE.decode(noise * (1 - a / 4) ** 4).numpy()  # Euler's path
         np.testing.assert_allclose(np.stack(images), expected, rtol=1e-3, atol=1e-3)
         assert titles in (["step 2"], ["step 3"])
     events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"images": 0}).Reload()
     assert [image.step for image in events.Images("samples")] == [2, 3]
 
 
-@pytest.mark.filterwarnings("ignore:.*")
 def test_a_picture_that_is_there_is_kept_and_none_may_be_asked_for(tmp_path):
     (tmp_path / "p").mkdir()
     (tmp_path / "p" / "step-00000002.png").write_bytes(b"kept")

@@ -21,13 +21,10 @@ from r2flow.samplers import build_sampler
 from r2flow.simulator import simulate
 from r2flow.stages import build_stage
 from r2flow.stages.transfer import Tasks, Transfer, coarser
+from tests import fields
 from tests.conftest import tiny_options
 
-CONFIG = {
-    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
-    "encoding": {"format": "logscale", "reflectance": True},
-    "backbone": {"name": "local", "channels": 16, "dilations": [1, 2]},
-}
+CONFIG = {**fields.CONFIG, "backbone": {"name": "local", "channels": 16, "dilations": [1, 2]}}
 
 
 def built(nought: bool = False, **changed) -> TransferFlow:
@@ -348,14 +345,10 @@ def test_a_batch_has_crops_of_several_sensors():
 )
 def test_a_part_of_another_sensor_that_cannot_be_learned_from_is_refused(name, sensor, word):
     part = {"name": "simulated", "scenes": 4}
-    config = {"data": {"name": "mixed", "batch_size": 4, "parts": [part, {**part, "sensor": sensor}]}}
-    if name == "rectify":
-        config["stage"] = {"name": name}
-        with pytest.raises(InputError, match=word):
-            build_stage({**CONFIG, **config, "seed": 0}, build_generator({**CONFIG, "backbone": tiny_options("hdit")}))
-    else:
-        with pytest.raises(InputError, match=word):
-            stage(**config)
+    data = {"name": "mixed", "batch_size": 4, "parts": [part, {**part, "sensor": sensor}]}
+    generator = build_generator({**CONFIG, "backbone": tiny_options("hdit")}) if name == "rectify" else built()
+    with pytest.raises(InputError, match=word):
+        build_stage({**CONFIG, "data": data, "seed": 0, "stage": {"name": name}}, generator)
 
 
 @pytest.mark.parametrize("other", ["rectify", "reflow"])
