@@ -1,4 +1,3 @@
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,11 +22,10 @@ def files(folder: Path, **options) -> ScanFiles:
 def test_skipping_takes_the_next_good_scan_of_the_same_block(numbered: Path, caplog):
     for bad in (3, 4, 11):
         (numbered / f"{bad:06d}.bin").write_bytes(b"\0" * 30)
-    with caplog.at_level(logging.WARNING):
-        source = files(numbered, on_bad_scan="skip")
+    source = files(numbered, on_bad_scan="skip")
+    for _ in range(2):
         assert numbers(source) == [0, 1, 2, 5, 5, 5, 6, 7, 8, 9, 10, 0]
-        assert numbers(source) == [0, 1, 2, 5, 5, 5, 6, 7, 8, 9, 10, 0]
-    assert len([r for r in caplog.records if "left out" in r.message]) == 3  # each is said once
+    assert caplog.text.count("left out") == 3  # each is said once
     # A block never reaches into its neighbour: scan 11 is not replaced by scan 0 of the training block.
     assert numbers(source.subset(range(9, 12))) == [9, 10, 9]
 
@@ -51,8 +49,7 @@ def test_when_all_are_bad_it_ends(numbered: Path):
 def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, caplog):
     rows = np.array([[10, 0, -1, 0.5], [np.nan, 0, 0, 0.5], [10, np.inf, 0, 0.5]] + [[11, 2, -1, 0.5]] * 5, np.float32)
     rows.tofile(tmp_path / "scan.bin")
-    with caplog.at_level(logging.WARNING):
-        image = read_image(tmp_path / "scan.bin", STRICT)
+    image = read_image(tmp_path / "scan.bin", STRICT)
     assert "scan.bin: points that are NaN, infinite or beyond 10000 m are dropped (2 points" in caplog.text
     assert (image[0] > 0).sum() == 2
 
