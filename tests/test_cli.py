@@ -3,6 +3,7 @@
 import hashlib
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -77,8 +78,7 @@ def test_info_says_what_is_in_a_checkpoint(r2flow, saved):
     said = r2flow.said("info", saved[0])
     for words in ("hdit", "2 x 8 x 64", "hdl64e", "logscale", "backbone.base_channels"):
         assert words in said
-    code, said, _ = r2flow("info", saved[0], "--json")
-    assert json.loads(said)["step"] == 7
+    assert json.loads(r2flow.said("info", saved[0], "--json"))["step"] == 7
 
 
 def test_export_writes_the_averaged_weights(r2flow, saved, tmp_path):
@@ -118,10 +118,7 @@ def test_every_verb_has_help_with_an_example(r2flow, verb):
     ],
 )
 def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, words):
-    def full(*_, **__):
-        raise error
-
-    monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", full)
+    monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", Mock(side_effect=error))
     for more, instead in ((("--batch-size", 4), "a smaller --batch-size"), ((), "smaller batches or images")):
         said = r2flow.refusal("sample", "-o", tmp_path, *more)
         assert words in said
@@ -129,9 +126,7 @@ def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, word
 
 
 def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_path):
-    def broken(*_, **__):
-        raise RuntimeError("shapes do not match")
-
+    broken = Mock(side_effect=RuntimeError("shapes do not match"))
     monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", broken)
     with pytest.raises(RuntimeError, match="shapes"):
         r2flow("sample", "-o", tmp_path)

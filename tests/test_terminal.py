@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -89,9 +90,7 @@ def test_a_config_file_that_contains_itself_is_one_line(tmp_path: Path):
 def test_a_lost_device_is_one_line(monkeypatch, tmp_path: Path, message: str):
     """As torch.distributed says it in the processes that are left."""
 
-    def fit(*_, **__):
-        raise RuntimeError(message)
-
+    fit = Mock(side_effect=RuntimeError(message))
     trainer = SimpleNamespace(world_size=2, max_steps=4, is_global_zero=False, fit=fit)
     run = SimpleNamespace(trainer=trainer, folder=tmp_path, config={"stage": {}}, data=None, stage=torch.nn.ReLU())
     monkeypatch.setattr(r2flow.training, "open_run", lambda *_: None)

@@ -5,10 +5,12 @@ import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import yaml
+from safetensors.numpy import load_file
 
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import SOURCES, find_drives
@@ -174,8 +176,6 @@ def test_real_scans_keep_their_reflectance_to_the_bit(
 
 
 def test_a_shard_is_three_bytes_a_pixel_and_readable_by_anybody(clouds: Path, tmp_path: Path):
-    from safetensors.numpy import load_file
-
     make(tmp_path, plan_of(clouds))
     assert list(files(tmp_path)) == [MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
     tensors = load_file(tmp_path / "scans-000003.safetensors")  # ten scans by threes: one is left
@@ -250,10 +250,7 @@ def test_another_recipe_is_refused_in_the_same_folder(clouds: Path, tmp_path: Pa
 
 def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch):
     make(tmp_path, plan_of(clouds))
-
-    def refused(*_, **__):
-        raise PermissionError(errno.EACCES, "Permission denied")
-
+    refused = Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
     for name in ("mkdir", "unlink", "rmdir"):
         monkeypatch.setattr(Path, name, refused)
     monkeypatch.setattr("os.replace", refused)
@@ -368,8 +365,7 @@ def test_a_manifest_that_is_damaged_or_missing_is_named(clouds: Path, tmp_path: 
 def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
     out = tmp_path / "out"
     typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 4)
-    code, said, _ = r2flow(*typed, "--workers", 1)
-    assert code == 0
+    said = r2flow.said(*typed, "--workers", 1)
     assert f"{out}: 6 scans in 2 shards, 0.0 MiB; range within" in said
     assert "reflectance as n/256, exactly" in said
     source = prepared_in(out)
@@ -414,9 +410,8 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
         assert (code, error) == (0, "")
     for one, two in zip(prepared_in(tmp_path / "one"), prepared_in(tmp_path / "two"), strict=False):
         assert np.array_equal(one, two)
-    code, _, error = r2flow("prepare", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two")
-    assert code == 2
-    assert "reading.columns=" in error
+    other = "prepare", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two"
+    assert "reading.columns=" in r2flow.refusal(*other)
     scan = wide / "000000.npy"
     assert r2flow("show", scan, *columns, "--size", "4x16", "--format", "npy", "-o", tmp_path / "image")[0] == 0
     expected = read_image(numbered / "000000.bin", Reading(SMALL, reflectance=True))

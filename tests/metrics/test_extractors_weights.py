@@ -211,8 +211,7 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path):
 def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):
     def here() -> set[str]:
         """Which networks have their weights, by the table."""
-        code, said, _ = r2flow("weights")
-        assert code == 0
+        said = r2flow.said("weights")
         for words in ("FRD", "FRID", "FPD", "FSVD", "FPVD", "darknet53-1024.tar.gz", f"Looked for in {folder}"):
             assert words in said
         rows = [line.split() for line in said.splitlines() if line.split(" ")[0] in SOURCES]
@@ -222,8 +221,7 @@ def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):
     assert here() == set()
     path = tmp_path / "mine.pth"
     torch.save(untrained(PointNet).state_dict(), path)
-    code, said, _ = r2flow("weights", "--add", "pointnet", path)
-    assert code == 0
+    said = r2flow.said("weights", "--add", "pointnet", path)
     assert said.startswith(f"{folder / 'pointnet.safetensors'}: weights ")
     assert said.endswith("of mine.pth\n")
     assert here() == {"pointnet"}

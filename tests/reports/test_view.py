@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow import load
 from r2flow.errors import InputError
 from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.sensors import SENSORS
+from r2flow.noise import Draws
 from r2flow.reports.view import MOST, page
 from r2flow.simulator import simulate
 
@@ -152,8 +154,8 @@ class TestTheVerb:
         many.mkdir()
         for number, image in enumerate(images(5)):
             np.save(many / f"{number}{ATTACK.replace('/', '')}.npy", image)
-        code, said, _ = r2flow("view", scan, many, "--num", 3, "--out", tmp_path / "a.html")
-        assert (code, said) == (0, f"{many}: 3 of its 5 scans, evenly spread (--num)\n{tmp_path / 'a.html'}\n")
+        said = r2flow.said("view", scan, many, "--num", 3, "--out", tmp_path / "a.html")
+        assert said == f"{many}: 3 of its 5 scans, evenly spread (--num)\n{tmp_path / 'a.html'}\n"
         data = Parsed((tmp_path / "a.html").read_text()).data
         assert [one["caption"][:1] for one in data["scans"]] == ["g", "0", "2", "4"]
         r, _ = unpacked(data, 0)
@@ -169,24 +171,19 @@ class TestTheVerb:
         assert data["frames"] == ["a.npy", "b.npy"]
 
     def test_draws_a_model_at_several_steps_from_the_same_noise(self, r2flow, saved, tmp_path):
-        import r2flow as package
-
         assert r2flow("view", saved[0], "--num", 2, "--steps", "1,3", "--out", tmp_path / "a.html")[0] == 0
         data = Parsed((tmp_path / "a.html").read_text()).data
         names = [f"{saved[0]}, seed 0, {steps}" for steps in ("1 step", "3 steps")]
         assert [one["caption"] for one in data["scans"]] == names
-        expected = package.load(saved[0]).sample(2, steps=3)
+        expected = load(saved[0]).sample(2, steps=3)
         for frame in range(2):
             assert np.abs(unpacked(data, 1, frame)[0] - expected[frame, 0].numpy()).max() < 0.0021
 
     def test_goes_from_noise_to_scan(self, r2flow, saved, tmp_path):
-        import r2flow as package
-        from r2flow.noise import Draws
-
         assert r2flow("view", saved[0], "--num", 1, "--times", 3, "--out", tmp_path / "a.html")[0] == 0
         data = Parsed((tmp_path / "a.html").read_text()).data
         assert data["frames"] == ["t = 0", "t = 0.5", "t = 1"]
-        flow = package.load(saved[0])
+        flow = load(saved[0])
         noise = flow.encoding.decode(Draws(0, [0]).start(flow.generator.noise_shape))
         assert np.abs(unpacked(data, 0, 0)[0] - noise[0, 0].numpy()).max() < 0.0021
 
