@@ -2,8 +2,8 @@
 
 import json
 import math
+import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +23,14 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.jsd_mmd import JSD, MMD
-from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import standard_normal
 from r2flow.reports.evaluation import Comparison, _figure, verdict
 from r2flow.samplers import build_sampler
 from tests.conftest import folder, images
-from tests.test_sampling import flow as without_config
+from tests.test_sampling import flow
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 READING = Reading(SENSOR)
-
-
-def flow() -> Checkpoint:
-    return replace(without_config(), config={"sensor": {}, "encoding": {}})
 
 
 def figures(real: ScanSet, generated: ScanSet, cache: Cache | None = None, work: Work | None = None):
@@ -132,14 +127,10 @@ class CountReturns(JSD):
 
 def test_the_fixed_shuffle_is_stated_and_does_not_change():
     assert fixed_choice(7, 7) == list(range(7))
-    assert fixed_choice(81106, 10000)[:3] == sorted(np.random.Generator(philox()).permutation(81106)[:10000])[:3]
+    key = np.array([0, zlib.crc32(b"shuffle")], dtype=np.uint64)
+    shuffled = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, 0])).permutation(81106)
+    assert fixed_choice(81106, 10000)[:3] == sorted(shuffled[:10000])[:3]
     assert real_rule(JSD(), open_scans("simulated:0", READING, num=10_000)) == (None, "all 10000")
-
-
-def philox() -> np.random.Philox:
-    import zlib
-
-    return np.random.Philox(key=np.array([0, zlib.crc32(b"shuffle")], dtype=np.uint64), counter=[0, 0, 0, 0])
 
 
 class TestSets:

@@ -35,8 +35,7 @@ def completed(config: dict, asked: list[str]) -> dict:
 
 @pytest.mark.parametrize("asked", [[], ["encoding"], ["encoding.reflectance"]])
 def test_auto_is_what_the_parent_is(parent: Path, asked: list[str]):
-    config = completed(child(parent, "auto"), asked)
-    assert config["encoding"] == {"format": "logscale", "reflectance": False}
+    assert completed(child(parent, "auto"), asked)["encoding"] == {"format": "logscale", "reflectance": False}
 
 
 def test_a_channel_that_the_parent_lacks_is_refused(parent: Path):
@@ -101,8 +100,7 @@ def test_weights_move_to_another_size_where_none_belongs_to_a_place(position: st
     assert torch.equal(ours.backbone.coords, rays)
     # A network made for the size, with these weights, does the same: nothing of the old rays is left.
     same = build_generator(sized(CONFIG, 16, 128, position=position))
-    state = {**theirs.state_dict(), "backbone.coords": rays}
-    same.load_state_dict(state)
+    same.load_state_dict({**theirs.state_dict(), "backbone.coords": rays})
     x, t = torch.randn(1, 1, 16, 128), torch.tensor(0.3)
     with torch.no_grad():
         assert torch.equal(ours.velocity(t, x), same.velocity(t, x))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread, imsave
 
 from r2flow.callbacks.loggers import build_loggers, log_config, log_figures, log_picture
 from r2flow.errors import InputError
@@ -21,8 +22,6 @@ def test_a_missing_package_names_its_extra(name, tmp_path, monkeypatch):
 
 
 def write_figures(run: Path) -> None:
-    from matplotlib.image import imsave
-
     (run / "samples").mkdir(parents=True)
     for path in (run / "loss.png", run / "samples" / "samples.png"):
         imsave(path, PIXELS)
@@ -42,8 +41,6 @@ def log_all(run: Path, name: str, loss: float, step: int) -> None:
 @pytest.mark.filterwarnings("ignore")
 def test_mlflow_keeps_curves_pictures_and_the_config_in_the_run(tmp_path, monkeypatch):
     mlflow = pytest.importorskip("mlflow")
-    from matplotlib.image import imread
-
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "")  # and put back what MLflow writes there
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
@@ -68,8 +65,6 @@ def test_mlflow_keeps_curves_pictures_and_the_config_in_the_run(tmp_path, monkey
 @pytest.mark.filterwarnings("ignore")
 def test_wandb_keeps_curves_pictures_and_the_config_offline(tmp_path, monkeypatch):
     wandb = pytest.importorskip("wandb")
-    from matplotlib.image import imread
-
     monkeypatch.setenv("WANDB_MODE", "offline")
     write_figures(tmp_path)
     log_all(tmp_path, "wandb", 0.5, 4)

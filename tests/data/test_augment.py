@@ -32,8 +32,7 @@ def test_half_of_the_scans_are_mirrored():
 
 
 def test_a_mirrored_image_is_the_image_of_the_mirrored_scan():
-    rays = SENSOR.rays()
-    xyz, reflectance = image_to_points(IMAGE, rays)
+    xyz, reflectance = image_to_points(IMAGE, SENSOR.rays())
     mirrored = project(xyz * np.float32([1, -1, 1]), reflectance, SENSOR)
     np.testing.assert_allclose(mirrored, IMAGE[..., ::-1], rtol=1e-5)
 

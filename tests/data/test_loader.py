@@ -90,13 +90,9 @@ def test_parts_lie_end_to_end():
         mixture[5]
 
 
-def part_of(index: int) -> int:
-    return int(np.searchsorted(np.cumsum(SIZES), index, side="right"))
-
-
 def test_weights_are_the_shares_of_the_images():
     order = MixedOrder(SIZES, WEIGHTS, seed=1)
-    parts = np.bincount([part_of(order[k]) for k in range(8000)]) / 8000
+    parts = np.bincount(np.searchsorted(np.cumsum(SIZES), [order[k] for k in range(8000)], side="right")) / 8000
     np.testing.assert_allclose(parts, [3 / 8, 1 / 8, 4 / 8], atol=0.02)  # standard deviation at most 0.0056
     first = [index for k in range(8000) if (index := order[k]) < 5]
     np.testing.assert_allclose(np.bincount(first) / len(first), [0.2] * 5, atol=0.03)  # standard deviation 0.0073

@@ -122,8 +122,7 @@ def test_what_a_gan_cannot_do_is_one_line(gan: Path, tmp_path: Path, verb: str):
     arguments, said = CANNOT[verb]
     for name, value in (("RUN", gan), ("SCAN", gan / "samples" / "000000.ply"), ("OUT", tmp_path / "out")):
         arguments = [one.replace(name, str(value)) for one in arguments]
-    done = r2flow(*verb.split(), GAN.plugin, *arguments)
-    assert said in done.refusal
+    assert said in r2flow(*verb.split(), GAN.plugin, *arguments).refusal
     assert not list(tmp_path.iterdir())
 
 

@@ -156,10 +156,7 @@ def test_the_state_stays_in_float32_around_a_half_precision_network():
     assert end.x.dtype == torch.float32
 
 
-ALONE = ["euler", "rk4", "adams3", "adams4", "dopri5", "torchdiffeq:dopri5", "torchdiffeq:bosh3"]
-
-
-@pytest.mark.parametrize("method", ALONE)
+@pytest.mark.parametrize("method", [*FIXED, "dopri5", "torchdiffeq:dopri5", "torchdiffeq:bosh3"])
 def test_a_scene_does_not_depend_on_its_neighbours(method):
     hard = torch.tensor([[20.0]], dtype=torch.float64)  # steep at the start
     together = solve(logistic, torch.cat([X_0, hard]), method=method, tolerance=1e-3)

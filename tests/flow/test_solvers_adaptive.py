@@ -5,6 +5,7 @@ import statistics
 
 import pytest
 import torch
+import torchdiffeq
 
 from benchmarks.solvers import Mixed
 from r2flow.flow.path import expand_time
@@ -33,8 +34,6 @@ def worst(x, exact):
 
 def as_one_state(velocity, x_0, tolerance):
     """torchdiffeq's dopri5 on the whole batch: its end, and its evaluations times the scenes."""
-    import torchdiffeq
-
     calls = []
 
     def counted(t, x):
@@ -45,15 +44,10 @@ def as_one_state(velocity, x_0, tolerance):
     return end[-1], len(x_0) * len(calls)
 
 
-def mixed_16():
-    straight, smooth, modes, drop = Straight(), Gaussian(), TwoModes(), RayDrop()
-    return Mixed([straight] * 8 + [smooth] * 4 + [modes] * 3 + [drop])
-
-
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-5])
 def test_a_mixed_batch_takes_six_tenths_of_the_evaluations_of_one_common_step(tolerance):
     # Four draws of the batch: one step more or less of torchdiffeq's eight moves a single one by an eighth.
-    batch, ours, theirs = mixed_16(), [], []
+    batch, ours, theirs = Mixed([Straight()] * 8 + [Gaussian()] * 4 + [TwoModes()] * 3 + [RayDrop()]), [], []
     for seed in range(4):
         x_0 = noise(16, seed=seed)
         exact = batch.solution(x_0, 1.0)
@@ -123,8 +117,7 @@ def test_nothing_is_evaluated_outside_the_interval(method, t_0, t_1, dtype):
         asked.append(t.clone())
         return Gaussian(std=0.05)(t, x)
 
-    start = noise(5).to(dtype)
-    solution = solve(velocity, start, t_0, t_1, method=method, steps=7, tolerance=1e-4)
+    solution = solve(velocity, noise(5).to(dtype), t_0, t_1, method=method, steps=7, tolerance=1e-4)
     ends = torch.tensor([t_0, t_1], dtype=torch.float64).to(dtype)
     for t in asked:
         assert t.dtype == dtype

@@ -259,8 +259,7 @@ def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
     with pytest.raises(InputError, match="cannot be told apart"):
         find_beams([lost])
     assert other_sensor([lost], SENSORS["hdl64e"]) is None
-    name = other_sensor([lost], SENSORS["vlp16"]).name
-    assert name is None
+    assert other_sensor([lost], SENSORS["vlp16"]).name is None
 
 
 def test_sensors_of_one_s_own_are_judged_by_their_beams():

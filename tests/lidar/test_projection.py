@@ -81,8 +81,7 @@ def test_points_that_are_not_finite_are_no_returns(convention, lost):
     """Neither in their own pixel nor in one that another point falls into, as the one at azimuth and elevation 0."""
     xyz = np.array([[10, 0, 0], [3, -4, 0.1], [-8, 1, -1]], dtype=np.float32)
     with_lost = np.concatenate([xyz, [[lost, 0, 0], [1, lost, 2], [lost, lost, lost]]]).astype(np.float32)
-    sensor = SENSORS["hdl64e"]
-    alone, beside = (project(p, None, sensor, convention=convention) for p in (xyz, with_lost))
+    alone, beside = (project(p, None, HDL64E, convention=convention) for p in (xyz, with_lost))
     assert (alone[0] > 0).sum() == 3
     np.testing.assert_array_equal(beside, alone)
 
@@ -212,9 +211,6 @@ def test_unfolded_real_scans_unproject_to_their_points(shared):
         assert np.median(height_error) < 0.05
 
 
-FIRED = ["hdl32e", "vlp16", "vlp32c", "os1_64", "pandar64"]
-
-
 def cloud(sensor: Sensor, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Points of a random image, (W, H, 3), a firing after the other, each from the top; a fifth without return."""
     draw = np.random.default_rng(seed)
@@ -233,7 +229,7 @@ def packet_order(sensor: Sensor, how: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("how", ["top", "bottom", "firing"])
-@pytest.mark.parametrize("name", FIRED)
+@pytest.mark.parametrize("name", ["hdl32e", "vlp16", "vlp32c", "os1_64", "pandar64"])
 def test_whole_firings_unfold_whatever_their_order(name, how):
     sensor = SENSORS[name].resized(columns=48)
     firings, image = cloud(sensor)

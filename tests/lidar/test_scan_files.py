@@ -16,8 +16,6 @@ XYZ = [row[:3] for row in ROWS]
 REFLECTANCE = [row[3] for row in ROWS]
 RING = [row[4] for row in ROWS]
 
-WRITTEN = ("bin", "ply", "npy", "pcd")
-
 
 def saved(folder: Path, name: str, content: bytes | str) -> Path:
     path = folder / name
@@ -167,7 +165,7 @@ def scan(count: int = 5000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return xyz, rng.integers(0, 100, count).astype(np.float32) / np.float32(100)
 
 
-@pytest.mark.parametrize("ending", WRITTEN)
+@pytest.mark.parametrize("ending", ["bin", "ply", "npy", "pcd"])
 def test_written_scans_are_read_back_bit_for_bit(tmp_path, ending):
     xyz, reflectance = scan()
     path = tmp_path / "new folder" / f"a.{ending}"

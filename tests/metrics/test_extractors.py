@@ -181,8 +181,7 @@ def test_sectors_by_hand():
     features = torch.tensor([[1.0], [3.0], [10.0], [20.0]])
     # Edges 0, 7.25, 10.5, ...: 4 + 52 i / 16 m, the first put to 0.
     assert mean_by_distance(features, coords).tolist() == [2, 15] + [0] * 14
-    far = coords * 1000
-    assert mean_by_distance(features, far).tolist() == [0] * 16
+    assert mean_by_distance(features, coords * 1000).tolist() == [0] * 16
 
 
 @pytest.mark.parametrize("cls", [MinkowskiNet, SPVCNN])

@@ -47,8 +47,7 @@ def baseline(name: str, training: np.ndarray, num: int) -> np.ndarray:
 
 
 def test_the_histograms_are_numpy_s_and_every_member_has_its_size():
-    image = walls(1, 0)[0]
-    r, q = image
+    r, q = walls(1, 0)[0]
     scan = Scan(r, q, SENSOR, np.zeros((100, 100)))
     up, cosine = scan.surfaces
     above = (r[1:] > 0) & (r[:-1] > 0)

@@ -16,8 +16,7 @@ E, A = SENSOR.rays().numpy().astype(np.float64)
 def ground(lean_x: float = 0.0) -> np.ndarray:
     """Ranges of the plane z = -1.73 + lean x: r = -1.73 / (sin e - lean cos e cos a)."""
     closing = np.sin(E) - lean_x * np.cos(E) * np.cos(A)
-    r = np.where(closing < -0.03, -1.73 / np.minimum(closing, -0.03), 0)
-    return r.astype(np.float32)
+    return np.where(closing < -0.03, -1.73 / np.minimum(closing, -0.03), 0).astype(np.float32)
 
 
 def scans_of(images: np.ndarray) -> list[Scan]:

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.pictures import completed_figure, contact_sheet, figure_pixels, save_figure, scan_figure
 
@@ -82,8 +83,6 @@ def test_a_wall_on_the_left_is_drawn_on_the_left():
 
 
 def test_labels_are_a_row_of_their_classes_colours():
-    from r2flow.lidar.labels import CLASSES
-
     labels = np.where(A > 0, 40, 70)
     labels[:8] = 0
     plain, labelled = (

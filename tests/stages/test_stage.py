@@ -73,8 +73,7 @@ def test_steps_of_its_own_are_clipped_scheduled_and_counted_as_lightning_s(tmp_p
         assert torch.equal(a, b)
     assert manual.rates == automatic.rates
     assert automatic.rates[:2] == pytest.approx([0.05, 0.1])  # a warm-up of 16 images is one of two steps
-    untouched = Manual().other.weight
-    assert not torch.equal(manual.other.weight, untouched)
+    assert not torch.equal(manual.other.weight, Manual().other.weight)
 
 
 class Slope(Stage):
@@ -85,8 +84,7 @@ class Slope(Stage):
         self.automatic_optimization, self.gradient_clip_val, self.slope = False, CLIP, slope
 
     def configure_optimizers(self):
-        optimizer = torch.optim.SGD(self.generator.layer.parameters(), lr=1.0)
-        return [optimizer], []
+        return [torch.optim.SGD(self.generator.layer.parameters(), lr=1.0)], []
 
     def training_step(self, batch, batch_idx):
         self.take_step(self.own_optimizers()[0], self.slope * self.generator.layer.bias.sum())

@@ -264,8 +264,7 @@ def test_a_chain_can_begin_at_a_flow_that_is_there():
     ],
 )
 def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path: Path, overrides: list[str], message: str):
-    done = in_process(tmp_path, ["experiment=demo", *overrides], check=False)
-    assert message in done.refusal
+    assert message in in_process(tmp_path, ["experiment=demo", *overrides], check=False).refusal
     assert list(tmp_path.iterdir()) == []
 
 

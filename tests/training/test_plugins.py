@@ -160,8 +160,7 @@ def test_what_is_in_a_registry_without_a_yaml_file_becomes_a_choice(group: str, 
     registry: Registry[Any] = getattr(importlib.import_module(module), table)
     original = next(iter(registry.items()))[1]
     monkeypatch.setattr(registry, "_entries", {**registry._entries, "somebodys": original})
-    config = compose([f"{group}=somebodys"])
-    assert config[group]["name"] == "somebodys"
+    assert compose([f"{group}=somebodys"])[group]["name"] == "somebodys"
     assert set(choices(group)) >= {"somebodys"}
 
 
