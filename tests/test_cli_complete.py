@@ -13,6 +13,7 @@ import r2flow
 from r2flow.data.opening import open_scans
 from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading
+from r2flow.errors import InputError
 from r2flow.lidar.known import Ray, parse_mask
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
@@ -329,6 +330,11 @@ def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_pa
     assert {*map(tuple, points.xyz[inside])} <= {*map(tuple, given.xyz)}
     if points.reflectance is not None:
         assert torch.equal(flow.complete(np.column_stack([points.xyz, points.reflectance])), answer)
+
+
+def test_points_in_memory_are_named_in_a_refusal(run):
+    with pytest.raises(InputError, match="^points in memory: .*beams cannot be told apart"):
+        r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
 
 
 def test_the_errors_of_hidden_rays_stand_next_to_those_of_interpolation():

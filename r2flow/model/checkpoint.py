@@ -101,12 +101,15 @@ class Checkpoint:
             check(images.shape[1] in (3, 4), f"points must be of (N, 3) or (N, 4), found {tuple(images.shape)}.")
             with TemporaryDirectory() as folder:
                 np.save(file := Path(folder, "points.npy"), torch.as_tensor(images).cpu())
-                return self.complete(file, state, num, seed, sensor=sensor, **how)
+                try:
+                    return self.complete(file, state, num, seed, sensor=sensor, **how)
+                except InputError as error:
+                    raise InputError(str(error).replace(str(file), "points in memory")) from None
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")
             self, scans, remarks = self.open_partial([str(images)], sensor)
             for lost in remarks[1:]:
-                warnings.warn(lost, stacklevel=2)
+                warnings.warn(lost.removeprefix(f"{images}: "), stacklevel=2)
             seen = [scan.read() for scan in scans]
             images = torch.from_numpy(np.stack([one.image for one in seen]))
             state = torch.from_numpy(np.stack([one.state for one in seen]))
