@@ -173,7 +173,7 @@ def _run_hydra(arguments: Sequence[str], job: Task) -> None:
 def job_folder(arguments: Sequence[str], overrides: str) -> str:
     """Folder name of a sweep's job: the swept values, and a hash of all overrides."""
     given = [argument.partition("=") for argument in arguments]
-    swept = {key.lstrip("+~") for key, _, value in given if "," in value}
+    swept = {key.lstrip("+~") for key, _, value in given if "," in value and not re.fullmatch(r"\[[^][]*]", value)}
     parts = [part for part in overrides.split(",") if part.partition("=")[0].lstrip("+~") in swept]
     readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
     return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
