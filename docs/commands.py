@@ -4,11 +4,13 @@ overrides compose. Nothing is run: python docs/commands.py
 
 import argparse
 import functools
+import os
 import re
 import shlex
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import typer
@@ -16,8 +18,10 @@ from hydra.errors import HydraException
 
 from r2flow.cli.verbs import USAGE_ERROR, app
 from r2flow.errors import InputError
+from r2flow.lidar.sensor_files import write_sensor
+from r2flow.lidar.sensors import SENSORS
 from r2flow.plugins import take_plugins
-from r2flow.runs.composing import CONF, compose, explain
+from r2flow.runs.composing import compose, explain
 
 DOCS = Path(__file__).resolve().parent
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.M | re.S)
@@ -44,7 +48,7 @@ def quieten(group: typer.Typer) -> None:
         quieten(part.typer_instance)
 
 
-def check(words: list[str], folder: Path) -> None:
+def check(words: list[str]) -> None:
     """Parse a command as r2flow itself does.
 
     Raises:
@@ -65,22 +69,20 @@ def check(words: list[str], folder: Path) -> None:
         overrides = [re.sub(r"^([\w.]+=[\w.]+)(,[\w.]+)+$", r"\1", one) for one in overrides]
     if plugins:  # whose choices are theirs
         overrides = [one for one in overrides if not re.match(r"(backbone|stage|data)=", one)]
-    own = DOCS.parent / (given.config_dir or "")
-    compose(overrides, [own if own.is_dir() else folder] if given.config_dir else [])
+    compose(overrides, [DOCS.parent / given.config_dir] if given.config_dir else [])
 
 
 def main() -> None:
     wrong, count = [], 0
     quieten(app)
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        (folder / "sensor").mkdir()
-        (folder / "sensor" / "mine.yaml").write_text((CONF / "sensor" / "hdl64e.yaml").read_text())
+        os.chdir(scratch)
+        write_sensor(replace(SENSORS["hdl64e"], name="mine"), "mine.yaml", "")
         for page in [DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))]:
             for words in commands(page.read_text()):
                 count += 1
                 try:
-                    check(words, folder)
+                    check(words)
                 except (InputError, HydraException, argparse.ArgumentError, USAGE_ERROR) as error:
                     said = explain(error) if isinstance(error, HydraException) else error
                     wrong.append(f"{page.relative_to(DOCS.parent)}: r2flow {shlex.join(words)}\n    {said}")
