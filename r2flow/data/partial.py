@@ -202,11 +202,9 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
             seen = points_through(points, fired, target, strength)
     if not seen.image[0].any():
         raise nothing_in_view(path, points, target)
-    assert seen.xyz is not None
     r = np.linalg.norm(points.xyz, axis=1)
-    rows, used = (np.ascontiguousarray(xyz).view("V12")[:, 0] for xyz in (points.xyz, seen.xyz.reshape(3, -1).T))
-    others = (r >= target.min_range) & (r <= target.max_range) & ~np.isin(rows, used)
-    return replace(seen, others=Points(points.xyz[others], None if strength is None else strength[others]))
+    inside = (r >= target.min_range) & (r <= target.max_range)
+    return replace(seen, points=Points(points.xyz[inside], None if strength is None else strength[inside]))
 
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:

@@ -28,7 +28,7 @@ class Partial:
     image: np.ndarray  # range in metres and, if measured, reflectance, (2 or 1, H, W) float32; 0 without a return
     state: np.ndarray  # `Ray` of each ray, (H, W) uint8
     xyz: np.ndarray | None = None  # the measured points of the returns in metres, (3, H, W) float32, or None
-    others: Points | None = None  # the other points of the scan's file: the image has the nearest one of each pixel
+    points: Points | None = None  # all points of the scan's file; the image has the nearest one of each pixel
 
 
 def sensor_of(scans: list[Points], named: Sensor | None = None) -> Sensor:

@@ -89,14 +89,14 @@ def write_completed(
             raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, np.ndarray | None] = {}
-    used = others = 0
+    used = kept = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with ScanBar("completing", len(left) * job.num, len(left) * batches, "answers") as bar:
         for number in left:
             scan = scans[number]
             whole, given = hiding(scan, job, number)
             used += 0 if scan.image else int((given.state == Ray.RETURN).sum())
-            others += 0 if given.others is None else len(given.others.xyz)
+            kept += 0 if given.points is None else len(given.points.xyz)
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (completed,) = complete(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,
@@ -114,8 +114,8 @@ def write_completed(
             bar.set(len(done) * job.num)
     if used:
         size = "x".join(map(str, checkpoint.sensor.shape))
-        more = f", and {others:,} more kept" if others else ""
-        print(f"{used:,} measured points are used, the nearest in each pixel of {size}{more}")
+        print(f"{used:,} measured points are used, the nearest in each pixel of {size}", end="")
+        print(f"; all {kept:,} are kept" if kept else "")
     return done
 
 
@@ -207,12 +207,12 @@ def _write(
             save_array(path, image)
         else:
             xyz, reflectance = image_to_points(image, checkpoint.sensor.rays(), measured)
-            if given.others is not None:
-                strength = given.others.reflectance
+            if given.points is not None:  # in the order of the file, before the new points
+                own, strength = given.points.xyz, given.points.reflectance
                 if strength is None:
-                    strength = reflectance[cKDTree(xyz).query(given.others.xyz)[1]]
-                xyz = np.concatenate([xyz, given.others.xyz])
-                reflectance = np.concatenate([reflectance, strength])
+                    strength = reflectance[cKDTree(xyz).query(own)[1]]
+                new, estimated = image_to_points(image * (given.state != Ray.RETURN), checkpoint.sensor.rays())
+                xyz, reflectance = np.concatenate([own, new]), np.concatenate([strength, estimated])
             write_points(path, xyz, reflectance if len(image) > 1 else None)
 
 
