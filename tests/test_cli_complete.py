@@ -17,6 +17,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.known import Ray, parse_mask
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
+from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.transfer import Partial, image_through
 from r2flow.model.completion import Completed
@@ -332,7 +333,16 @@ def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_pa
         assert torch.equal(flow.complete(np.column_stack([points.xyz, points.reflectance])), answer)
 
 
+def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_path):
+    sparse_scan(tmp_path / "room.pcd")
+    write_sensor(replace(VLP16, name="mine"), tmp_path / "mine.yaml", "")
+    asked = tmp_path / "room.pcd", "--to", tmp_path / "mine.yaml", "--size", "32x128"
+    assert "16 of the 32 rows of mine are measured" in success(complete(*asked, model=None))
+
+
 def test_points_in_memory_are_named_in_a_refusal(run):
+    with pytest.raises(InputError, match=r"points in memory of \(N, 3\) or \(N, 4\), found \(4,\)"):
+        r2flow.load(run).complete(np.zeros(4))
     with pytest.raises(InputError, match="^points in memory: .*beams cannot be told apart"):
         r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
 

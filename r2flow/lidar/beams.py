@@ -72,8 +72,8 @@ class Doubt(NamedTuple):
 def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     """The mismatch of some scans and a sensor; None if they match, or if there are too few returns.
 
-    The beams of the scans are compared with the sensor's. Without beams, or if a custom sensor has another number of
-    rows (which may be intended), the share of returns in the sensor's view decides.
+    The beams of the scans are compared with the sensor's. Without beams, or if a custom sensor has fewer rows than the
+    scans have beams (which may be intended), the share of returns in the sensor's view decides.
     """
     elevation = np.concatenate([elevations_of(scan.xyz) for scan in scans])
     elevation = elevation[np.isfinite(elevation)]
@@ -92,7 +92,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
         return None if share >= IN_VIEW else Doubt(seen, None)
     name, near = nearest_sensor(beams)
     distance = 0.0
-    if sensor.name in SENSORS or len(beams) == len(sensor.elevations):
+    if sensor.name in SENSORS or len(beams) <= len(sensor.elevations):
         tables = [sensor.elevations]  # a built-in sensor at another size is the same sensor
         tables += [other.elevations for name, other in SENSORS.items() if _family(name) == _family(sensor.name)]
         distance = min(_distance(beams, np.asarray(table)) for table in tables)

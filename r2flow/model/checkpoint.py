@@ -97,10 +97,14 @@ class Checkpoint:
             sensor: Sensor of the points, by name or YAML file; None: found by their beams.
             how: Options of `r2flow.model.completion.complete`: sampler, steps, batch_size, ...
         """
-        if not isinstance(images, str | Path) and np.ndim(images) == 2:
-            check(images.shape[1] in (3, 4), f"points must be of (N, 3) or (N, 4), found {tuple(images.shape)}.")
+        if not isinstance(images, str | Path):
+            images = torch.as_tensor(images)
+            shape = tuple(images.shape)
+            right = len(shape) == 4 or (len(shape) == 2 and shape[1] in (3, 4))
+            check(right, f"give images of (B, 2 or 1, H, W), or points in memory of (N, 3) or (N, 4), found {shape}.")
+        if isinstance(images, Tensor) and images.ndim == 2:
             with TemporaryDirectory() as folder:
-                np.save(file := Path(folder, "points.npy"), torch.as_tensor(images).cpu())
+                np.save(file := Path(folder, "points.npy"), images.cpu())
                 try:
                     return self.complete(file, state, num, seed, sensor=sensor, **how)
                 except InputError as error:
@@ -115,7 +119,6 @@ class Checkpoint:
             state = torch.from_numpy(np.stack([one.state for one in seen]))
         else:
             check(sensor is None, "images are of the model's sensor: give no sensor, or points of (N, 4).")
-            images = torch.as_tensor(images)
         return torch.stack([completed.images for completed in complete(self, images, state, num, seed, **how)])
 
     def open_partial(

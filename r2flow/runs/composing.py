@@ -20,7 +20,7 @@ from hydra.core.override_parser.types import OverrideType, Sweep
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
-from r2flow.config import flatten, override
+from r2flow.config import flatten, key_of, override
 from r2flow.errors import InputError
 from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
 
@@ -199,11 +199,12 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
             problem = f" leaves the run without its {key}: give one of {', '.join(choices(key))}"
         elif parsed.is_delete() and key.partition(".")[0] not in MAY_GO:
             problem = f": every run has its {key}; give {key}=VALUE"
-        elif key == "sensor" and str(value).endswith((".yaml", ".yml")):
+        elif key == "sensor" and str(value).lower().endswith((".yaml", ".yml")):
             from r2flow.lidar.sensor_files import options_of_sensor, read_sensor
 
-            options = options_of_sensor(read_sensor(str(value)))
-            converted += [override(f"++sensor.{name}", option) for name, option in options.items()]
+            options = {f"sensor.{name}": option for name, option in options_of_sensor(read_sensor(str(value))).items()}
+            given = set(map(key_of, overrides))
+            converted += [override(f"++{name}", option) for name, option in options.items() if name not in given]
             continue
         else:
             named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
@@ -234,7 +235,7 @@ def explain(error: Exception) -> str:
     if choice:
         group, name = choice.groups()
         names = choices(group)
-        hint = f" For your own configs give --config-dir FOLDER, with FOLDER/{group}/NAME.yaml."
+        hint = f" For your own configs, also files in a sweep, give --config-dir FOLDER, with FOLDER/{group}/NAME.yaml."
         return f"no {group} config named '{name}'; known: {', '.join(names)}.{did_you_mean(name, names) or hint}"
     several = re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
     if several:

@@ -2,12 +2,15 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 
 from r2flow.errors import InputError
+from r2flow.lidar.sensor_files import write_sensor
+from r2flow.lidar.sensors import SENSORS
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.stages.checkpointing import AtomicCheckpointIO
@@ -104,6 +107,13 @@ def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
 def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(scans: Path, tmp_path: Path):
     asked = ["experiment=densify", "data=folder", f"data.root={scans}", f"run_dir={tmp_path / 'run'}"]
     assert build(compose(asked), asked).data.options.name == "folder"
+
+
+def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
+    write_sensor(replace(SENSORS["vlp16"], name="mine"), tmp_path / "my sensor.yaml", "")
+    sensor = compose(["sensor.columns=256", f"sensor='{tmp_path}/my sensor.yaml'", "sensor.min_range=3"])["sensor"]
+    assert [sensor[key] for key in ("name", "rows", "columns", "min_range")] == ["mine", None, 256, 3]
+    assert sensor["elevations"] == list(SENSORS["vlp16"].elevations)
 
 
 def test_a_named_choice_has_options_of_its_own():
