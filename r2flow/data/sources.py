@@ -262,7 +262,7 @@ class SimulatedScans(MadeScans):
 class InMemory(ScanSource):
     """Named images in memory, (N, 2 or 1, H, W)."""
 
-    names: Sequence[str] = ()
+    names: Sequence[str] = ()  # set for each instance; the base class has a property
 
     def __init__(self, images: np.ndarray, names: Sequence[str]) -> None:
         self.images, self.names = images, names

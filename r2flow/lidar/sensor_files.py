@@ -59,6 +59,6 @@ def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
 
 
 def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
-    """The options of `build_sensor` for a sensor, and the ray convention of a model."""
+    """The keys of `sensor` in a config: the options of `build_sensor`, and rays through the pixels' centres."""
     options = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(sensor).items()}
     return {**options, "rows": None, "rays": "centre"}
