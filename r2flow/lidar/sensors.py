@@ -92,7 +92,8 @@ class Sensor:
     def resized(self, rows: int | None = None, columns: int | None = None) -> "Sensor":
         """The sensor with the same field of view and another number of rows and columns.
 
-        Row edges are interpolated: each new row covers an equal share of the old rows, evenly spaced or not.
+        More rows: each beam is the centre of a row, with the others evenly spread between beams. Fewer: row edges are
+        interpolated, so that each new row covers an equal share of the old rows.
         """
         sensor = self if columns is None else replace(self, columns=columns)
         old = len(self.elevations)
@@ -102,8 +103,13 @@ class Sensor:
             raise InputError(
                 f"sensor {self.name!r}: rows must be 2 or more, at most {MOST_PIXELS:,} pixels; found {rows}."
             )
-        edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)
-        middle = (edges[:-1] + edges[1:]) / 2
+        if rows > old:
+            e, beam = self.elevations, np.arange(-1, old + 1)  # with a step beyond the first and the last beam
+            beams = [2 * e[0] - e[1], *e, 2 * e[-1] - e[-2]]
+            middle = np.interp(np.arange(rows), (2 * beam + 1) * rows // (2 * old), beams)
+        else:
+            edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)
+            middle = (edges[:-1] + edges[1:]) / 2
         return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # a row is no longer one laser
 
 

@@ -7,6 +7,7 @@ import torch
 import yaml
 
 from r2flow.errors import InputError
+from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.sensor_files import read_sensor, write_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.lidar.space import build_space
@@ -45,10 +46,22 @@ def test_resizing_keeps_the_field_of_view(sensor):
         assert smaller.shape == (rows, 256)
         edges = smaller.row_edges
         gap = abs(np.diff(edges)).max()
-        assert abs(edges[[0, -1]] - sensor.row_edges[[0, -1]]).max() < gap / 2
+        assert abs(edges[[0, -1]] - sensor.row_edges[[0, -1]]).max() < gap / 2 + 1e-9
     # Evenly spaced beams stay so: the edges are exact.
     even = Sensor("even", tuple(9.5 - beam for beam in range(40))).resized(10)
     np.testing.assert_allclose(even.row_edges, np.linspace(10, -30, 11), atol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [20, 32, 48, 64, 128])
+def test_more_rows_than_beams_see_the_ground_where_the_beams_meet_it(rows):
+    fine, e = SENSORS["vlp16"].resized(rows), np.radians(SENSORS["vlp16"].elevations[9:])[:, None]  # within 100 m
+    a = np.pi * (1 - 2 * (np.arange(1024) + 0.5) / 1024)  # middles of the columns
+    ground = np.stack(np.broadcast_arrays(np.cos(a) / np.tan(-e), np.sin(a) / np.tan(-e), -1.0), -1) * 1.8
+    xyz, _ = image_to_points(project(ground.reshape(-1, 3), None, fine), fine)
+    assert len(xyz) == 7 * 1024
+    np.testing.assert_allclose(xyz[:, 2], -1.8, atol=1e-4)
+    assert fine.row_edges[0] > 15.2
+    assert fine.row_edges[-1] < -15.2
 
 
 @pytest.mark.parametrize(
