@@ -208,8 +208,9 @@ def full_reflectance(scans: Sequence[Points]) -> float | None:
     highest = float(values.max())
     if highest <= max(0.0, float(values.min())):
         return None
-    if highest >= 0.1:  # else the values would fill less than a tenth of the scale
-        return next((full for full in FULL_REFLECTANCE if highest <= full * (1 + 1e-3)), highest)
+    usual = next((full for full in FULL_REFLECTANCE if highest <= full * (1 + 1e-3)), math.inf)
+    if highest >= 0.1 * usual:  # else the values would fill less than a tenth of the scale
+        return usual
     return float(f"{highest:.1g}") if float(f"{highest:.1g}") >= highest else float(f"{highest * 1.05:.2g}")
 
 

@@ -112,7 +112,9 @@ def test_ring_numbers_by_laser_give_the_firing_order(first):
         (np.arange(101), 100),
         (np.arange(236), 255),
         (np.arange(257), 256),
-        (np.arange(3000), 65535),
+        (np.arange(301), 300),  # an Ouster's counts of photons
+        (np.linspace(0, 3000, 50), 3000),
+        (np.linspace(0, 7000, 50), 65535),
         (np.linspace(0, 0.0115, 50), 0.012),
         (np.zeros(5), None),
     ],
