@@ -110,7 +110,7 @@ def _files(
         scans = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
         own = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
         doubt = other_sensor(scans, source or own)
-        if source and doubt and not stored:
+        if source and doubt and not (stored or doubt.finer):
             fits = f"; they fit --from {doubt.name}" if doubt.name else ""
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         if not source and not doubt and own.shape[0] < target.shape[0]:

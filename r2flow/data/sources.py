@@ -118,9 +118,9 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path)
 def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:
     """Warn if scan files do not match a sensor (`mismatch_of`), and name the sensor that matches."""
     mismatch, sensor = mismatch_of(paths, reading, root), reading.sensor
-    if mismatch is None:
+    if mismatch is None or mismatch.finer:
         return
-    seen, name, hopeless, _ = mismatch
+    seen, name, hopeless = mismatch[:3]
     if hopeless and reading.within_limits:
         raise InputError(f"{root}: {seen}.")
     edges = sensor.row_edges

@@ -60,13 +60,15 @@ class Estimate(NamedTuple):
 class Doubt(NamedTuple):
     """What was `seen` in scans that do not fit a sensor; hopeless: they have no beams.
 
-    `name` is the nearest built-in sensor within `OFF`; sure: it is within `BEATEN`.
+    `name` is the nearest built-in sensor within `OFF`; sure: it is within `BEATEN`; finer: it is the sensor with rows
+    between its beams (`Sensor.resized`), a sensor of one's own.
     """
 
     seen: str
     name: str | None
     hopeless: bool = False
     sure: bool = False
+    finer: bool = False
 
 
 def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
@@ -91,12 +93,16 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     if beams is None:
         return None if share >= IN_VIEW else Doubt(seen, None)
     name, near = nearest_sensor(beams)
-    distance = 0.0
+    distance, every = 0.0, 1
     if sensor.name in SENSORS or len(beams) <= len(sensor.elevations):
-        tables = [sensor.elevations]  # a built-in sensor at another size is the same sensor
-        tables += [other.elevations for name, other in SENSORS.items() if _family(name) == _family(sensor.name)]
-        distance = min(_distance(beams, np.asarray(table)) for table in tables)
+        # A sensor at another size is the same sensor: `resized` makes one of every few rows a beam.
+        most = 1 if sensor.name in SENSORS else len(sensor.elevations) // len(beams)
+        tables = [(sensor.elevations[n // 2 :: n], n) for n in range(1, most + 1)]
+        tables += [(other.elevations, 1) for name, other in SENSORS.items() if _family(name) == _family(sensor.name)]
+        distance, every = min((_distance(beams, np.asarray(table)), n) for table, n in tables)
     if share >= IN_VIEW and distance < OFF and not (distance > BEATEN and near < distance / 2):
+        if every > 1:
+            return Doubt(f"they have {len(beams)} beams, one of every {every} of its rows", None, finer=True)
         void = _rows_between_beams(elevation, edges) if len(beams) >= len(sensor.elevations) else 0
         seen = f"{void} of its {len(sensor.elevations)} rows lie between their beams and stay empty"
         return Doubt(seen, None) if void > len(sensor.elevations) * MOST_VOID else None
