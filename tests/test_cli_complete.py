@@ -376,6 +376,15 @@ def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
     assert (scan.read().state != Ray.UNKNOWN).any(1).sum() == 16
 
 
+def test_sectors_never_scanned_are_told(complete, tmp_path: Path):
+    xyz = sparse_scan(tmp_path / "whole.ply")
+    front = xyz[np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 3]
+    write_points(tmp_path / "front.ply", front)
+    asked = "--to", "vlp16", "--size", "32x360"
+    assert "invented" not in success(complete(tmp_path / "whole.ply", *asked))
+    assert "front: no ray returned from 240 degrees" in success(complete(tmp_path / "front.ply", *asked))
+
+
 @pytest.mark.parametrize(("rows", "columns", "named"), [(4, 64, True), (8, 32, True), (4, 32, True), (8, 32, False)])
 def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(
     tmp_path: Path, rows: int, columns: int, named: bool

@@ -19,6 +19,7 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.unfolding import elevations_of
 
 BLIND = 5.0  # degrees: a wider sector without any return counts as not measured, as in a cropped scan
+WHOLE = 0.9  # minimum share of the rays of a turn that a file with all lost rays stores
 
 
 @dataclass(frozen=True)
@@ -68,9 +69,10 @@ def points_through(points: Points, source: Sensor, target: Sensor, reflectance: 
     for r, members in zip(row, by_beam, strict=True):
         if r >= 0:
             empty[r, _columns(_without_return(azimuth[members], source.columns), target.columns)] = True
-    many = points.dropped > (len(points.xyz) + points.dropped) / 100  # a few damaged rows are not lost rays
-    keeps_empty = many or bool((beam < 0).any() and (~points.xyz.any(axis=1)).any())
-    if not keeps_empty:
+    stored = len(points.xyz) + points.dropped
+    many = points.dropped > stored / 100  # a few damaged rows are not lost rays
+    lost = many or bool((beam < 0).any() and (~points.xyz.any(axis=1)).any())
+    if not lost or stored < WHOLE * math.prod(source.shape):
         empty[:, _blind(azimuth[beam >= 0], target.columns, 3 * 360 / source.columns)] = False
     chosen = np.flatnonzero((beam >= 0) & (row[beam] >= 0))
     pixel = row[beam[chosen]] * target.columns + _columns(azimuth[chosen], target.columns)

@@ -15,7 +15,7 @@ from r2flow import noise
 from r2flow.data.partial import PartialScan
 from r2flow.errors import InputError, check
 from r2flow.files import atomic_write, save_array
-from r2flow.generators import Sampler
+from r2flow.generators import Sampler, TransferFlow
 from r2flow.generators.base import Precision
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
@@ -97,6 +97,9 @@ def write_completed(
             whole, given = hiding(scan, job, number)
             used += 0 if scan.image else int((given.state == Ray.RETURN).sum())
             kept += 0 if given.points is None else len(given.points.xyz)
+            cut = 360 * (whole.state == Ray.UNKNOWN).mean() * share_in_sectors(whole.state)
+            if cut and isinstance(checkpoint.generator, TransferFlow):
+                print(f"{scan.name}: no ray returned from {cut:.0f} degrees; what the answers hold there is invented")
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (completed,) = complete(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,

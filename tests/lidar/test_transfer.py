@@ -184,4 +184,6 @@ def test_one_damaged_row_does_not_make_a_cut_sector_measured():
     clean = points_through(some, firing, TARGET).state
     damaged = replace(some, dropped=1)
     assert (points_through(damaged, firing, TARGET).state == clean).all()
+    within = replace(some, dropped=len(some.xyz) // 10)  # lost rays of the half turn alone
+    assert (points_through(within, firing, TARGET).state == clean).all()
     assert (clean == Ray.UNKNOWN).sum() > (clean == Ray.EMPTY).sum()
