@@ -43,7 +43,14 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     code, printed, error = r2flow("sensor", scans, "--out", out)
     assert (code, error) == (0, "")
     printed = " ".join(printed.split())
-    for words in ("beams 8:", "128 steps a turn", "reflectance_scale=255", "1.50 m above", "ring after ring"):
+    for words in (
+        "beams 8:",
+        "128 steps a turn",
+        "reflectance_scale=255",
+        "lie 0.00 from",
+        "1.50 m above",
+        "ring after ring",
+    ):
         assert words in printed
     options = yaml.safe_load(out.read_text())
     assert options["name"] == "mine"
@@ -57,6 +64,13 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     assert (np.load(image)[0] > 0).mean() == pytest.approx(0.9, abs=0.03)
     r2flow.said("show", scans / "000000.bin", "--sensor", out, "--size", "4x64", *npy)
     assert np.load(image).shape == (2, 4, 64)
+
+
+def test_points_of_another_frame_are_warned_of(r2flow, tmp_path: Path):
+    xyz, ring = image_to_points(np.full((1, 8, 128), 10, np.float32), MINE)[0], np.arange(8).repeat(128)
+    for mount, warned in ((0, False), (1.5, True)):
+        write_points(tmp_path / "0.ply", xyz + np.float32([mount, 0, mount]), ring=ring)
+        assert ("in the frame of one sensor" in r2flow("sensor", tmp_path / "0.ply")[2]) == warned
 
 
 def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, tmp_path: Path):

@@ -25,6 +25,8 @@ from r2flow.errors import InputError, check
 
 log = logging.getLogger(__name__)
 
+MOST_OFF = 0.4  # degrees between points and their beams; real scans have 0.25 at most
+
 
 @app.command(epilog="Example: r2flow simulate --num 1000 --sensor os1_64 --seed 1 --out scans --labels")
 def simulate(
@@ -124,14 +126,14 @@ def sensor(
     name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
     paths = [folder[index] for folder in map(scans_of, scans) for index in spread(len(folder), most)]
     points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
-    mine, beams, steps = estimate_sensor(points, name)
+    mine, beams, steps, off = estimate_sensor(points, name)
     e, middle = mine.elevations, len(mine.elevations) // 2
     shown = " ... ".join(f"{a:+.2f} {b:+.2f}" for a, b in (e[:2], e[middle - 1 : middle + 1], e[-2:]))
     nearest, distance = nearest_sensor(beams.elevations)
     scale = mine.reflectance_scale
     rows = [
         ("beams", f"{len(e)}: {beams.order}"),
-        ("elevations", f"{shown} degrees"),
+        ("elevations", f"{shown} degrees; points lie {off:.2f} from their beams"),
         ("nearest sensor", f"{nearest}, beams {distance:.2f} degrees apart" if nearest else "no built-in sensor"),
         ("resolution", f"{steps:,.0f} steps a turn; images of {mine.columns} columns"),
         ("range", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle is visible"),
@@ -139,6 +141,10 @@ def sensor(
         ("reflectance", "none: encoding.reflectance=false" if scale is None else f"reflectance_scale={scale:g}"),
     ]
     print_table(rows, ("", ""))
+    if off > MOST_OFF:
+        log.warning(
+            "points %.2f degrees from their beams: are they in the frame of one sensor, not the vehicle's?", off
+        )
     if out is not None:
         write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
         print(out)

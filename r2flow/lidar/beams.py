@@ -55,6 +55,7 @@ class Estimate(NamedTuple):
     sensor: Sensor
     beams: Beams
     steps: float
+    off: float  # median distance of the points from their beams in degrees
 
 
 class Doubt(NamedTuple):
@@ -167,7 +168,9 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         beams.firing,
         full_reflectance(scans),
     )
-    return Estimate(sensor, beams, steps)
+    off = np.concatenate([np.abs(elevations_of(s.xyz) - beams.elevations[row])[row >= 0]
+                          for s, row in zip(scans, beams.of_point, strict=True)])  # fmt: skip
+    return Estimate(sensor, beams, steps, float(np.median(off)))
 
 
 def _height(xyz: np.ndarray) -> float:
