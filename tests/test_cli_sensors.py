@@ -67,10 +67,12 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
 
 
 def test_points_of_another_frame_are_warned_of(r2flow, tmp_path: Path):
-    xyz, ring = image_to_points(np.full((1, 8, 128), 10, np.float32), MINE)[0], np.arange(8).repeat(128)
-    for mount, warned in ((0, False), (1.5, True)):
+    xyz, ring = image_to_points(np.full((1, 8, 128), 2.5, np.float32), MINE)[0], np.arange(8).repeat(128)
+    for mount, warned in ((1.5, True), (0, False)):
         write_points(tmp_path / "0.ply", xyz + np.float32([mount, 0, mount]), ring=ring)
-        assert ("in the frame of one sensor" in r2flow("sensor", tmp_path / "0.ply")[2]) == warned
+        code, said, error = r2flow("sensor", tmp_path / "0.ply")
+        assert (code, "in one sensor's frame" in error) == (0, warned)
+    assert "not found, 1.73 m assumed" in said  # a round room without a floor
 
 
 def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, tmp_path: Path):

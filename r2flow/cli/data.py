@@ -126,7 +126,7 @@ def sensor(
     name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
     paths = [folder[index] for folder in map(scans_of, scans) for index in spread(len(folder), most)]
     points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
-    mine, beams, steps, off = estimate_sensor(points, name)
+    mine, beams, steps, off, ground = estimate_sensor(points, name)
     e, middle = mine.elevations, len(mine.elevations) // 2
     shown = " ... ".join(f"{a:+.2f} {b:+.2f}" for a, b in (e[:2], e[middle - 1 : middle + 1], e[-2:]))
     nearest, distance = nearest_sensor(beams.elevations)
@@ -137,14 +137,12 @@ def sensor(
         ("nearest sensor", f"{nearest}, beams {distance:.2f} degrees apart" if nearest else "no built-in sensor"),
         ("resolution", f"{steps:,.0f} steps a turn; images of {mine.columns} columns"),
         ("range", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle is visible"),
-        ("height", f"{mine.height:.2f} m above the ground"),
+        ("height", f"{mine.height:.2f} m above the ground" if ground else f"not found, {mine.height:g} m assumed"),
         ("reflectance", "none: encoding.reflectance=false" if scale is None else f"reflectance_scale={scale:g}"),
     ]
     print_table(rows, ("", ""))
     if off > MOST_OFF:
-        log.warning(
-            "points %.2f degrees from their beams: are they in the frame of one sensor, not the vehicle's?", off
-        )
+        log.warning("points %.2f degrees off their beams: are they in one sensor's frame, not the vehicle's?", off)
     if out is not None:
         write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
         print(out)

@@ -56,6 +56,7 @@ class Estimate(NamedTuple):
     beams: Beams
     steps: float
     off: float  # median distance of the points from their beams in degrees
+    ground: bool  # whether the height above it was found
 
 
 class Doubt(NamedTuple):
@@ -158,30 +159,31 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         if below >= above:
             elevations[row + 1] = round(above - 1e-3, 3)
     near, far = np.quantile(np.linalg.norm(xyz, axis=1), [1e-4, 1 - 1e-4])
+    ground = _height(xyz)
     sensor = Sensor(
         name,
         tuple(elevations),
         max(int((steps + 0.5) // COLUMNS), 1) * COLUMNS,
         max(math.floor(near * 10) / 10, 0.1),
         float(math.ceil(far)),
-        _height(xyz),
+        ground or Sensor.height,
         beams.firing,
         full_reflectance(scans),
     )
     off = np.concatenate([np.abs(elevations_of(s.xyz) - beams.elevations[row])[row >= 0]
                           for s, row in zip(scans, beams.of_point, strict=True)])  # fmt: skip
-    return Estimate(sensor, beams, steps, float(np.median(off)))
+    return Estimate(sensor, beams, steps, float(np.median(off)), ground is not None)
 
 
-def _height(xyz: np.ndarray) -> float:
-    """Height above the ground: the lowest frequent height of returns 3 to 20 m away, or the default. The most frequent
-    one may be that of hedges and cars."""
+def _height(xyz: np.ndarray) -> float | None:
+    """Height above the ground: the lowest frequent height of returns 3 to 20 m away, or None. The most frequent one
+    may be that of hedges and cars."""
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
     z = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2), 2]
     counts, edges = np.histogram(z, np.arange(-6, -0.1, 0.1))
     smooth = np.convolve(counts, np.ones(3), "same")
     if smooth.max() < FEWEST_RETURNS / 4:
-        return Sensor.height
+        return None
     ground = edges[np.argmax(smooth > 0.7 * smooth.max())] + 0.05
     return round(-float(np.median(z[np.abs(z - ground) < 0.3])), 2)
 
