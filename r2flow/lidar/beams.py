@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from r2flow.errors import InputError
-from r2flow.lidar.scan_files import Points
+from r2flow.errors import InputError, check
+from r2flow.lidar.scan_files import FARTHEST_RAY, Points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of, median_of_seen, rings_from_order, scatter_of
 
@@ -158,7 +158,8 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
     for row, (above, below) in enumerate(pairwise(elevations)):  # equal after rounding
         if below >= above:
             elevations[row + 1] = round(above - 1e-3, 3)
-    near, far = np.quantile(np.linalg.norm(xyz, axis=1), [1e-4, 1 - 1e-4])
+    near, middle, far = np.quantile(np.linalg.norm(xyz, axis=1), [1e-4, 0.5, 1 - 1e-4])
+    check(middle <= FARTHEST_RAY, f"half the returns are {middle:,.0f} or more away: are the points in metres?")
     ground = _height(xyz)
     sensor = Sensor(
         name,

@@ -135,9 +135,11 @@ def test_range_limits_include_all_but_stray_returns():
     assert r.max() <= mine.max_range < r.max() + 1
 
 
-def test_too_few_returns_are_refused():
+def test_what_no_sensor_is_estimated_from_is_refused():
     with pytest.raises(InputError, match="too few"):
         estimate_sensor([Points(np.ones((1, 3), np.float32))])
+    with pytest.raises(InputError, match="are the points in metres"):
+        estimate_sensor([Points(1000 * scan(MINE, FIRINGS).xyz)])
     with pytest.raises(InputError, match="beams cannot be told apart"):
         estimate_sensor([Points(np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32))])
 
