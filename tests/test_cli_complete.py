@@ -376,6 +376,15 @@ def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
     assert (scan.read().state != Ray.UNKNOWN).any(1).sum() == 16
 
 
+def test_points_outside_the_limits_are_counted(complete, tmp_path: Path):
+    xyz = sparse_scan(tmp_path / "whole.ply")
+    xyz[:300] /= 100  # 0.1 m away
+    xyz[300] = 0  # a ray without return
+    write_points(tmp_path / "some.ply", xyz)
+    kept = f"; {len(xyz) - 301:,} are kept, 300 outside 0.5-100 m are left out"
+    assert kept in success(complete(tmp_path / "some.ply", "--to", "vlp16", "--size", "32x360"))
+
+
 def test_sectors_never_scanned_are_told(complete, tmp_path: Path):
     xyz = sparse_scan(tmp_path / "whole.ply")
     front = xyz[np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 3]

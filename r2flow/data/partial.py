@@ -204,7 +204,9 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
         raise nothing_in_view(path, points, target)
     r = np.linalg.norm(points.xyz, axis=1)
     inside = (r >= target.min_range) & (r <= target.max_range)
-    return replace(seen, points=Points(points.xyz[inside], None if strength is None else strength[inside]))
+    outside = int(np.count_nonzero(r) - inside.sum())
+    kept = Points(points.xyz[inside], None if strength is None else strength[inside], dropped=outside)
+    return replace(seen, points=kept)
 
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:

@@ -148,7 +148,10 @@ def _distance(beams: np.ndarray, table: np.ndarray) -> float:
 
 
 def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
-    """Estimate a sensor from scans in its frame; the range limits exclude one return in 10,000, and are rounded."""
+    """Estimate a sensor from scans in its frame; the range limits exclude one return in 10,000, and are rounded.
+
+    The minimum is not above that of the nearest built-in sensor, else 0.5 m: the scans may hold nothing near.
+    """
     xyz = np.concatenate([scan.xyz[scan.xyz.any(axis=1)] for scan in scans])
     if len(xyz) < FEWEST_RETURNS:
         raise InputError(f"{len(xyz)} returns are too few for an estimate: give scans with at least {FEWEST_RETURNS}.")
@@ -160,7 +163,8 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
             elevations[row + 1] = round(above - 1e-3, 3)
     near, middle, far = np.quantile(np.linalg.norm(xyz, axis=1), [1e-4, 0.5, 1 - 1e-4])
     check(middle <= FARTHEST_RAY, f"half the returns are {middle:,.0f} or more away: are the points in metres?")
-    ground = _height(xyz)
+    nearest, ground = nearest_sensor(beams.elevations)[0], _height(xyz)
+    near = min(near, SENSORS[nearest].min_range if nearest else 0.5)
     sensor = Sensor(
         name,
         tuple(elevations),

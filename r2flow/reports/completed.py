@@ -89,14 +89,15 @@ def write_completed(
             raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, np.ndarray | None] = {}
-    used = kept = 0
+    used = kept = outside = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with ScanBar("completing", len(left) * job.num, len(left) * batches, "answers") as bar:
         for number in left:
             scan = scans[number]
             whole, given = hiding(scan, job, number)
             used += 0 if scan.image else int((given.state == Ray.RETURN).sum())
-            kept += 0 if given.points is None else len(given.points.xyz)
+            if given.points is not None:
+                kept, outside = kept + len(given.points.xyz), outside + given.points.dropped
             cut = 360 * (whole.state == Ray.UNKNOWN).mean() * share_in_sectors(whole.state)
             if cut and isinstance(checkpoint.generator, TransferFlow):
                 print(f"{scan.name}: no ray returned from {cut:.0f} degrees; what the answers hold there is invented")
@@ -116,9 +117,11 @@ def write_completed(
                 print(f"{scan.name}: everything is known, so nothing was completed; see --fill-gaps and --mask")
             bar.set(len(done) * job.num)
     if used:
-        size = "x".join(map(str, checkpoint.sensor.shape))
+        sensor = checkpoint.sensor
+        size = "x".join(map(str, sensor.shape))
         print(f"{used:,} measured points are used, the nearest in each pixel of {size}", end="")
-        print(f"; all {kept:,} are kept" if kept else "")
+        lost = f", {outside:,} outside {sensor.min_range:g}-{sensor.max_range:g} m are left out" if outside else ""
+        print(f"; {'' if outside else 'all '}{kept:,} are kept{lost}" if kept else "")
     return done
 
 

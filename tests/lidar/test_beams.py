@@ -131,8 +131,10 @@ def test_range_limits_include_all_but_stray_returns():
     r = np.linalg.norm(points.xyz, axis=1)
     xyz = np.concatenate([points.xyz, [[900, 0, 0]]]).astype(np.float32)  # one bad return of 13,000
     mine = estimate_sensor([Points(xyz)]).sensor
-    assert mine.min_range <= r.min() < mine.min_range + 0.1
+    assert mine.min_range == sensor.min_range < r.min()  # nothing is near in these scans
     assert r.max() <= mine.max_range < r.max() + 1
+    assert estimate_sensor([scan(MINE, RING_AFTER_RING)]).sensor.min_range == 0.5
+    assert estimate_sensor([Points(xyz / 20)]).sensor.min_range == math.floor(r.min() / 2) / 10  # 0.3 m
 
 
 def test_what_no_sensor_is_estimated_from_is_refused():
