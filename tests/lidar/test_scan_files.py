@@ -131,6 +131,14 @@ def test_npy_of_any_float_type_and_order(tmp_path, dtype):
     expect_rows(read_points(tmp_path / "b.npy"), reflectance=None)
 
 
+def test_points_of_pcl_s_memory_are_refused_without_their_columns(tmp_path):
+    memory = np.array([[*row[:3], 1, row[3], 0, 0, 0] for row in ROWS], dtype="<f4")
+    path = saved(tmp_path, "a.bin", memory.tobytes())
+    with pytest.raises(InputError, match="--columns x,y,z,_,intensity,_,_,_"):
+        read_points(path)
+    expect_rows(read_points(path, [*"xyz_", "intensity", *"___"]))
+
+
 # --- rows that are not finite ---
 
 
