@@ -19,6 +19,7 @@ TIGHT = 0.1  # scatter (`scatter_of`) below which each column is one laser
 BANDWIDTHS = np.geomspace(0.015, 2.0, 50)  # degrees
 BIN = 0.005  # degrees
 FAINT = 0.02  # share of the median peak's height below which a peak is not a beam
+SAME = 0.02  # degrees: neighbouring lasers that are nearer are two returns of one
 STABLE = 1.5  # range of bandwidths, as a factor, over which the number of peaks must be constant
 SCATTERED = 0.3  # median gap between elevations over their mean gap, above which a scan has no beams: `_is_scattered`
 CROWDED = 20  # minimum mean number of points per sector for a comparison of gaps
@@ -243,7 +244,9 @@ def _beams(scans: Sequence[Points]) -> Beams:
     if all(scan.ring is not None for scan in scans):
         return _by_laser(elevations, [np.asarray(scan.ring, dtype=np.int64) for scan in scans], RINGS)
     if count := _lasers_of_firings(elevations):
-        return _by_laser(elevations, [np.arange(len(e)) % count for e in elevations], FIRINGS)
+        middle = median_of_seen(np.concatenate([e.reshape(-1, count) for e in elevations]))
+        twice = count % 2 == 0 and np.nanmax(np.abs(middle[::2] - middle[1::2])) < SAME
+        return _by_laser(elevations, [np.arange(len(e)) % count // (1 + twice) for e in elevations], FIRINGS)
     peaks = _by_elevation(elevations)
     if (rings := _rings(scans, elevations)) is not None:
         beams = _by_laser(elevations, rings, RING_AFTER_RING)

@@ -82,6 +82,15 @@ def test_a_sensor_is_found_again(name, how):
     assert found.beams.firing == (sensor.firing if how == FIRINGS else None)
 
 
+def test_two_returns_of_each_ray_are_of_one_beam():
+    points = scan(SENSORS["vlp16"].resized(columns=192), FIRINGS)
+    xyz = np.repeat(points.xyz, 2, axis=0)
+    xyz[1::2] *= 0.9 * (np.random.default_rng(1).random((len(points.xyz), 1)) < 0.3)  # 7 of 10 have one return
+    found = find_beams([Points(xyz)])
+    np.testing.assert_allclose(found.elevations, SENSORS["vlp16"].elevations, atol=1e-3)
+    assert found.firing == SENSORS["vlp16"].firing
+
+
 def test_an_estimated_sensor_projects_its_scans_like_the_true_one():
     sensor = SENSORS["vlp32c"].resized(columns=192)
     points = scan(sensor, FIRINGS)
