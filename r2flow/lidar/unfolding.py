@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.lidar.sensors import Convention, Sensor
 
 SAMPLE = 256  # number of firings from which their order is estimated
@@ -32,6 +32,14 @@ def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring:
             f"is stored neither ring after ring nor in whole firings of {rows}. Use the spherical projection, which "
             "finds rows by elevation."
         )
+    returned = xyz[order >= 0]
+    turn = np.flatnonzero(np.diff(returned[:, 1] < 0))
+    jump = np.abs(elevations_of(returned[turn + 1]) - elevations_of(returned[turn]))
+    ahead, behind = (np.nanmedian(np.append(jump[at], 0)) for at in (returned[turn, 0] > 0, returned[turn, 0] <= 0))
+    check(  # real scans: 1.2 times as far at least
+        ahead >= behind / 3,
+        "elevations jump behind and not ahead: rings must be stored from azimuth 0 on. Use the spherical projection.",
+    )
     return row
 
 

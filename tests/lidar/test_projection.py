@@ -252,6 +252,15 @@ def test_scans_whose_lasers_cannot_be_found_are_refused_in_one_line():
             project(xyz, None, sensor, "unfolding", ring=ring)
 
 
+def test_rings_stored_from_behind_on_are_refused():
+    sensor = SENSORS["vlp16"].resized(columns=48)
+    xyz, _ = image_to_points(np.full((1, 16, 48), 9, np.float32), sensor)
+    assert (project(xyz, None, sensor, "unfolding")[0] > 0).all()
+    from_behind = np.roll(xyz.reshape(16, 48, 3), 24, axis=1).reshape(-1, 3)
+    with pytest.raises(InputError, match="from azimuth 0 on"):
+        project(from_behind, None, sensor, "unfolding")
+
+
 def test_a_real_scan_of_whole_firings(shared):
     # 64 x 2048 in order: the row of a point is its number modulo 64.
     (path,) = (shared / "real" / "other_sensors" / "rellis_os1_64").glob("*.bin")
