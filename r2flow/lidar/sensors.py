@@ -20,7 +20,7 @@ MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, b
 
 @dataclass(frozen=True)
 class Sensor:
-    """A spinning LiDAR as an image of H beams by W azimuth bins."""
+    """A spinning LiDAR as an image of H beams by W azimuth bins. Elevations are in degrees."""
 
     name: str
     elevations: tuple[float, ...]  # of each row in degrees, the top row first, strictly decreasing
