@@ -144,6 +144,11 @@ def test_spread_is_over_the_answers_with_a_return():
     torch.testing.assert_close(share, torch.tensor([[1, 1 / 3, 0]]))
 
 
+def test_a_model_of_another_sensor_is_not_saved_as_that_of_training(tmp_path):
+    with pytest.raises(InputError, match="save the model before `through`"):
+        network().through("vlp16").save(tmp_path / "moved.safetensors")
+
+
 class Noise(Generator):
     """No flow."""
 

@@ -26,6 +26,7 @@ from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.space import build_space
 from r2flow.model.completion import complete
 from r2flow.model.published import FORMATS, inert, plain
 from r2flow.model.sampling import sample
@@ -339,6 +340,8 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
 
     path = Path(path)
     check(path.suffix == ".safetensors", f"{path}: a checkpoint is written as .safetensors.")
+    moved = checkpoint.sensor != build_space(checkpoint.config).sensor
+    check(not moved, f"{path}: a file keeps the sensor of training alone: save the model before `through`.")
     weights = {name: value.detach().cpu().contiguous() for name, value in checkpoint.generator.state_dict().items()}
     if half:
         parameters = checkpoint.generator.named_parameters()
