@@ -145,6 +145,8 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
         InputError: an invalid value, an unknown name or option, a parent that is missing or not finished.
     """
     check_keys(config)
+    if config.get("chain"):
+        raise InputError("this config is a chain of runs: train it by `r2flow train`.")
     with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
         parent, checkpoint = find_parent(config) or (None, None)
         config = _checked(config, asked, parent)
