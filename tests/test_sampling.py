@@ -290,6 +290,7 @@ def test_numeric_times_decide_the_number_of_steps():
         ({"sampler": "sde", "finish": 1.5}, "finish"),
         ({"sampler": "sde", "churn": -1.0}, "churn"),
         ({"sampler": "jump"}, "map"),
+        ({"precision": "16-mixed"}, "32-true or bf16-mixed, found '16-mixed'"),
         ({"condition": {"known": torch.ones(3, 1, 8, 32)}}, "condition"),
     ],
 )

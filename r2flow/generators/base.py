@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.solvers.solution import wide
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
@@ -32,6 +32,7 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
 
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[Any]:
     """Context in which networks run with `precision`."""
+    check(precision in get_args(Precision), f"a network's precision is 32-true or bf16-mixed, found {precision!r}.")
     return nullcontext() if precision == "32-true" else torch.autocast(device.type, torch.bfloat16)
 
 
