@@ -2,6 +2,7 @@
 
 import math
 import weakref
+from functools import partial
 from itertools import product
 
 import pytest
@@ -160,6 +161,11 @@ def test_the_type_of_the_weights_sets_the_precision(method, caplog):
     torch.testing.assert_close(floored.x, math.exp(0.5) * X_0, rtol=2e-2, atol=2e-2)
 
 
+def test_many_short_steps_have_a_gradient():
+    w = torch.tensor(1500.0, requires_grad=True)
+    assert solve(lambda t, x: -w * x, X_0, method="dopri5").x.requires_grad
+
+
 @pytest.mark.parametrize("method", [method for method in METHODS if method != "exprb43"])  # it gives no gradient
 def test_a_network_that_is_being_trained_can_be_solved(method):
     # x' = W x: the end is exp(W) x_0, its sum's gradient is not zero
@@ -169,6 +175,17 @@ def test_a_network_that_is_being_trained_can_be_solved(method):
     torch.testing.assert_close(solution.x.detach(), exact, rtol=0, atol=2e-2 if method == "euler" else 1e-3)
     solution.x.sum().backward()
     assert network.weight.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("method", ["exprb43", "auto"])
+def test_exponential_steps_refuse_to_lose_a_gradient(method):
+    stiff = StiffLinear(1e6)
+    for weight, x in ((torch.ones(1, requires_grad=True), X_0), (torch.ones(1), X_0.clone().requires_grad_())):
+        velocity = partial(lambda weight, t, x: weight * stiff(t, x), weight)
+        with pytest.raises(InputError, match=r"no gradient: solve with dopri5 or under torch.no_grad\(\)"):
+            solve(velocity, x, method=method)
+        with torch.no_grad():
+            assert solve(velocity, x, method=method).converged.all()
 
 
 @pytest.mark.parametrize("method", ["dopri5", "torchdiffeq:dopri5"])

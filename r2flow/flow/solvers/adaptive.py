@@ -85,9 +85,10 @@ def _step(
     short = (good & (control.h < SHORT * control.length)).nonzero()[0]
     control.judge(good, size, dk, dy, v.counts[control.scenes])
     if len(short):
-        displacement, length = rows(k[-1] * expand_time(h, x), short), 1 + rows(y, short).abs()
+        first, last, end = (rows(part.detach(), short) for part in (k[0], k[-1], y))
+        displacement, length = last * expand_time(rows(h, short), last), 1 + end.abs()
         share = displacement.flatten(1).norm(dim=1) / length.flatten(1).norm(dim=1)
-        back = (rows(k[0], short) * displacement * expand_time(rows(h, short), displacement)).flatten(1).sum(1) < 0
+        back = (first * displacement * expand_time(rows(h, short), displacement)).flatten(1).sum(1) < 0
         control.note_pole(short, rows(h, short).abs().cpu().numpy(), share.cpu().numpy(), back.cpu().numpy())
     if good.all():
         x, k_1 = y, k[-1]

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.errors import check
 from r2flow.flow.solvers.adaptive import advance, attainable
 from r2flow.flow.solvers.batched import norms, powered, unpowered
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
@@ -52,7 +53,7 @@ class ExponentialMethod:
         stiff = first.stiff.numpy() | (self.start is None)
         for place in (stiff & ~converged).nonzero()[0]:
             v.only(np.array([place]))
-            scene = _Scene(v, first.x[place].detach(), float(reached[place]), t_0, t_1, limits)
+            scene = _Scene(v, first.x[place], float(reached[place]), t_0, t_1, limits)
             converged[place] = scene.solve()
             ends[place] = scene.u.view(x.shape[1:])
             accepted[place] += scene.accepted
@@ -80,43 +81,45 @@ class _Scene:
             torch.autocast(kind, lower, enabled=on) for on in (torch.is_autocast_enabled(kind), False)
         )
 
-    @torch.no_grad()
     def solve(self) -> bool:
         """Solve to t_end; whether it was reached."""
         with self._of_steps:  # full precision for the solver, independent of the network's
-            return self._solve()
-
-    def _solve(self) -> bool:
-        try:
-            f = self.velocity(self.t, self.u)
-            self.tolerance = attainable(self.limits, self.v.precision)
-            self.roundoff = torch.finfo(self.v.precision).eps
-            # Differences of a noisy velocity (dropout, sampling inside the network) do not approximate J.
-            if _rms(self.velocity(self.t, self.u) - f) > math.sqrt(self.roundoff) * _rms(f):
+            try:
+                f = self.velocity(self.t, self.u)
+                lost = torch.is_grad_enabled() and (f.requires_grad or self.u.requires_grad)
+                check(not lost, "exponential steps have no gradient: solve with dopri5 or under torch.no_grad().")
+                return self._solve(f)
+            except Spent:
                 return False
-            h = self._first_step(f)
-            while self.t != self.t_end and f.isfinite().all():
-                krylov = _Krylov(partial(self.product, f), torch.cat([f, f.new_ones(1)]))
-                left = abs(self.t_end - self.t)
-                while True:
-                    h = min(h, self.limits.max_step * self.length)
-                    h = left if 1.01 * h >= left else left / 2 if 2 * h > left else h
-                    if h < self._shortest():
-                        return False
-                    error, h, end = self._try(f, krylov, h)
-                    factor = min(max(SAFETY * max(error, 1e-10) ** -0.25, SHRINK), GROW) if error < math.inf else SHRINK
-                    if error <= 1:
-                        break
-                    self.rejected += 1
-                    h *= min(factor, 0.8)
-                t = self.t_end if h == left else self.t + self.direction * h
-                following = self.velocity(t, end)
-                if not following.isfinite().all():
-                    return False
-                self.accepted += 1
-                self.u, self.t, f, h = end, t, following, h * factor
-        except Spent:
+
+    @torch.no_grad()
+    def _solve(self, f: Tensor) -> bool:
+        self.tolerance = attainable(self.limits, self.v.precision)
+        self.roundoff = torch.finfo(self.v.precision).eps
+        # Differences of a noisy velocity (dropout, sampling inside the network) do not approximate J.
+        if _rms(self.velocity(self.t, self.u) - f) > math.sqrt(self.roundoff) * _rms(f):
             return False
+        h = self._first_step(f)
+        while self.t != self.t_end and f.isfinite().all():
+            krylov = _Krylov(partial(self.product, f), torch.cat([f, f.new_ones(1)]))
+            left = abs(self.t_end - self.t)
+            while True:
+                h = min(h, self.limits.max_step * self.length)
+                h = left if 1.01 * h >= left else left / 2 if 2 * h > left else h
+                if h < self._shortest():
+                    return False
+                error, h, end = self._try(f, krylov, h)
+                factor = min(max(SAFETY * max(error, 1e-10) ** -0.25, SHRINK), GROW) if error < math.inf else SHRINK
+                if error <= 1:
+                    break
+                self.rejected += 1
+                h *= min(factor, 0.8)
+            t = self.t_end if h == left else self.t + self.direction * h
+            following = self.velocity(t, end)
+            if not following.isfinite().all():
+                return False
+            self.accepted += 1
+            self.u, self.t, f, h = end, t, following, h * factor
         return self.t == self.t_end
 
     def velocity(self, t: float, u: Tensor) -> Tensor:
