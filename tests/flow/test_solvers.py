@@ -114,13 +114,14 @@ def test_the_global_error_is_estimated_and_its_cost_counted(method):
 
 
 def test_an_unknown_or_wrong_grid_is_refused():
+    assert torch.equal(solve(logistic, X_0, grid=[0, 0.5, 1]).x, solve(logistic, X_0, steps=2).x)
     for grid in ("power", "power:0.5", "power:nan", "power:11", "power-start:", "start-power:2"):
         with pytest.raises(InputError, match=f"P from 1 to 10; found '{grid}'"):
             solve(logistic, X_0, grid=grid)
     for times in ([0.0, 0.6, 0.5, 1.0], [0.0, 0.5, 0.9]):
         with pytest.raises(InputError, match="time grid"):
             solve(logistic, X_0, grid=torch.tensor(times))
-    with pytest.raises(AssertionError, match="power grid"):
+    with pytest.raises(InputError, match="power grid"):
         solve(logistic, X_0, 0.0, 1.5, grid="power:2")
 
 
@@ -180,6 +181,9 @@ def test_knots_are_states_of_the_path(method):
     whole = solve(lambda t, x: x, x_0, method=method, steps=64, grid=grid)
     assert torch.equal(found.x, whole.x)
     assert torch.equal(found.evaluations, whole.evaluations)
+    for wrong in ({"knots": 4}, {"knots": 64}, {"knots": -1}, {"knots": 1, "method": "dopri5"}):
+        with pytest.raises(InputError, match="knots need a fixed-step method"):
+            solve(logistic, x_0, steps=64, **wrong)
 
 
 def test_knots_that_a_sampler_does_not_have_are_refused():

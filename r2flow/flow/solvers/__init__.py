@@ -1,7 +1,7 @@
 """ODE solvers for dx/dt = v(t, x)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,7 +55,7 @@ def solve(
     tolerance: float = 1e-5,
     progress: Callable[[], None] | None = None,
     *,
-    grid: str | Tensor = "uniform",
+    grid: str | Sequence[float] | Tensor = "uniform",
     max_evaluations: int = 20_000,
     max_step: float = 1.0,
     global_error: bool = False,
@@ -99,7 +99,8 @@ def solve(
     if t_0 == t_1 or not len(x):
         return _at_rest(x, global_error, knots)
     times = torch.tensor([t_0, t_1], dtype=torch.float64) if solver.adapts else build_grid(grid, t_0, t_1, steps)
-    assert not knots or isinstance(solver, FixedStep)
+    even = isinstance(solver, FixedStep) and knots > 0 and (len(times) - 1) % (knots + 1) == 0
+    check(even or knots == 0, f"{knots} knots need a fixed-step method of r2flow and a multiple of {knots + 1} steps.")
     limits = Limits(tolerance, max_evaluations, max_step=max_step, knots=knots)
     solution = solver.solve(Evaluations(velocity, len(x), progress), x, times, limits)
     if not (global_error and solver.adapts):

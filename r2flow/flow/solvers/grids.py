@@ -1,12 +1,12 @@
 """Time grids of fixed steps."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 
 def uniform(t_0: float, t_1: float, steps: int) -> Tensor:
@@ -21,7 +21,7 @@ def power(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
 
 def power_start(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
     """t = u^p at equal steps of u: for p > 1 denser towards t = 0."""
-    assert min(t_0, t_1) >= 0, "a power grid ends at the time towards which it gets denser"
+    check(min(t_0, t_1) >= 0, "a power grid ends at the time towards which it gets denser: give grid=uniform.")
     return uniform(t_0 ** (1 / p), t_1 ** (1 / p), steps) ** p
 
 
@@ -45,12 +45,12 @@ def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
     return lambda t_0, t_1, steps: NAMED[kind](t_0, t_1, steps, p)
 
 
-def build_grid(grid: str | Tensor, t_0: float, t_1: float, steps: int) -> Tensor:
-    """Times from t_0 to t_1, (N + 1,) float64 on the CPU; N = steps unless `grid` is a tensor of times."""
+def build_grid(grid: str | Sequence[float] | Tensor, t_0: float, t_1: float, steps: int) -> Tensor:
+    """Times from t_0 to t_1, (N + 1,) float64 on the CPU; N = steps unless `grid` has the times."""
     if isinstance(grid, str):
         times = named_grid(grid)(t_0, t_1, steps)
     else:
-        times = grid.detach().to("cpu", torch.float64, copy=True)
+        times = torch.as_tensor(grid, dtype=torch.float64, device="cpu").detach().clone()
     one_way = times.ndim == 1 and len(times) > 1 and bool((times.diff() * (t_1 - t_0) > 0).all())
     if not one_way or max(abs(times[0] - t_0), abs(times[-1] - t_1)) > 1e-6:
         given = grid if not isinstance(grid, str) else f"{steps} steps on {grid}, too short for float64"
