@@ -20,6 +20,7 @@ from r2flow.lidar.region import region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.completion import completing
 from r2flow.model.sampling import draw, evaluated_region, sample
 from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
@@ -307,6 +308,12 @@ def test_the_network_is_computed_in_the_precision_that_is_asked_for():
     assert seen == [torch.float32] * 3 + [torch.bfloat16] * 3
     assert 0 < (exact - coarse).norm() < 2**-4 * exact.norm()  # bfloat16 has 8 bits, of which some products take a few
     assert sampled_set(one, "", 2).about != sampled_set(network(), "", 2).about
+
+
+def test_a_samplers_name_may_have_fields_as_on_the_command_line():
+    short = build_sampler("adams3", steps=2, finish=0.02)
+    assert flow().generator.choose("adams3:steps=9:finish=0.02", steps=2) == short
+    assert completing(flow().generator, "repaint:steps=2") == completing(flow().generator, "repaint", steps=2)
 
 
 def test_settings_may_be_numpy_s_and_torch_s():

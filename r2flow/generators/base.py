@@ -13,7 +13,7 @@ from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import options_of
-from r2flow.samplers import SAMPLERS, FixedSteps, build_sampler
+from r2flow.samplers import SAMPLERS, FixedSteps, build_sampler, parse_sampler
 from r2flow.samplers.base import Condition, Generated, Progress, Sampler
 
 Precision = Literal["32-true", "bf16-mixed"]  # names of Lightning's Trainer
@@ -113,9 +113,10 @@ class Generator(nn.Module):
     def choose(self, name: str | None = None, **options: Any) -> Sampler:
         """A sampler by name, with `options` that are not None; without a name, `sampler`, or `few` for fewer steps.
 
-        Another sampler keeps the number of steps and has its own defaults otherwise.
+        A name may have fields (`parse_sampler`). Another sampler keeps the number of steps, with defaults otherwise.
         """
-        given = {key: value for key, value in options.items() if value is not None}
+        given = (parse_sampler(str(name)) if name else {}) | {k: v for k, v in options.items() if v is not None}
+        name = given.pop("name", None)
         default, steps = self.sampler, getattr(self.sampler, "steps", None)
         if self.few and (name == self.few.name if name else steps and given.get("steps", steps) < steps):
             default, steps = self.few, None

@@ -17,7 +17,7 @@ from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, Samples, draw
-from r2flow.samplers import Transport, build_sampler
+from r2flow.samplers import Transport, build_sampler, parse_sampler
 
 ANSWER = 2**32  # offset of the noise number between answers: answer 0 to scan i has the noise of sample i
 
@@ -52,6 +52,8 @@ def completing(generator: Generator, name: str | None = None, *, several: bool =
         if several and name is None and not changes and hasattr(generator, Transport.needs):
             name = "transport"
         return generator.choose(name, **changes)
+    changes = (parse_sampler(name) if name else {}) | changes
+    name = changes.pop("name", None)
     completers = {completer.name: completer for completer in getattr(generator, "completers", ())}
     completer = completers.get(name or next(iter(completers)))
     how = build_sampler({"name": name, **changes}) if completer is None else completer.changed(**changes)
