@@ -12,7 +12,7 @@ import torch
 from r2flow import __version__
 from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
-from r2flow.generators import build_generator
+from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.export import NOTES, compare, export, tableau
 from r2flow.noise import Draws
@@ -82,6 +82,26 @@ def test_a_sampler_that_is_no_fixed_number_of_steps_of_the_ode_is_refused(sample
     with pytest.raises(InputError, match="cannot be exported"):
         export(flow("efficient_unet"), tmp_path / "flow.pt2", build_sampler(sampler))
     assert not [*tmp_path.iterdir()]
+
+
+class Clipped(RectifiedFlow):
+    def velocity(self, t, x, condition=None):
+        return super().velocity(t, x).clamp(-20, 20)
+
+
+@pytest.mark.parametrize(("network", "words"), [(True, "Clipped is more than its network"), (False, "is not linear")])
+def test_a_velocity_of_ones_own_is_not_exported_as_the_network(network, words, tmp_path):
+    checkpoint = flow("efficient_unet")
+    checkpoint.generator.__class__ = Clipped
+    with pytest.raises(InputError, match=words):
+        export(checkpoint, tmp_path / "flow.pt2", SHORT, network)
+
+
+def test_an_export_leaves_the_model_as_it_was_and_takes_a_samplers_name(tmp_path):
+    checkpoint = flow("efficient_unet")
+    checkpoint.generator.train()
+    assert export(checkpoint, tmp_path / "flow.pt2", "euler:steps=1").notes["evaluations"] == 1
+    assert checkpoint.generator.backbone.training
 
 
 def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from copy import copy
+from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,18 +40,17 @@ class Tableau(NamedTuple):
 
 
 class _Recorder(nn.Module):
-    """Replaces a network: records the inputs of each call and returns the j-th unit vector for the j-th call."""
+    """Replaces a network: records the inputs of each call and returns the j-th vector for the j-th call."""
 
-    def __init__(self) -> None:
+    def __init__(self, vectors: Tensor) -> None:
         super().__init__()
+        self.vectors = vectors
         self.precision = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=False)
-        self.calls: list[tuple[Tensor, Tensor, Tensor]] = []
+        self.calls: list[tuple[Tensor, ...]] = []
 
     def forward(self, t: Tensor | float, x: Tensor, s: Tensor | float | None = None) -> Tensor:
         self.calls.append((torch.as_tensor(t), x, torch.as_tensor(t if s is None else s)))
-        v = torch.zeros_like(x)
-        v[len(self.calls) :][:1] = 1
-        return v
+        return self.vectors[len(self.calls)].view_as(x)
 
 
 def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
@@ -64,14 +63,22 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
             f"sampler {sampler.name} needs {what} and cannot be exported: give --sampler {USUAL.name} --steps "
             f"{USUAL.steps}."
         )
-    recorder, shadow = _Recorder(), copy(flow)
+    units = torch.eye(count + 1, dtype=torch.float64)  # x_0 is the first unit vector
+    rows, calls = _recorded(flow, sampler, units)
+    others = 7 - 1000 * units
+    linear = torch.allclose(_recorded(flow, sampler, others)[0], rows @ others)
+    check(linear, f"{sampler.name} is not linear in the noise and the network's outputs here: it cannot be exported.")
+    times, _, second = zip(*calls, strict=True)
+    rows = rows[:, : len(times) + 1]  # with `finish`, fewer than count
+    return Tableau([float(t) for t in times], [float(s) for s in second] if flow.second_time else None, rows)
+
+
+def _recorded(flow: RectifiedFlow, sampler: Sampler, vectors: Tensor) -> tuple[Tensor, list[tuple[Tensor, ...]]]:
+    """States of a sampler and x_1, (E + 1, N), from x_0 and network outputs that are the vectors, (E + 1, N)."""
+    recorder, shadow = _Recorder(vectors), copy(flow)
     shadow._modules = {**flow._modules, "backbone": recorder}
-    basis = torch.eye(count + 1, dtype=torch.float64)[:, :1, None, None]  # x_0 is the first unit vector
-    x_1 = shadow(basis, sampler=sampler).x
-    times, states, second = zip(*recorder.calls, strict=True)
-    rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # with `finish`, fewer than count
-    others = [float(s) for s in second] if flow.second_time else None
-    return Tableau([float(t) for t in times], others, rows)
+    x_1 = shadow(vectors[0].view(-1, 1, 1, 1), sampler=sampler).x
+    return torch.stack([*(x for _, x, _ in recorder.calls), x_1]).flatten(1), recorder.calls
 
 
 class Decoded(nn.Module):
@@ -120,7 +127,9 @@ class Exported(NamedTuple):
     notes: dict[str, Any]  # metadata
 
 
-def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = None, network: bool = False) -> Exported:
+def export(
+    checkpoint: Checkpoint, path: str | Path, sampler: Sampler | str | None = None, network: bool = False
+) -> Exported:
     """Write a flow as a `.pt2` (torch.export) or an `.onnx`.
 
     The input is `noise` (B, C, H, W). The outputs are `scan`, range in metres and reflectance, (B, 2 or 1, H, W), 0
@@ -129,18 +138,20 @@ def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = N
 
     Args:
         path: Output file; its suffix sets the format.
-        sampler: Sampler; None: the flow's default.
+        sampler: Sampler or its name; None: the flow's default.
         network: Export v(t, x) alone: `t` (B,) and `x` (B, C, H, W) to `v`; for a flow map also `s` (B,).
 
     Raises:
         InputError: an unknown suffix, a generator that is not a flow, a sampler that cannot be exported, a missing
             package, or a network that torch cannot export.
     """
-    path, flow = Path(path), checkpoint.generator
+    path, flow = Path(path), deepcopy(checkpoint.generator)  # tracing moves it to the CPU and sets its mode
     if not isinstance(flow, RectifiedFlow):
         raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
     write = FORMATS[path.suffix.removeprefix(".")]
-    how = sampler or flow.sampler
+    how = sampler if isinstance(sampler, Sampler) else flow.choose(sampler)
+    own = type(flow).velocity is not RectifiedFlow.velocity
+    check(not (network and own), f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler.")
     steps = None if network else tableau(flow, how)
     notes = _notes(checkpoint, how, steps)
     with _quiet():
