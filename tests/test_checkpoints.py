@@ -203,6 +203,11 @@ def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
     mine = Checkpoint(build_generator(config).eval(), config)
     mine.save(tmp_path / "mine.safetensors")
     loaded = load_checkpoint(tmp_path / "mine.safetensors")
+    names = mine.generator.state_dict().keys()
     torch.testing.assert_close(loaded.generator.state_dict(), mine.generator.state_dict(), rtol=0, atol=0)
     assert loaded.config == config
+    mine.generator.backbone = torch.compile(mine.generator.backbone)
+    for half in (False, True):
+        save_checkpoint(mine, tmp_path / "compiled.safetensors", half)
+        assert load_checkpoint(tmp_path / "compiled.safetensors").generator.state_dict().keys() == names
     assert repr(loaded) == "Checkpoint(mine, rectified_flow, 8x64 hdl64e, step 0)"

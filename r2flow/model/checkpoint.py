@@ -38,6 +38,7 @@ from r2flow.samplers import build_sampler
 FOLDER = "checkpoints"
 PREFIX = "generator."  # of the generator's weights in a LightningModule
 BACKBONE = "backbone."  # of a flow's network in the generator
+COMPILED = "_orig_mod."  # in the names of the weights after torch.compile
 NOTES = "r2flow"  # key of the JSON metadata in a .safetensors
 SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors
 
@@ -342,10 +343,11 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     check(path.suffix == ".safetensors", f"{path}: a checkpoint is written as .safetensors.")
     moved = checkpoint.sensor != build_space(checkpoint.config).sensor
     check(not moved, f"{path}: a file keeps the sensor of training alone: save the model before `through`.")
-    weights = {name: value.detach().cpu().contiguous() for name, value in checkpoint.generator.state_dict().items()}
+    state, parameters = checkpoint.generator.state_dict(), checkpoint.generator.named_parameters()
+    weights = {n.replace(COMPILED, ""): value.detach().cpu().contiguous() for n, value in state.items()}
     if half:
-        parameters = checkpoint.generator.named_parameters()
-        weights |= {n: weights[n].half() for n, value in parameters if value.ndim > 1 and value.numel() > SMALL}
+        large = [n.replace(COMPILED, "") for n, value in parameters if value.ndim > 1 and value.numel() > SMALL]
+        weights |= {n: weights[n].half() for n in large}
     notes = {"config": learned(checkpoint.config), "step": checkpoint.step, **checkpoint.generator.drawing()}
     # Under one key, since the order of several metadata keys is not fixed.
     write_file(path, save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})}))
