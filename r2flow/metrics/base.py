@@ -141,8 +141,9 @@ class ScanMetric(Metric):
             scans = Scans(scans.to(self.device), self.sensor, names=range(first, first + len(scans)))
         if not isinstance(scans, Scans):
             raise InputError(
-                f"'{self.name}' takes metrics.scans.Scans(images, sensor), or images once it has their sensor: "
-                f"METRICS['{self.name}'](sensor=SENSORS['hdl64e']); found {type(scans).__name__} without a sensor."
+                f"'{self.name}' takes metrics.scans.Scans(images, sensor), or a tensor of images once it has their "
+                f"sensor: METRICS['{self.name}'](sensor=SENSORS['hdl64e']); found {type(scans).__name__}"
+                f"{'' if self.sensor else ' without a sensor'}."
             )
         if self.needs_reflectance and not scans.has_reflectance:
             raise InputError(f"'{self.name}' needs reflectance, which these scans do not have; leave it out.")

@@ -233,6 +233,11 @@ def test_moving_and_setting_a_dtype_change_no_figure(build, sets):
     assert told(metric, sets).compute() == expected
 
 
+def test_images_of_numpy_are_refused_as_such():
+    with pytest.raises(InputError, match=r"a tensor of images once it has their sensor: .*; found ndarray\.$"):
+        METRICS["jsd"](sensor=SMALL).update(images().numpy(), real=True)
+
+
 def images(n=3):
     r = torch.linspace(2, 60, n * 8 * 32).view(n, 1, 8, 32)
     return torch.cat([r, torch.full_like(r, 0.5)], 1)
