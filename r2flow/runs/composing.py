@@ -19,6 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import OverrideType, Sweep
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from r2flow.config import flatten, key_of, override
 from r2flow.errors import InputError
@@ -43,16 +44,19 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
         folders: Additional config folders, as in `--config-dir`.
 
     Raises:
-        HydraException: an unknown key or choice; `explain` shortens it to one line.
+        InputError: an unknown key or choice.
     """
     overrides = as_hydra_takes(overrides)
     search = (
         [f"hydra.searchpath=[{','.join(f'file://{Path(folder).resolve()}' for folder in folders)}]"] if folders else []
     )
-    with _hydra():
-        config = with_choices(partial(hydra.compose, "train", [*overrides, *search], return_hydra_config=True))
-        HydraConfig.instance().set_config(config)
-        return plain(config)
+    try:
+        with _hydra():
+            config = with_choices(partial(hydra.compose, "train", [*overrides, *search], return_hydra_config=True))
+            HydraConfig.instance().set_config(config)
+            return plain(config)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(explain(error)) from None
 
 
 def names_folder(text: str) -> bool:

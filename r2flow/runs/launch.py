@@ -284,8 +284,8 @@ def _check_links(links: Sequence[Any]) -> None:
     for link in links:
         try:
             configs[link.name] = compose(link.overrides, folders)
-        except (HydraException, OmegaConfBaseException) as error:
-            raise InputError(f"chain.{link.name}: {explain(error)}") from None
+        except InputError as error:
+            raise InputError(f"chain.{link.name}: {error}") from None
     from r2flow.model.checkpoint import FOLDER
     from r2flow.runs.lineage import Parent
     from r2flow.training import check

@@ -96,6 +96,11 @@ def test_a_wrong_value_is_refused(tmp_path: Path, arguments: str, words: str):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_python_explains_a_wrong_key_as_the_command_line():
+    with pytest.raises(InputError, match=r"no key 'trainer.max_step'. Did you mean 'trainer.max_steps'\?"):
+        compose(["trainer.max_step=3"])
+
+
 def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
     asked = ["data.scenes=2", "backbone=hdit_tiny", f"run_dir={tmp_path}"]
     assert build(compose(asked), asked).config["encoding"]["levels"] == 100
