@@ -34,6 +34,7 @@ REGISTRIES = {
     "stage": ("r2flow.stages", "STAGES", ("batch_size", "seed")),
     "backbone": ("r2flow.backbones", "BACKBONES", ("in_channels", "out_channels", "second_time")),
     "data": ("r2flow.data.opening", "SOURCES", ()),
+    "sensor": ("r2flow.lidar.sensors", "SENSORS", ()),
 }
 
 
@@ -125,6 +126,8 @@ def add_choices(group: str) -> None:
             continue
         if group == "data":
             node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
+        elif group == "sensor":
+            node = {**options_of(import_module(module).build_sensor), "name": name, "rays": "centre"}
         else:
             node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
             if group == "stage":
