@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from r2flow import simulator
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.mixture import MixedOrder, Mixture
@@ -60,6 +59,7 @@ class ScanDataModule(L.LightningDataModule):
         self.validation = self.options.validation_options
         self.further: Further | None = None
         self.names: list[str] = []
+        self.opened: list[ScanSource] = []  # as found, before they are read
         self.training_source: ScanSource | PairSource | None = None
         self.validation_source: ScanSource | PairSource | None = None
         self.pairs = self._pair_options() if self.options.name == PAIRS else None
@@ -85,10 +85,10 @@ class ScanDataModule(L.LightningDataModule):
             _ = self.pair_store  # refuses other pairs in the folder early; missing pairs are made later
             if self.options.next_to_pairs is not None:
                 source = self._open(self.options.next_to_pairs)
-                self.names = list(source.names)
+                self.names, self.opened = list(source.names), [source]
                 self.scans = self._kept(source, "scans next to the pairs", [self.sensor])
             return
-        training, held = self.sources()
+        training, held = self.opened = [*self.sources()]
         self._order(training)  # refuses wrong weights before anything is read or written
         self.training_source = self._kept(training, "training scans", self.sensors)
         self.validation_source = self._kept(held, "validation scans", self.held_out_sensors)
@@ -138,20 +138,17 @@ class ScanDataModule(L.LightningDataModule):
         return Permutations(len(source), self.seed)
 
     def fingerprint(self) -> str:
-        """Identity of the training data, independent of its path: a run resumes only with the same scans and order."""
+        """Identity of the data, independent of its path: a run resumes only with the same scans and order."""
         if self.pairs is not None:
             pairs = f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"
-            other = self.options.next_to_pairs
-            return f"{pairs}; {self._named(self.scans, [other])}" if self.scans is not None and other else pairs
-        assert isinstance(self.training_source, ScanSource)
-        return self._named(self.training_source, self.parts)
+            return f"{pairs}; {self._named()}" if self.scans is not None else pairs
+        return self._named()
 
-    def _named(self, taken: ScanSource, parts: Sequence[SourceOptions]) -> str:
-        """The number of the run's scans that are taken, and a hash of all names."""
-        # Revisions of the simulator draw different scans of the same name.
-        revision = [f"simulator {simulator.REVISION}"] if any(p.name == SIMULATED for p in parts) else []
-        names = hashlib.sha256(os.fsencode("\n".join([*self.names, *revision]))).hexdigest()[:12]
-        return f"{len(taken)} of {len(self.names)} scans, {names}"
+    def _named(self) -> str:
+        """The number of the run's scans that are trained on, and a hash of all names and contents."""
+        known = [*self.names, *(source.contents for source in self.opened)]
+        digest = hashlib.sha256(os.fsencode("\n".join(known))).hexdigest()[:12]
+        return f"{len(self.opened[0])} of {len(self.names)} scans, {digest}"
 
     @property
     def held_out_sensors(self) -> list[Sensor]:

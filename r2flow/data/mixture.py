@@ -20,6 +20,10 @@ class Mixture(ScanSource):
     def names(self) -> list[str]:
         return [name for part in self.parts for name in part.names]
 
+    @property
+    def contents(self) -> str:  # type: ignore[override]
+        return "\n".join(part.contents for part in self.parts)
+
     def __len__(self) -> int:
         return int(self.starts[-1])
 

@@ -43,12 +43,14 @@ class ScanSource(ABC):
         measured: Whether the measured points of the pixels are available; they are not for range images, prepared
             shards, samples and simulated scans.
         drives: Numbers of the scans of each recording, by its name, if known.
+        contents: What is cheaply known of the scans beside their names, equal for a copy of the data set.
     """
 
     slow = False
     drawn = False
     measured = False
     drives: Mapping[str, Sequence[int]] = {}
+    contents = ""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -177,14 +179,25 @@ class ScanFiles(ScanSource):
 
     @cached_property
     def _digest(self) -> str:
-        files = [(name, os.stat(path)) for name, path in zip(self.names, self.paths, strict=True)]
-        stats = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in files]
+        return self._hashed(times=True)
+
+    @property
+    def contents(self) -> str:  # type: ignore[override]
+        return self._hashed(times=False)
+
+    def _hashed(self, times: bool) -> str:
+        """Hash of all names and sizes, with `times` also of the times of change, and of the contents of some files."""
+        stats, hashes = [], []
+        for name, path in zip(self.names, self.paths, strict=True):
+            with suppress(OSError):  # reported when the scan is read
+                stat = os.stat(path)
+                stats.append((name, stat.st_size, *[stat.st_mtime_ns] * times))
         # Hash some contents, too: unpacked archives can have equal names, sizes and times.
-        hashes = []
         for i in spread(len(self.paths), 8):
-            if os.path.isfile(self.paths[i]):  # a pipe would block, a device never end
-                with open(self.paths[i], "rb") as file:
-                    hashes.append(hashlib.file_digest(file, "sha256").hexdigest())
+            with suppress(OSError):
+                if os.path.isfile(self.paths[i]):  # a pipe would block, a device never end
+                    with open(self.paths[i], "rb") as file:
+                        hashes.append(hashlib.file_digest(file, "sha256").hexdigest())
         return hashlib.sha256(json.dumps([stats, hashes]).encode()).hexdigest()
 
     def places(self) -> set[str]:
@@ -252,6 +265,12 @@ class SimulatedScans(MadeScans):
 
         numbers = hashlib.sha256(np.asarray(self.numbers, dtype=np.int64).tobytes()).hexdigest()[:16]
         return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": self.sensor.described()}
+
+    @property
+    def contents(self) -> str:  # type: ignore[override]
+        from r2flow import simulator
+
+        return f"simulator {simulator.REVISION}"  # its revisions draw different scans of the same name
 
     def __getitem__(self, index: int) -> np.ndarray:
         from r2flow.simulator import simulate
