@@ -30,6 +30,9 @@ MEASURED = {
     "straightness": "bend",
 }  # fmt: skip
 
+# Keys that are equal for all seeds, though a run may resume with another value.
+TELLING = {"trainer.precision", "data.root", "parent.step"}
+
 
 class ComparedRun(NamedTuple):
     """A run, read from its folder.
@@ -126,12 +129,13 @@ def group_runs(runs: Sequence[ComparedRun]) -> Groups:
 def configuration(config: Mapping[str, Any]) -> str:
     """Configuration of a run and its ancestors, without seeds, as text."""
     pairs = config["data"]["name"] == "pairs"
-    # The parent's hash in pairs differs between seeds.
-    ignored = {"seed", "data.pairs.parent", "scans"} if pairs else {"seed"}
+    # The parent's hash in pairs and their folder differ between seeds.
+    ignored = {"seed", "data.pairs.parent", "scans", "data.root"} if pairs else {"seed"}
     keys = [
         f"{key}={value}"
         for key, value in sorted(flatten(config))
-        if value is not None and key not in ignored and rule(key).resume != "free" and not key.startswith("parent.")
+        if value is not None and key not in ignored
+        if key in TELLING or (rule(key).resume != "free" and not key.startswith("parent."))
         if pairs or not key.startswith("data.pairs.")
     ]
     if parent := config.get("parent"):

@@ -134,6 +134,14 @@ def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_an
     assert len({configuration(one) for one in (first, *others)}) == 5
 
 
+@pytest.mark.parametrize("key", ["trainer.precision", "data.root", "parent.step"])
+def test_what_is_free_on_resumption_still_tells_configurations_apart(tmp_path, key):
+    parent = {"path": str(make_run(tmp_path / "a") / "checkpoints" / "step-00000040.ckpt"), "weights": "aaa"}
+    make_run(tmp_path / "b", {"parent": parent, key: 20})
+    make_run(tmp_path / "c", {"parent": parent, key: 40, "seed": 1})
+    assert len(group_runs(read_runs([tmp_path / "b", tmp_path / "c"]))) == 2
+
+
 def test_a_sweep_s_files_and_folders_without_a_run_are_passed_over(tmp_path, caplog):
     make_run(tmp_path / "a")
     (tmp_path / "multirun.yaml").touch()
