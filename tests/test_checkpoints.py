@@ -155,8 +155,10 @@ def test_weights_that_do_not_fit_name_the_first(saved):
 def test_a_full_disk_is_one_line_and_loses_nothing(saved):
     path, _ = saved
     before = path.read_bytes()
-    with small_disk(50_000), pytest.raises(InputError, match=r"step-00000007.ckpt cannot be written"):
+    with small_disk(50_000), pytest.raises(InputError, match=r"step-00000007.ckpt cannot be written.* are intact"):
         AtomicCheckpointIO().save_checkpoint({"x": torch.randn(100_000)}, path)
+    with small_disk(50_000), pytest.raises(InputError, match=r"cannot be written: [^.]*\. Fix this"):
+        AtomicCheckpointIO().save_checkpoint({"x": torch.randn(100_000)}, path.parent.parent / "new" / path.name)
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 

@@ -27,9 +27,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             cause = error.__context__ if isinstance(error, RuntimeError) else error
             if not isinstance(cause, OSError):
                 raise
+            kept = "The earlier checkpoints are intact; fix" if any(Path(path).parent.glob("step-*.ckpt")) else "Fix"
             raise InputError(
-                f"{path} cannot be written: {cause.strerror or cause}. The earlier checkpoints are intact; "
-                "fix this and give the same command again."
+                f"{path} cannot be written: {cause.strerror or cause}. {kept} this and give the same command again."
             ) from None
 
     def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None) -> dict[str, Any]:
