@@ -15,7 +15,7 @@ from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import FOLDER, checkpoints_of
+from r2flow.model.checkpoint import FOLDER, checkpoints_of, step_of
 from r2flow.registry import Count
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, outlive_parent
 
@@ -110,9 +110,12 @@ class Stopping(L.Callback):
         self._training = False
 
     def _leave_newest(self, trainer: L.Trainer) -> None:
-        """Delete old checkpoints: ModelCheckpoint does not know of those saved here and would keep them."""
+        """Set damaged checkpoints aside, and delete old ones: ModelCheckpoint does not know of those saved here."""
         if trainer.is_global_zero:
             keep = max((getattr(one, "save_top_k", 0) for one in trainer.checkpoint_callbacks), default=2)
+            for path in checkpoints_of(self.run_dir):
+                if step_of(path) > trainer.global_step:  # the run could not resume from it
+                    path.rename(path.with_suffix(".damaged"))
             for old in checkpoints_of(self.run_dir)[keep:]:
                 old.unlink(missing_ok=True)
 

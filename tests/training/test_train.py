@@ -178,6 +178,16 @@ def test_an_odd_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, st
     assert_bit_equal(alone[0], copied)
 
 
+def test_damaged_checkpoints_of_later_steps_are_set_aside(train: Run, copied: Path):
+    newest, older = checkpoints_of(copied)
+    for step in (20, 22):
+        newest.with_name(f"step-{step:08d}.ckpt").write_bytes(b"half")
+    newest.unlink()
+    train("name=copied")
+    assert checkpoints_of(copied) == [newest, older]
+    assert len([*newest.parent.glob("*.damaged")]) == 2
+
+
 def test_a_moved_run_goes_on(train: Run, alone: tuple[Path, str], copied: Path):
     moved = copied.rename(copied.parent / "moved")
     checkpoints_of(moved)[0].unlink()  # as if killed before the last step
