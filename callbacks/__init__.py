@@ -54,6 +54,15 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     return built
 
 
+class Newest(ModelCheckpoint):
+    """A ModelCheckpoint that can resume with a smaller `save_top_k`."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        newest = sorted(self.best_k_models.items(), key=lambda item: item[1])[-self.save_top_k :]
+        self.best_k_models, self.kth_best_model_path = dict(newest), newest[0][0] if newest else ""
+
+
 def keep_checkpoints(folder: Path, every: Count = 100, keep: Count = 2) -> list[Callback]:
     """A checkpoint every `every` steps and one at the last step; the newest `keep` remain."""
     common: dict[str, Any] = {
@@ -66,8 +75,8 @@ def keep_checkpoints(folder: Path, every: Count = 100, keep: Count = 2) -> list[
     }
     # Without save_on_train_epoch_end, the checkpoint of the last step would wait for a validation that may not happen,
     # and one checkpoint too many would remain.
-    regular = ModelCheckpoint(every_n_train_steps=every, save_top_k=keep, save_on_train_epoch_end=True, **common)
-    final = ModelCheckpoint(every_n_epochs=1, save_on_train_epoch_end=True, save_top_k=1, **common)
+    regular = Newest(every_n_train_steps=every, save_top_k=keep, save_on_train_epoch_end=True, **common)
+    final = Newest(every_n_epochs=1, save_on_train_epoch_end=True, save_top_k=1, **common)
     return [regular, final]
 
 
