@@ -246,7 +246,7 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
             raise InputError(f"stage={name} takes its own optimiser steps: trainer.accumulate_grad_batches must be 1.")
         stage.gradient_clip_val, options["gradient_clip_val"] = options["gradient_clip_val"], None
     if isinstance(interval := options["val_check_interval"], int):  # a short run is validated once, at its end
-        options["val_check_interval"] = min(interval, options["max_steps"] * options["accumulate_grad_batches"])
+        options["val_check_interval"] = min(interval, options["max_steps"]) * options["accumulate_grad_batches"]
     callbacks = build_callbacks(config)
     loggers = build_loggers(config["loggers"], Path(config["run_dir"]))
     try:

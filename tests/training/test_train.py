@@ -270,6 +270,11 @@ def test_a_run_shorter_than_the_interval_is_validated_at_its_end(train: Run):
     assert "val/loss" in train("trainer.max_steps=1", "samples.num=0").stdout
 
 
+def test_steps_between_validations_are_of_the_optimiser(train: Run, tmp_path: Path):
+    train("trainer.accumulate_grad_batches=2", "trainer.max_steps=6", "samples.num=0", "run_dir=run")
+    assert list(read_curves(tmp_path / "run")["val/loss"][0]) == [3, 6]
+
+
 def test_mixed_precision_trains(train: Run, tmp_path: Path):
     train("trainer.precision=bf16-mixed", "trainer.max_steps=4", "name=half")
     assert all(v.dtype == torch.float32 for v in weights(tmp_path / "runs" / "half")[1].values())
