@@ -317,6 +317,8 @@ def _fit_in_folder(run: Run) -> int:
         if last is None and run.config["stage"].get("init"):  # what the end of the run is compared with
             run.trainer.validate(run.stage, run.data, verbose=False)
         run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
+    except MisconfigurationException as error:  # as of limit_val_batches, with few scans
+        raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     except RuntimeError as error:
         if run.trainer.world_size > 1 and re.search(PEER_LOST, str(error)):
             raise InputError("a process of this run on another device ended; the same command resumes.") from error

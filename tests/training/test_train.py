@@ -275,6 +275,10 @@ def test_steps_between_validations_are_of_the_optimiser(train: Run, tmp_path: Pa
     assert list(read_curves(tmp_path / "run")["val/loss"][0]) == [3, 6]
 
 
+def test_too_few_scans_for_a_share_of_the_validation_are_one_line(train: Run):
+    assert "trainer: You requested" in train("trainer.limit_val_batches=0.1", check=False).refusal
+
+
 def test_mixed_precision_trains(train: Run, tmp_path: Path):
     train("trainer.precision=bf16-mixed", "trainer.max_steps=4", "name=half")
     assert all(v.dtype == torch.float32 for v in weights(tmp_path / "runs" / "half")[1].values())
