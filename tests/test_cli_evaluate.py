@@ -116,6 +116,12 @@ def test_several_samplers_and_steps_make_a_set_each(points, saved, tmp_path):
     assert (tmp_path / "evaluation_speed.png").stat().st_size > 10_000
 
 
+def test_fields_in_a_sampler_s_text_count_and_make_a_set_each(points, saved):
+    rows, page = points(saved[0], "--sampler", "sde:steps=3:churn=0,sde:steps=3:churn=1")
+    assert [row["evaluations"] for row in rows] == [3, 3]
+    assert "sde:steps=3:" in page
+
+
 def test_each_number_of_steps_takes_the_sampler_that_the_generator_has_for_it(points, tmp_path):
     config = {**CONFIG, "generator": {"name": "flow_map"}}
     generator = build_generator(config).eval()

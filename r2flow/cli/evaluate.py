@@ -163,7 +163,7 @@ def _compare(
     options: EvaluateOptions,
 ) -> None:
     """Compare all sets; the first process prints and writes the results."""
-    from r2flow.evaluation.comparing import Comparer, pairs_of
+    from r2flow.evaluation.comparing import Comparer, pairs_of, with_equal_panels
     from r2flow.evaluation.copies import Nearest, find_nearest, with_copies
     from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.protocols import PROTOCOLS
@@ -176,7 +176,8 @@ def _compare(
     work = Work(options.batch_size, options.workers)
     rules, cache = PROTOCOLS[options.protocol], None if options.no_cache else Cache()
     compare = Comparer(metrics, work, rules, options.bootstrap, cache, options.out and options.out / "results", device)
-    comparisons = [compare(*pair) for pair in pairs_of(truth, judged, options.reference, options.baselines)]
+    pairs = pairs_of(truth, judged, options.reference, options.baselines)
+    comparisons = with_equal_panels([compare(*pair) for pair in pairs])
     if place()[0] > 0:
         return
     nearest: dict[str, Nearest] = {}
@@ -230,11 +231,12 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
 
     names = options.sampler.split(",") if options.sampler else [None]
     steps = numbers("steps", options.steps) if options.steps else [None]
-    sets = {}
+    sets: dict[str, ScanSet] = {}
     for sampler in _samplers(flow.generator, names, steps, options.tolerance):
         line = f"{label}, {sampler.name}" if len(names) > 1 else label
         count = getattr(sampler, "steps", None)
         name = f"{line}, {count} step{'s' * (count > 1)}" if count and len(steps) > 1 else line
+        name = f"{label}, {sampler.text}" if name in sets else name
         sets[name] = sampled_set(flow, line, options.num or SAMPLED, sampler, options.seed, options.precision)
     return sets
 

@@ -152,8 +152,8 @@ class SamplerOptions:
         from r2flow.samplers import parse_sampler
 
         fields = {"steps": self.steps, "tolerance": self.tolerance, "grid": self.grid}
-        given = {**(parse_sampler(self.sampler) if self.sampler else {}), **fields}
-        return {key: value for key, value in given.items() if value is not None}
+        given = {key: value for key, value in fields.items() if value is not None}
+        return {**(parse_sampler(self.sampler) if self.sampler else {}), **given}
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import logging
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -186,7 +187,10 @@ def completion(
         for name, model in loaded.items()
         for sampler in (samplers.split(",") if samplers else [None])
     ]
-    first = ways[0].checkpoint
+    first, names = ways[0].checkpoint, [way.name for way in ways]
+    ways = [
+        replace(way, model=f"{way.model} ({way.sampler.text})") if names.count(way.name) > 1 else way for way in ways
+    ]
     masks = re.split(r"\s*,\s*(?=[a-z]+:)|\s+", tasks.strip()) if tasks else list(TASKS)
     for task in masks:
         measured_by(task, first.sensor, 0)

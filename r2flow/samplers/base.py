@@ -130,6 +130,11 @@ class Sampler(ABC):
             del values["method"]
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
+    @property
+    def text(self) -> str:
+        """`NAME:FIELD=VALUE:...` with all fields, as `parse_sampler` reads it."""
+        return ":".join([self.name, *(f"{key}={value}" for key, value in self._fields().items())])
+
     def __str__(self) -> str:
         steps = getattr(self, "steps", None)
         return self.name if steps is None else f"{self.name}, {steps} step{'s' * (steps > 1)}"
