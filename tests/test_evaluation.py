@@ -15,6 +15,7 @@ from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
+from r2flow.evaluation.comparing import with_equal_panels
 from r2flow.evaluation.measuring import MetricResult, Work, gather_real, measure, real_rule
 from r2flow.evaluation.references import reference_sets
 from r2flow.evaluation.sets import sampled_set
@@ -23,6 +24,7 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.jsd_mmd import JSD, MMD
+from r2flow.metrics.panel import PANEL, REFLECTANCE
 from r2flow.noise import standard_normal
 from r2flow.reports.evaluation import Comparison, _figure, verdict
 from r2flow.samplers import build_sampler
@@ -273,6 +275,21 @@ def test_the_verdict_is_of_the_panel_if_measured():
     named = (("a", "judged"), ("real halves", "reference"))
     both = [Comparison(name, range(200), range(200), results, 0.0, kind) for name, kind in named]
     assert verdict(both)[0].startswith("a: panel 7 (reference: real halves 7): not distinguishable")
+
+
+def test_panels_are_means_of_the_same_lines():
+    lines = dict.fromkeys(PANEL, 0.2)
+    panels = [{"panel": 0.2, **lines, REFLECTANCE: math.nan}, {"panel": 0.3, **lines, REFLECTANCE: 1.4}]
+    sets = [Comparison(str(i), [], [], [MetricResult("panel", one, {})], 0.0) for i, one in enumerate(panels)]
+    assert [c.measured[0].figures["panel"] for c in with_equal_panels(sets)] == pytest.approx([0.2, 0.2])
+    assert with_equal_panels(sets[1:])[0].measured[0].figures["panel"] == 0.3
+
+
+def test_a_verdict_without_baselines_does_not_name_them():
+    results = [MetricResult("panel", {"panel": 7.0}, {})]
+    named = (("a", "judged"), ("real halves", "reference"))
+    both = [Comparison(name, range(20), range(20), results, 0.0, kind) for name, kind in named]
+    assert "not above the real halves; too few" in verdict(both)[0]
 
 
 @pytest.mark.parametrize(

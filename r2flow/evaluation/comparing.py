@@ -1,9 +1,10 @@
 """Comparisons of sets of scans; those of sampled sets are stored, so that an interrupted evaluation resumes."""
 
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ from r2flow.evaluation.references import baseline_sets, reference_sets
 from r2flow.evaluation.statistics import Cache, Statistics
 from r2flow.files import read_json, write_file
 from r2flow.metrics.base import ScanMetric
+from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, Panel, mean_distance
 from r2flow.processes import place
 from r2flow.store import checksum
 
@@ -54,6 +56,20 @@ def pairs_of(
         num = min(max((len(scans) for scans in judged.values()), default=len(real)), MOST_BASELINES)
         pairs += [("baseline", name, real, scans) for name, scans in baseline_sets(real, num).items()]
     return pairs
+
+
+def with_equal_panels(comparisons: Sequence[Comparison]) -> list[Comparison]:
+    """Leave reflectance out of every panel's mean if a set lacks it, so that all are means of the same lines."""
+    panels = [result.figures for c in comparisons for result in c.measured if result.metric == Panel.name]
+    lacking = any(math.isfinite(figures[Panel.name]) and math.isnan(figures[REFLECTANCE]) for figures in panels)
+
+    def equal(result: MetricResult) -> MetricResult:
+        if result.metric != Panel.name or math.isnan(result.figures[REFLECTANCE]):
+            return result
+        mean = mean_distance({name: result.figures[name] for name in PANEL if name != REFLECTANCE})
+        return replace(result, figures={**result.figures, Panel.name: mean}, remarks=[*result.remarks, LACKING])
+
+    return [replace(c, measured=[*map(equal, c.measured)]) for c in comparisons] if lacking else list(comparisons)
 
 
 class Comparer:

@@ -103,6 +103,7 @@ def find_nearest(sets: Mapping[str, ScanSet], training: ScanSet, work: Work, dev
         for neighbours in nearest.values():
             neighbours.approach(y, first)
         first += len(y)
+    check(all(n.squared.isfinite().all() for n in nearest.values()), f"no scan of {training.label} has a return.")
     return nearest
 
 

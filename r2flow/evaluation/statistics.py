@@ -19,7 +19,7 @@ from r2flow.model.checkpoint import read_tensors
 
 log = logging.getLogger(__name__)
 
-FORMAT = 3  # increment if statistics change for the same scans and protocol
+FORMAT = 4  # increment if statistics change for the same scans and protocol
 
 
 @dataclass(frozen=True)

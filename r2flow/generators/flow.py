@@ -168,6 +168,6 @@ def ode_sampler(flow: Flow) -> Sampler:
 
 def as_flow(generator: Generator, what: str) -> Flow:
     """The generator, if it is a flow."""
-    if not isinstance(generator, Flow):
-        raise InputError(f"{what} needs the velocity of a flow, which a {type(generator).__name__} does not have.")
+    if not isinstance(generator, Flow) or not generator.draws:
+        raise InputError(f"{what} needs the velocity of a flow from noise; a {type(generator).__name__} has none.")
     return generator

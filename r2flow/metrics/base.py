@@ -1,5 +1,6 @@
 """Base class of metrics between two sets of scans, and the protocol of their results."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Self
@@ -66,6 +67,7 @@ class ScanMetric(Metric):
         keeping: Whether rows are always stored in memory, float32.
         resamples: Whether bootstrap intervals exist; they require rows stored by `keep=True`.
         fewest: Minimum number of scans per set for `resampled`.
+        highest: Largest possible value.
 
     Args:
         keep: Store rows for bootstrap intervals.
@@ -85,6 +87,7 @@ class ScanMetric(Metric):
     keeping: ClassVar[bool] = False
     resamples: ClassVar[bool] = True
     fewest: ClassVar[int] = 2
+    highest: ClassVar[float] = math.inf
 
     def __init__(
         self, keep: bool = False, *, sensor: Sensor | None = None, name: str | None = None, **options: Any

@@ -29,7 +29,7 @@ def bootstrap(
     so that sigma^2 = Var l - Var q estimates its variance, L + Q (Efron and Stein 1981). Efron's bootstrap, which
     repeats scans, has variance L + 3 Q: for nearly equal sets, where L vanishes, its intervals are 1.7 times too wide.
     The weights change little, because repeated or missing scans also bias the distance. t is Student's quantile. If
-    t sigma > d, the interval is d +- t sigma, cut off at 0.
+    t sigma > d, the interval is d +- t sigma, for positive d cut off at 0.
 
     Weights act on the stored rows of all processes, without copies or further network evaluations.
 
@@ -57,7 +57,8 @@ def bootstrap(
                 drawn.setdefault(name, []).append(figures.view(2, -1))
             if advance:
                 advance(2 * len(signs))
-    return {name: _interval(values[name], torch.cat(drawn[name], 1).numpy()) for name in values if name in drawn}
+    intervals = {name: _interval(values[name], torch.cat(drawn[name], 1).numpy()) for name in values if name in drawn}
+    return {name: (low, min(high, metric.highest)) for name, (low, high) in intervals.items()}
 
 
 def _weights(sizes: dict[Side, int], draws: range, seed: int) -> dict[Side, Tensor]:
@@ -83,4 +84,4 @@ def _interval(value: float, drawn: np.ndarray) -> tuple[float, float]:
     half = float(stdtrit(drawn.shape[1], (1 + LEVEL) / 2)) * sigma
     if half < value:  # distances vary by factors
         return value * math.exp(-half / value), value * math.exp(half / value)
-    return max(value - half, min(value, 0.0)), value + half
+    return value - half if value < 0 else max(value - half, 0.0), value + half

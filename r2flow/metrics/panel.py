@@ -29,7 +29,9 @@ DENSITIES = np.array([0.5, 1.5, 2.5, 4.5, 8.5, 16.5, 32.5, 64.5, 128.5, 256.5, n
 NORMALS, COSINES = np.linspace(-1, 1, 21), np.linspace(0, 1, 21)
 APART = 128, 512  # pixels of a pair are 1/128 and 1/512 turn apart: range, reflectance
 DROPS, PAIRS = 12, 16  # bins of range
-MOST_ROWS = 256
+MOST_ROWS = 1024
+REFLECTANCE = "reflectance pairs"  # the line that needs reflectance
+LACKING = "a set has no reflectance: the panel's mean leaves reflectance pairs out."
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def run_lengths(scan: Scan) -> np.ndarray:
 
 
 def changes_row(scan: Scan) -> np.ndarray:
-    """Per row, pairs of neighbours with exactly one return, and all pairs, (2, 256); 0 beyond the image's rows."""
+    """Per row, pairs of neighbours with exactly one return, and all pairs, (2, 1024); 0 beyond the image's rows."""
     returned = scan.r > 0
     counts = np.zeros((2, MOST_ROWS))
     counts[0, : len(returned)] = (returned != np.roll(returned, -1, -1)).sum(1)
@@ -181,7 +183,7 @@ PANEL: dict[str, Member] = {
     "surface normals": Member(surface_normals, len(NORMALS) - 1),
     "incidence": Member(incidence, len(COSINES) - 1),
     "range pairs": Member(range_pairs, PAIRS**2),
-    "reflectance pairs": Member(reflectance_pairs, (len(REFLECTANCES) - 1) ** 2, reflectance_distance),
+    REFLECTANCE: Member(reflectance_pairs, (len(REFLECTANCES) - 1) ** 2, reflectance_distance),
     "bird's-eye density": Member(birds_eye_density, len(DENSITIES) - 1),
 }
 ENDS = np.cumsum([member.size for member in PANEL.values()])
@@ -238,6 +240,6 @@ class Panel(SumMetric):
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         values, remarks = super().figures()
-        if np.isnan(values["reflectance pairs"]) and all(self.count(side) for side in SIDES):
-            remarks.append("a set has no reflectance: the panel's mean leaves reflectance pairs out.")
+        if np.isnan(values[REFLECTANCE]) and all(self.count(side) for side in SIDES):
+            remarks.append(LACKING)
         return values, remarks

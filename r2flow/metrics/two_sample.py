@@ -18,8 +18,8 @@ class TwoSample(FeatureMetric):
     """Area under the ROC curve of a logistic regression between two sets (Lopez-Paz and Oquab 2017).
 
     Each contiguous half of both sets is scored by the classifier trained on the other half, so that neighbouring scans
-    of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always distinguished. The interval resamples the
-    scored scans.
+    of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always distinguished. The interval resamples
+    the scored scans for these two classifiers: it contains the mean over new sets of 30 to 100 scans in 70 to 86 %.
     """
 
     kind = "auc"
@@ -27,6 +27,7 @@ class TwoSample(FeatureMetric):
     settings: ClassVar[Mapping[str, Any]] = {"classifier": "logistic regression, ridge 1", "folds": "two halves"}
     keeping = True
     fewest = 4  # two to train on, two to test
+    highest = 1.0
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         real, generated = (self.kept(side).double() for side in SIDES)

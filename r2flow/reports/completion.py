@@ -123,7 +123,8 @@ def completion_page(rows: Sequence[Mapping[str, Any]], figure: Figure, about: st
     text = [
         f"{about} Figures are of the hidden rays, means over scans and answers, unless their name says otherwise: "
         "`MAE, all pixels` is LiDARGen's and RangeLDM's, IoU and Chamfer are of whole scans with the measured rays "
-        "pasted in. The panel is the mean distance of its lines between the completed scans and the true ones. "
+        "pasted in. The panel is the mean distance of its lines between the completed scans and the true ones; it and "
+        "`MAE where all return` are of the first answers. "
         "Coverage is the share of hidden ranges between the least and the greatest answer."
     ]
     for task in dict.fromkeys(row["task"] for row in rows):

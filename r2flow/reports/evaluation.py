@@ -21,6 +21,7 @@ from r2flow.reports.tables import print_table, shown, table
 
 ENDS = (" low", " high")  # suffixes of interval limits
 DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
+UNBIASED = ("kid_", "mmd_unbiased", "speed")
 ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
 MARGIN = 1.25  # sets of the same source differ by as much
 HEADLINE = "panel"  # metric of the verdict, if measured
@@ -94,7 +95,7 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     judged, baselines = (sorted(values[kind].values(), key=lambda pair: pair[0]) for kind in ("judged", "baseline"))
     best = baselines[0][0] if baselines else math.inf
     title, factor = heading(metric, metric)
-    unbiased = metric.startswith("kid_")
+    unbiased = metric.startswith(UNBIASED)
     equal = len(judged) > 1 and len({len(c.generated) for _, c in judged}) == 1
     lines = []
     for value, comparison in judged:
@@ -102,11 +103,12 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
         compared, pair = as_many or (value, comparison)
         scans, of_half = (min(len(c.real), len(c.generated)) for c in (pair, halves))
         farther = compared > MARGIN * max(reference, 0)
+        beside = "" if not baselines else ", below the baselines" if value < best else ", not below the baselines"
         if min(scans, of_half) < ENOUGH:
             judgement = (
-                f"{'above' if compared > reference else 'not above'} the real halves, "
-                f"{'below' if value < best else 'not below'} the baselines; too few scans for a verdict: "
-                f"{len(comparison.real)} real, {len(comparison.generated)} generated, {2 * ENOUGH} and {ENOUGH} needed"
+                f"{'above' if compared > reference else 'not above'} the real halves{beside}; too few scans "
+                f"for a verdict: {len(comparison.real)} real, {len(comparison.generated)} generated, {2 * ENOUGH} and "
+                f"{ENOUGH} needed"
             )
         elif value >= best:
             judgement = "no lower than a baseline"
@@ -215,7 +217,8 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     if drawn:
         draws = drawn[0]["bootstrap draws"]
         lines.append(f"In brackets: intervals of {drawn[0]['level']:.0%}, from {draws} bootstrap draws.")
-    if len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:
+    biased = any(not m.metric.startswith(UNBIASED) for m in comparisons[0].measured)
+    if biased and len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:
         lines.append("Distances of fewer scans are larger: compare only sets of equal sizes.")
     remarks: dict[str, dict[str, list[str]]] = {}  # remark -> comparison -> metrics
     for comparison in comparisons:
@@ -294,7 +297,12 @@ def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     for comparison in comparisons:
         if comparison["kind"] != "judged" or comparison["generated"].get("kind") != "sampled":
             continue
-        row = {"flow": comparison["generated"]["set"], "weights": comparison["generated"]["weights"]}
+        protocol, real = comparison["metrics"][0]["protocol"], comparison["real"]
+        row = {
+            "flow": comparison["generated"]["set"], "weights": comparison["generated"]["weights"],
+            "protocol": f"{protocol['name']}, {comparison['generated']['scans']} scans of "
+            f"{'x'.join(map(str, protocol['image']))} against {real['scans']} of {real['set']}",
+        }  # fmt: skip
         for metric in comparison["metrics"]:
             short = "" if metric["metric"] == "speed" else f"{metric['metric']}/"
             row |= {f"{short}{name}": math.nan if value is None else value for name, value in metric["figures"].items()}

@@ -54,9 +54,10 @@ def role_of(checkpoint: Checkpoint, label: str) -> str:
         if system == "LiDM" and (options.get("unet") or {}).get("position") == "learnable":
             system = "LiDM + APE"
         return system if checkpoint.encoding.reflectance else f"{system}, range"
-    if stage.get("name") == "distill":
-        return f"{stage['steps']}-TD"
-    return {"rectify": "1-RF", "reflow": "2-RF"}.get(stage.get("name", ""), label)
+    role, learned_from = {
+        "rectify": ("1-RF", None), "reflow": ("2-RF", "rectify"), "distill": (f"{stage.get('steps')}-TD", "reflow")
+    }.get(stage.get("name", ""), (label, None))  # fmt: skip
+    return role if (config.get("parent") or {}).get("stage") in (None, learned_from) else label
 
 
 def paper_page(
@@ -79,7 +80,11 @@ def paper_page(
     evaluated = [{**row, "role": roles[row["weights"]]} for row in rows if row["weights"] in roles]
     architectures = architecture_rows(runs, evaluated, device)
     names = ", ".join(f"{run.label} ({run.role})" for run in runs)
+    protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
     text = [f"{len(runs)} generators: {names}.", "## Table I: methods and metrics", table_i(evaluated)]
+    if protocols:
+        text.append(f"Evaluated rows: {protocols}. Printed rows: paper, 10000 scans of 64x1024 against KITTI-360. Only "
+                    "equal protocols and numbers of scans are comparable.")  # fmt: skip
     if architectures:
         text += ["## Table II: velocity estimators", table(architectures, ARCHITECTURES)]
     figures: dict[str, Figure] = {}

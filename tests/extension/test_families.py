@@ -107,9 +107,9 @@ def test_a_flow_is_straightened(family: Family, tmp_path: Path, tmp_path_factory
 
 CANNOT = {
     "interpolate": (
-        ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
+        ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "needs the velocity of a flow from noise; a ToyGenerator"
     ),
-    "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
+    "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow from noise; a ToyGenerator"),
     "report solvers": (["RUN", "-o", "OUT"], "report solvers needs the velocity of a flow"),
     "export": (["RUN", "-o", "OUT.onnx"], "only flows can be exported"),
     "pairs": (["RUN"], "needs a generator with a velocity"),

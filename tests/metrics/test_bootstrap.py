@@ -69,7 +69,25 @@ def test_every_metric_has_an_interval_around_its_figure_or_says_that_it_has_none
         expected = set(metric.compute()) if metric.resamples and metric.fewest <= 20 else set()
         assert set(found) == expected, name
         for figure, (low, high) in found.items():
-            assert 0 <= low <= metric.compute()[figure] <= high, figure
+            assert 0 <= low <= metric.compute()[figure] <= high <= metric.highest, figure
+
+
+class MeanDifference(SumMetric):
+    """mean x - mean y of numbers; the second number of a row counts them."""
+
+    name, representation, width = "difference", "numbers", 2
+
+    def figures_of(self, real, generated):
+        return {"difference": float(generated[0] / generated[1] - real[0] / real[1])}
+
+
+def test_the_interval_of_a_negative_figure_lies_around_it():
+    metric, draw = MeanDifference(keep=True), np.random.default_rng(0)
+    for side, shift in (("real", 1.0), ("generated", 0.0)):
+        metric.add_rows(torch.from_numpy(np.stack([draw.normal(shift, 1, 50), np.ones(50)], 1)), side)
+    low, high = bootstrap(metric, draws=200)["difference"]
+    middle, sigma = metric.compute()["difference"], math.sqrt(2 / 50)
+    assert (low, high) == pytest.approx((middle - 1.96 * sigma, middle + 1.96 * sigma), abs=0.25 * sigma)
 
 
 def test_draws_depend_on_the_seed_only(scans_of):

@@ -29,6 +29,13 @@ def test_every_run_finds_its_role(runs):
     assert {role: role_of(load_checkpoint(run), "label") for role, run in runs.items()} == {r: r for r in runs}
 
 
+def test_a_role_is_also_of_what_a_run_was_learned_from(runs):
+    checkpoint = load_checkpoint(runs["2-RF"])
+    for parent, role in (("rectify", "2-RF"), ("reflow", "label")):  # reflow of a 2-RF is a 3-RF
+        checkpoint.config["parent"] = {"stage": parent}
+        assert role_of(checkpoint, "label") == role
+
+
 def test_the_printed_rows_have_a_figure_for_each_column():
     assert {len(row.figures) for row in TABLE_I} == {len(COLUMNS)}
     assert all(name in METRICS for name in COLUMNS)
@@ -61,8 +68,10 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     figures = {"speed": {"evaluations": 1.0, "seconds": 0.1}, "jsd": {"jsd": 0.25}, "mmd": {"mmd": 1e-4}}
     metrics = [{"metric": name, "figures": values, "intervals": {}} for name, values in figures.items()]
     hashes = weights_hash(load_checkpoint(runs["1-RF"])), "another model"
-    sets = [{"kind": "sampled", "set": "a", "weights": weights} for weights in hashes]
-    comparisons = [{"kind": "judged", "generated": one, "metrics": metrics} for one in sets]
+    sets = [{"kind": "sampled", "set": "a", "weights": weights, "scans": 5} for weights in hashes]
+    metrics[0]["protocol"] = {"name": "r2flow", "image": [8, 64]}
+    real = {"set": "held", "scans": 7}
+    comparisons = [{"kind": "judged", "real": real, "generated": one, "metrics": metrics} for one in sets]
     results = tmp_path / "e.json"
     results.write_text(json.dumps({"comparisons": comparisons}))
     options = ("--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0")
@@ -70,6 +79,7 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     said = r2flow.said("report", "paper", *named, "--results", results, *options, "-o", tmp_path / "out")
     assert "3 generators" in said
     assert "(9-RF)" in said
+    assert "r2flow, 5 scans of 8x64 against 7 of held" in (tmp_path / "out" / "paper.md").read_text()
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
     (architecture,) = content["architectures"]
