@@ -8,7 +8,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.lidar.known import Ray, ray_states
-from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.completion import Completed, complete, completing
 from r2flow.samplers import build_sampler
 from tests import test_sampling
@@ -142,6 +142,15 @@ def test_spread_is_over_the_answers_with_a_return():
     deviation, share = Completed(images, 0, torch.zeros(3), torch.ones(3) > 0, 0.0).spread
     assert deviation.tolist() == [[2.0, 0.0, 0.0]]  # of 3, 5, 7: sqrt((4 + 0 + 4) / 2)
     torch.testing.assert_close(share, torch.tensor([[1, 1 / 3, 0]]))
+
+
+@pytest.mark.parametrize(("sensor", "size", "other"), [("hdl64e", "32x256", False), ("vlp16", "16x256", True)])
+def test_coarser_images_of_the_own_sensor_are_not_of_another(r2flow, tmp_path, sensor, size, other):
+    r2flow.said("simulate", "--num", 1, "--sensor", sensor, "--size", size, "--format", "npy", "--out", tmp_path)
+    found, (scan,), _ = load_checkpoint("densify").open_partial([str(tmp_path)])
+    assert found.generator.foreign == other
+    rows, columns = scan.read().state.nonzero()
+    assert other or (set(rows % 2), set(columns % 4)) == ({1}, {2})  # rays on edges of pixels
 
 
 def test_a_model_of_another_sensor_is_not_saved_as_that_of_training(tmp_path):

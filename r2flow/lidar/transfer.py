@@ -18,6 +18,7 @@ from r2flow.lidar.scan_files.points import NEAREST
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.unfolding import elevations_of
 
+TIE = 1e-3  # of a column, or degrees: rays on the edge of a pixel are in the lower row and in the later column
 BLIND = 5.0  # degrees: a wider sector without any return counts as not measured, as in a cropped scan
 WHOLE = 0.9  # minimum share of the rays of a turn that a file with all lost rays stores
 
@@ -46,7 +47,7 @@ def sensor_of(scans: list[Points], named: Sensor | None = None) -> Sensor:
 
 def rows_of(elevations: np.ndarray, sensor: Sensor) -> np.ndarray:
     """The row of a sensor's image for each elevation in degrees; -1 outside the view."""
-    row = np.searchsorted(-sensor.row_edges, -np.asarray(elevations), side="right") - 1
+    row = np.searchsorted(-sensor.row_edges, TIE - np.asarray(elevations), side="right") - 1
     return np.where(row < sensor.shape[0], row, -1)
 
 
@@ -154,7 +155,7 @@ def _azimuth(xyz: np.ndarray) -> np.ndarray:
 
 
 def _columns(azimuth: np.ndarray, columns: int) -> np.ndarray:
-    return np.floor((1 - azimuth / math.pi) / 2 * columns).astype(np.int64) % columns
+    return np.floor((1 - azimuth / math.pi) / 2 * columns + TIE).astype(np.int64) % columns
 
 
 def _without_return(azimuth: np.ndarray, steps: float) -> np.ndarray:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.config import check_tree, learned
-from r2flow.data.opening import reading_for
+from r2flow.data.opening import own_reading, reading_for
 from r2flow.data.partial import PartialScan, open_partial
 from r2flow.errors import InputError, check, naming
 from r2flow.files import parse_json, telling, write_file
@@ -129,8 +129,14 @@ class Checkpoint:
         """This model for the sensor of scans to complete, the scans, and remarks; see `r2flow.data.partial`."""
         reading = replace(reading_for([], self), columns=how.pop("columns", None))
         scans, remarks = open_partial(specs, reading, None if sensor is None else named_sensor(sensor), **how)
-        foreign = remarks and isinstance(self.generator, TransferFlow)  # another sensor fills other rows
-        return self.through(self.sensor, numbered=False) if foreign else self, scans, remarks
+        if not remarks or not isinstance(self.generator, TransferFlow) or all(map(self._coarser, specs)):
+            return self, scans, remarks
+        return self.through(self.sensor, numbered=False), scans, remarks  # another sensor fills other rows
+
+    def _coarser(self, spec: str) -> bool:
+        """Whether r2flow wrote some scans as images of this sensor in another size."""
+        stored = own_reading(spec)
+        return stored is not None and self.sensor.resized(*stored.sensor.shape).same_image(stored.sensor)
 
     def through(self, sensor: Sensor | str, numbered: bool = True) -> "Checkpoint":
         """This transfer flow for images of another sensor, by name, YAML file or `Sensor`; the weights are shared."""
@@ -296,11 +302,9 @@ def weights_hash(checkpoint: Checkpoint) -> str:
 
 
 def as_parent(config: Mapping[str, Any], path: Path, step: int, weights: str | None) -> dict[str, Any]:
-    """Entry `parent` in a child's config: the checkpoint that it starts from; for a grown one also its origin."""
-    origin = None if config.get("stage") else config.get("parent")
-    grown_from = {"grown_from": {key: value for key, value in origin.items() if key != "path"}} if origin else {}
-    stage = (origin or {}).get("stage") or (config.get("stage") or {}).get("name", "rectify")
-    return {"path": str(path), "weights": weights, "step": step, "stage": stage, **grown_from}
+    """Entry `parent` in a child's config: the checkpoint that it starts from."""
+    stage = (config.get("stage") or {}).get("name", "rectify")
+    return {"path": str(path), "weights": weights, "step": step, "stage": stage}
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -89,7 +89,7 @@ def write_completed(
             raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, np.ndarray | None] = {}
-    used = kept = outside = 0
+    used = kept = outside = blind = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with ScanBar("completing", len(left) * job.num, len(left) * batches, "answers") as bar:
         for number in left:
@@ -98,9 +98,7 @@ def write_completed(
             used += 0 if scan.image else int((given.state == Ray.RETURN).sum())
             if given.points is not None:
                 kept, outside = kept + len(given.points.xyz), outside + given.points.dropped
-            cut = 360 * (whole.state == Ray.UNKNOWN).mean() * share_in_sectors(whole.state)
-            if cut and isinstance(checkpoint.generator, TransferFlow):
-                print(f"{scan.name}: no ray returned from {cut:.0f} degrees; what the answers hold there is invented")
+            blind = max(blind, 360 * (whole.state == Ray.UNKNOWN).mean() * share_in_sectors(whole.state))
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (completed,) = complete(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,
@@ -116,6 +114,8 @@ def write_completed(
             if not completed.evaluations.any():
                 print(f"{scan.name}: everything is known, so nothing was completed; see --fill-gaps and --mask")
             bar.set(len(done) * job.num)
+    if blind and isinstance(checkpoint.generator, TransferFlow):
+        print(f"no ray returned from up to {blind:.0f} degrees of a scan; what the answers hold there is invented")
     if used:
         sensor = checkpoint.sensor
         size = "x".join(map(str, sensor.shape))
