@@ -56,8 +56,6 @@ RULES: dict[str, Key] = {
     "backbone": OF_THE_MODEL,
     "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # does not affect the weights' shapes
     "backbone.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
-    "backbone.inner.attention": replace(OF_THE_MODEL, inherited="unless_given"),
-    "backbone.inner.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
     "stage.init": FREE,
     "data": OF_SCANS,
     "data.root": replace(OF_SCANS, resume="free"),

@@ -49,10 +49,6 @@ TINY: dict[str, dict[str, Any]] = {
     "local": {"channels": 8, "dilations": [1, 2]},
 }
 TINY["efficient_unet"] = TINY["adm_unet"]
-TINY["pyramid"] = {
-    "inner": {"name": "hdit", **TINY["hdit"]}, "factor": [1, 2], "coarse": [1, 8], "detail": [1, 8],
-    "time_channels": 16,
-}  # fmt: skip
 
 
 def tiny_options(name: str) -> dict[str, Any]:

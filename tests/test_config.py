@@ -42,7 +42,6 @@ def test_the_key_of_an_override(override: str, key: str):
 def test_every_rule_is_of_a_key_that_exists(config):
     keys = {key for key, _ in flatten(config)} | {"experiment", "size", "hydra", "parent.path", "data.parts.*.root"}
     keys |= {"data.validation.data.root", "data.scans.root", *(f"callbacks.{name}" for name in CALLBACKS)}
-    keys |= {key for key, _ in flatten(compose(["backbone=pyramid"]))}
     for key in RULES:
         assert any(known == key or known.startswith(f"{key}.") for known in keys), key
 

@@ -106,17 +106,6 @@ def test_weights_move_to_another_size_where_none_belongs_to_a_place(position: st
         assert torch.equal(ours.velocity(t, x), same.velocity(t, x))
 
 
-def test_a_network_inside_another_looks_elsewhere_too():
-    inner = {**CONFIG["backbone"], "position": "none"}
-    config = {**CONFIG, "backbone": {"name": "pyramid", "inner": inner, "factor": [1, 2]}}
-    theirs, ours = (build_generator(sized(config, *size)) for size in ((8, 64), (16, 128)))
-    rays = ours.backbone.inner.coords.clone()
-    assert rays.shape[2:] == (16, 64)
-    ours.start_from(theirs)
-    assert torch.equal(ours.backbone.inner.coords, rays)
-    assert torch.equal(ours.backbone.inner.tokenizer[0].weight, theirs.backbone.inner.tokenizer[0].weight)
-
-
 def test_weights_that_belong_to_a_place_do_not_move():
     theirs, ours = (build_generator(sized(CONFIG, *size, position="learnable")) for size in ((8, 64), (16, 128)))
     with pytest.raises(InputError, match=r"weights for images of 1x8x64 .*found 1x16x128: leave sensor out"):
@@ -176,19 +165,6 @@ def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Pa
     assert found() == ("unfolding", "reference")
     assert found(reading={"projection": "spherical"}) == ("spherical", "reference")
     assert found(name="simulated", root=None) == ("spherical", "centre")
-
-
-@pytest.mark.parametrize("asked", ["backbone.inner.dropout", "backbone.inner"])
-def test_of_a_network_inside_another_that_may_change_which_is_no_weight(parent: Path, asked: str):
-    """A key of its own, however it was given; the rest stays the parent's, and an unknown group is refused as ever."""
-    inner = {"name": "hdit", "base_channels": 8, "dropout": 0.0}
-    there = {**CONFIG, "backbone": {"name": "pyramid", "inner": inner, "channels": 4}}
-    config = {**child(parent, False), "backbone": {"inner": {"dropout": 0.1}}}
-    found = inherit(config, [asked], Parent(there, parent))["backbone"]
-    assert found == {"name": "pyramid", "inner": {**inner, "dropout": 0.1}, "channels": 4}
-    for unsaid in ([], ["backbone"]):
-        config["backbone"] = {**there["backbone"], "inner": {**inner, "dropout": 0.1}}
-        assert inherit(config, unsaid, Parent(there, parent))["backbone"] == there["backbone"]
 
 
 def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):

@@ -1,6 +1,5 @@
-"""Generators that have a name: those in the package, and those in the folder of models."""
+"""Generators that have a name."""
 
-import hashlib
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ import torch
 from safetensors import safe_open
 
 import r2flow
+from r2flow import models
 from r2flow.config import learned
 from r2flow.data.pairs import default_folder
 from r2flow.errors import InputError
@@ -20,17 +20,16 @@ from r2flow.lidar.known import parse_mask, ray_states
 from r2flow.lidar.sensors import build_sensor
 from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
-from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
+from r2flow.models import MODELS, find_model, name_of
 from r2flow.simulator import simulate
 from tests.conftest import ROOT
 
-PACKAGED = [name for name, model in MODELS.items() if model.page is None]
 
-
-@pytest.mark.parametrize("name", PACKAGED)
+@pytest.mark.parametrize("name", MODELS)
 def test_a_model_of_the_package_draws(name):
     found = load_checkpoint(name)
-    assert found.path == find_model(name) == SHIPPED / f"{name}.safetensors"
+    assert found.path == find_model(name)
+    assert name_of(found.path) == name
     assert all(value.isfinite().all() for value in found.generator.state_dict().values())
     if not found.generator.draws:
         with pytest.raises(InputError, match="r2flow complete"):
@@ -67,8 +66,9 @@ def test_densify_is_ahead_of_interpolation(name: str, size: tuple[int, int], tas
 
 
 def test_the_wheel_can_bear_the_models():
-    assert {path.stem for path in SHIPPED.glob("*.safetensors")} == set(PACKAGED)
-    assert sum(find_model(name).stat().st_size for name in PACKAGED) <= 20e6
+    files = list(find_model("street").parent.glob("*.safetensors"))
+    assert {path.stem for path in files} == set(MODELS)
+    assert sum(path.stat().st_size for path in files) <= 20e6
 
 
 def test_two_lines_of_python_without_a_network_and_a_light_import():
@@ -112,39 +112,15 @@ def test_a_run_or_a_file_of_a_models_name_comes_first(saved, tmp_path, monkeypat
         load_checkpoint("street")
 
 
-@pytest.fixture
-def released(saved, tmp_path, monkeypatch) -> Path:
-    """The file of a model `large` that does not come with the package."""
-    monkeypatch.setenv("R2FLOW_MODELS", str(tmp_path / "models"))
-    path = tmp_path / "downloads" / "some.safetensors"
-    save_checkpoint(load_checkpoint(saved[0]), path)
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
-    monkeypatch.setitem(MODELS._entries, "large", Model("anything", found, page="https://example.org/some.safetensors"))
-    return path
-
-
-def test_a_released_model_is_added_from_a_file(r2flow, released, tmp_path):
-    with pytest.raises(InputError, match=r"large is not here .*example.org/some.safetensors and give r2flow weights"):
-        load_checkpoint("large")
-    assert "no" in next(line for line in r2flow("weights")[1].splitlines() if line.startswith("large")).split()
-    said = r2flow.said("weights", "--add", "large", released)
-    assert said == f"{tmp_path / 'models' / 'large.safetensors'}: the model large\n"
-    assert "yes" in next(line for line in r2flow("weights")[1].splitlines() if line.startswith("large")).split()
-    assert load_checkpoint("large").step == 7
-    assert name_of(model_file("large")) == "large"
-
-
-def test_another_file_is_no_model(r2flow, released):
-    released.write_bytes(released.read_bytes() + b" ")
-    with pytest.raises(InputError, match="is not the model large, or damaged"):
-        add_model("large", released)
-    model_file("large").parent.mkdir()
-    model_file("large").write_bytes(released.read_bytes())
-    with pytest.raises(InputError, match="is not the model large, or damaged"):
-        load_checkpoint("large")
-    assert "Did you mean 'large'?" in r2flow.refusal("weights", "--add", "larg", released)
-    with pytest.raises(InputError, match="comes with the package"):
-        add_model("street", released)
+def test_a_damaged_file_is_not_the_model(tmp_path, monkeypatch):
+    data = bytearray(find_model("densify").read_bytes())
+    monkeypatch.setattr(models, "FOLDER", tmp_path)
+    with pytest.raises(InputError, match="the model densify is not here"):
+        load_checkpoint("densify")
+    data[-1] ^= 1
+    (tmp_path / "densify.safetensors").write_bytes(data)
+    with pytest.raises(InputError, match="is not the model densify, or damaged"):
+        load_checkpoint("densify")
 
 
 def test_half_precision_rounds_large_weights_alone(saved, tmp_path):
@@ -191,17 +167,6 @@ def test_a_written_config_says_what_was_learned_and_no_folder():
 
 def test_pairs_of_a_model_lie_outside_the_package():
     assert default_folder(find_model("street")) == Path("runs/street-pairs")
-
-
-def test_the_files_of_the_release_are_the_models_that_they_are_named_after(tmp_path: Path, monkeypatch):
-    monkeypatch.setenv("R2FLOW_MODELS", str(tmp_path))
-    files = sorted((ROOT / "release").glob("*.safetensors"))
-    if not files:
-        pytest.skip("this copy of the source has no release files")
-    for file in files:
-        name = file.stem
-        assert MODELS[name].page == f"release/{file.name} in the source of r2flow"
-        assert add_model(name, file) == find_model(name)
 
 
 def test_torch_hub_gives_the_model_of_the_package():

@@ -12,11 +12,10 @@ from r2flow.backbones.base import Backbone
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
-from r2flow.backbones.pyramid import Pyramid
 from r2flow.registry import Registry
 
 BACKBONES: Registry[type[Backbone]] = Registry(
-    "backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, pyramid=Pyramid, local=Local
+    "backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, local=Local
 )
 
 

@@ -92,13 +92,13 @@ class Backbone(ExactBuffers):
         assert s is None or self.second_time, "this backbone was built for one time and takes no s"
         t, s = _times("t", t, x), None if s is None else _times("s", s, x)
         if self.data_std is None:
-            return self._evaluated(t, x, s).to(x.dtype)
+            return self._velocity(t, x, s).to(x.dtype)
         image, rest = at_least_float32(x[:, : self.out_channels]), x[:, self.out_channels :]
         into, skip, out = precondition(t, self.data_std)
         inner = torch.cat([into * image, rest], dim=1) if rest.shape[1] else into * image
-        return (skip * image + out * self._evaluated(t, inner, s)).to(x.dtype)
+        return (skip * image + out * self._velocity(t, inner, s)).to(x.dtype)
 
-    def _evaluated(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
+    def _velocity(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
         y = x.to(next(self.parameters()).dtype)
         if not self.second_time:
             return self.velocity(t, y)

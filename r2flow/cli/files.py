@@ -10,7 +10,6 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.options import SamplerOptions, grouped
 from r2flow.errors import InputError, check
-from r2flow.registry import Registry
 
 
 @app.command(epilog="Example: r2flow export runs/NAME --to onnx --steps 8 --out flow.onnx")
@@ -89,35 +88,26 @@ def info(
 def weights(
     add: Annotated[
         tuple[str, Path] | None,
-        typer.Option(metavar="NAME FILE", help="Install a model from its file, or a network from a file or folder."),
+        typer.Option(metavar="NAME FILE", help="Install a network from its file or folder."),
     ] = None,
 ) -> None:
-    """List the models and the feature networks of published metrics, which are installed, and where to get others.
+    """List the models, and the feature networks of published metrics: which are installed, and where to get others.
 
-    r2flow does not download: get a file, then --add it. Models are checked by SHA-256 and stored in R2FLOW_MODELS
-    (default ~/.cache/r2flow/models). Networks are loaded as tensors only, checked and stored in R2FLOW_WEIGHTS (default
-    ~/.cache/r2flow/weights).
+    r2flow does not download: get a network's file, then --add it. It is loaded as tensors only, checked and stored in
+    R2FLOW_WEIGHTS (default ~/.cache/r2flow/weights).
     """
     from r2flow.metrics import FIELD_NAMES
     from r2flow.metrics.extractors.weights import SOURCES, kept, kept_file, weights_folder
     from r2flow.metrics.extractors.weights import add as take
-    from r2flow.models import MODELS, add_model, model_file, models_folder
+    from r2flow.models import MODELS
     from r2flow.reports.tables import print_table
 
     if add is not None:
         name, path = add
-        if name in MODELS:
-            print(f"{add_model(name, path)}: the model {name}")
-            return
-        Registry("weights", **dict(MODELS.items()), **dict(SOURCES.items()))[name]
         print(f"{kept_file(name)}: weights {take(name, path)} of {path.name}")
         return
-    models = [
-        (name, model.about, "yes" if model_file(name).is_file() else "no", model.page or "in the package")
-        for name, model in MODELS.items()
-    ]
-    print_table(models, ("model", "samples", "installed", "file"))
-    print(f"\nLooked for in {models_folder()} (R2FLOW_MODELS) unless in the package. Sample: r2flow sample MODEL\n")
+    print_table([(name, model.about) for name, model in MODELS.items()], ("model", "samples"))
+    print()
     rows = [(name, FIELD_NAMES[name].upper(), kept(name) or "no", Path(page).name) for name, page in SOURCES.items()]
     print_table(rows, ("network", "distance", "installed", "published file"))
     print(f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Install one: r2flow weights --add NAME FILE")

@@ -104,14 +104,13 @@ class NetworkFlow(Flow):
         new = {name: value for name, value in state.items() if not name.startswith("backbone.")}
         new |= {name: state[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
         if not torch.equal(self.space.rays, parent.space.rays):
-            inherited |= {name: value for name, value in state.items() if name.endswith(".coords")}  # inner ones too
+            inherited |= {name: value for name, value in state.items() if name.endswith(".coords")}
             sized = [name for name, value in inherited.items() if name in state and value.shape != state[name].shape]
             if sized:
                 size, parent_size = ("x".join(map(str, flow.space.shape)) for flow in (self, parent))
                 raise InputError(
                     f"the parent has weights for images of {parent_size} ('{sized[0]}'), found {size}: leave "
-                    f"sensor out, give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}, "
-                    "or first grow the parent to a multiple of its size (examples/street/growing.py)."
+                    f"sensor out, or give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}."
                 )
         self._take(parent, {**new, **inherited})
 

@@ -176,12 +176,9 @@ def test_a_rolled_ring_gives_a_rolled_velocity_without_position(name):
         assert not model.learns_directions
 
 
-@pytest.mark.parametrize(("name", "options"), [
-    ("hdit", {"detail": [2, 8], "position": "none", "window": [3, 5], "depths": [1, 1]}),
-    ("pyramid", {"inner": {**tiny_options("adm_unet"), "position": "none"}}),
-])  # fmt: skip
-def test_a_turned_image_gives_a_turned_answer(name, options):
-    model, x = tiny(name, **options).double(), image().double()
+def test_a_turned_image_gives_a_turned_answer():
+    model = tiny("hdit", detail=[2, 8], position="none", window=[3, 5], depths=[1, 1]).double()
+    x = image().double()
     assert torch.allclose(model(0.4, x.roll(16, -1)), model(0.4, x).roll(16, -1), atol=1e-5)  # rays are float32
 
 

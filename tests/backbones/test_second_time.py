@@ -38,7 +38,7 @@ def test_training_reaches_the_second_time(name):
     _, two = grown(name)
     x, t, s = image(), torch.tensor([0.2, 0.7]), torch.tensor([0.9, 0.8])
     zero = [p for n, p in two.named_parameters() if n in two.second_time_names() and not p.any()]
-    assert len(zero) == (2 if name == "pyramid" else 1)  # its own and the inner network's
+    assert len(zero) == 1
     new = [p for n, p in two.named_parameters() if n in two.second_time_names()]
     for reached in (zero, new):
         two.zero_grad()

@@ -59,7 +59,7 @@ def test_options_that_cannot_work_say_why(name, options, message):
 
 
 @pytest.mark.parametrize(("name", "key", "value"), [
-    ("adm_unet", "base_channels", 2), ("efficient_unet", "base_channels", 9), ("pyramid", "time_channels", 1),
+    ("adm_unet", "base_channels", 2), ("efficient_unet", "base_channels", 9),
 ])  # fmt: skip
 def test_widths_without_a_time_embedding_are_refused(name, key, value):
     with pytest.raises(InputError, match=rf"{key} must be .* of at least (4 that is even|2), found {value}"):

@@ -7,8 +7,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from r2flow.backbones import Pyramid
-from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.space import ModelSpace
@@ -50,8 +48,6 @@ class Diffusion(NetworkFlow):
         clip: Positive | None = 1.0,
     ) -> None:
         super().__init__(space, backbone)
-        if isinstance(self.backbone, Pyramid):
-            raise InputError("a pyramid needs the time of straight lines, and a diffusion has another: choose hdit.")
         self.prediction, self.clip, self.answer = PREDICTIONS[prediction], clip, f"{prediction}(z, log-SNR)"
         self.schedule = SCHEDULES.build(schedule or {"name": "cosine"})
         self.run_by(DDPM(256))  # as in the published scripts
