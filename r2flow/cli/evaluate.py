@@ -18,6 +18,7 @@ from r2flow.cli.options import (
     choose_device,
     grouped,
     numbers,
+    separate,
 )
 from r2flow.errors import InputError, check
 
@@ -229,14 +230,15 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
     """One set per sampler and number of steps that suits the generator, by name."""
     from r2flow.evaluation.sets import sampled_set
 
-    names = options.sampler.split(",") if options.sampler else [None]
+    names = separate(options.sampler) if options.sampler else [None]
     steps = numbers("steps", options.steps) if options.steps else [None]
-    sets: dict[str, ScanSet] = {}
-    for sampler in _samplers(flow.generator, names, steps, options.tolerance):
+    sets, samplers = {}, _samplers(flow.generator, names, steps, options.tolerance)
+    plain = [str(sampler) for sampler in samplers]
+    for sampler in samplers:
         line = f"{label}, {sampler.name}" if len(names) > 1 else label
         count = getattr(sampler, "steps", None)
         name = f"{line}, {count} step{'s' * (count > 1)}" if count and len(steps) > 1 else line
-        name = f"{label}, {sampler.text}" if name in sets else name
+        name = f"{label}, {sampler.text}" if plain.count(str(sampler)) > 1 else name
         sets[name] = sampled_set(flow, line, options.num or SAMPLED, sampler, options.seed, options.precision)
     return sets
 

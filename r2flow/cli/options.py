@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
@@ -164,6 +165,11 @@ class DrawOptions:
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends only on the seed and i.")] = 0
     batch_size: Annotated[int, typer.Option(min=1, help="Scans per batch.")] = 1
     device: DeviceOption = "auto"
+
+
+def separate(samplers: str) -> list[str]:
+    """Split at commas, except those in a list of times."""
+    return re.split(r",(?![^\[]*\])", samplers)
 
 
 def numbers(option: str, text: str) -> list[int]:

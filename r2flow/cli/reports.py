@@ -26,6 +26,7 @@ from r2flow.cli.options import (
     grouped,
     numbers,
     rows_and_columns,
+    separate,
 )
 from r2flow.errors import InputError, check
 
@@ -185,7 +186,7 @@ def completion(
     ways = [
         Way(name, model, completing(model.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
         for name, model in loaded.items()
-        for sampler in (samplers.split(",") if samplers else [None])
+        for sampler in (separate(samplers) if samplers else [None])
     ]
     first, names = ways[0].checkpoint, [way.name for way in ways]
     ways = [

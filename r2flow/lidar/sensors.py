@@ -105,7 +105,7 @@ class Sensor:
             )
         if rows > old:
             e, beam = self.elevations, np.arange(-1, old + 1)  # with a step beyond the first and the last beam
-            beams = [2 * e[0] - e[1], *e, 2 * e[-1] - e[-2]]
+            beams = [min(2 * e[0] - e[1], e[0] / 2 + 45), *e, max(2 * e[-1] - e[-2], e[-1] / 2 - 45)]
             middle = np.interp(np.arange(rows), (2 * beam + 1) * rows // (2 * old), beams)
         else:
             edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)

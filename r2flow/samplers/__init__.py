@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from r2flow.errors import check
+from r2flow.errors import InputError, check
 from r2flow.flow.solvers import SOLVERS, usual_grid
 from r2flow.registry import Registry, lazy
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _with_steps
@@ -82,7 +82,10 @@ def _plain(text: str) -> Any:
     try:
         return yaml.safe_load(text) if text.lstrip("-").isdigit() else float(text)
     except ValueError:
-        return yaml.safe_load(text)
+        try:
+            return yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise InputError(f"a sampler's value cannot be read: {text!r}.") from None
 
 
 def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:

@@ -132,8 +132,8 @@ class Sampler(ABC):
 
     @property
     def text(self) -> str:
-        """`NAME:FIELD=VALUE:...` with all fields, as `parse_sampler` reads it."""
-        return ":".join([self.name, *(f"{key}={value}" for key, value in self._fields().items())])
+        """`NAME:FIELD=VALUE:...`, as `parse_sampler` reads it."""
+        return ":".join([self.name, *(f"{key}={value}" for key, value in self._fields().items() if value is not None)])
 
     def __str__(self) -> str:
         steps = getattr(self, "steps", None)
