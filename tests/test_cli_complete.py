@@ -376,22 +376,16 @@ def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
     assert (scan.read().state != Ray.UNKNOWN).any(1).sum() == 16
 
 
-def test_points_outside_the_limits_are_counted(complete, tmp_path: Path):
-    xyz = sparse_scan(tmp_path / "whole.ply")
+def test_points_outside_the_limits_and_sectors_never_scanned_are_told(complete, tmp_path: Path):
+    xyz, asked = sparse_scan(tmp_path / "whole.ply"), ("--to", "vlp16", "--size", "32x360")
+    assert "invented" not in success(complete(tmp_path / "whole.ply", *asked))
+    write_points(tmp_path / "front.ply", xyz[np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 3])
+    assert re.search("no ray .* up to (239|240) degrees", success(complete(tmp_path / "front.ply", *asked)))
     xyz[:300] /= 100  # 0.1 m away
     xyz[300] = 0  # a ray without return
     write_points(tmp_path / "some.ply", xyz)
     kept = f"; {len(xyz) - 301:,} are kept, 300 outside 0.5-100 m are left out"
-    assert kept in success(complete(tmp_path / "some.ply", "--to", "vlp16", "--size", "32x360"))
-
-
-def test_sectors_never_scanned_are_told(complete, tmp_path: Path):
-    xyz = sparse_scan(tmp_path / "whole.ply")
-    front = xyz[np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 3]
-    write_points(tmp_path / "front.ply", front)
-    asked = "--to", "vlp16", "--size", "32x360"
-    assert "invented" not in success(complete(tmp_path / "whole.ply", *asked))
-    assert re.search("no ray .* up to (239|240) degrees", success(complete(tmp_path / "front.ply", *asked)))
+    assert kept in success(complete(tmp_path / "some.ply", *asked))
 
 
 @pytest.mark.parametrize(("rows", "columns", "named"), [(4, 64, True), (8, 32, True), (4, 32, True), (8, 32, False)])

@@ -10,7 +10,6 @@ import torch
 from safetensors import safe_open
 
 import r2flow
-from r2flow import models
 from r2flow.config import learned
 from r2flow.data.pairs import default_folder
 from r2flow.errors import InputError
@@ -114,7 +113,7 @@ def test_a_run_or_a_file_of_a_models_name_comes_first(saved, tmp_path, monkeypat
 
 def test_a_damaged_file_is_not_the_model(tmp_path, monkeypatch):
     data = bytearray(find_model("densify").read_bytes())
-    monkeypatch.setattr(models, "FOLDER", tmp_path)
+    monkeypatch.setattr("r2flow.models.FOLDER", tmp_path)
     with pytest.raises(InputError, match="the model densify is not here"):
         load_checkpoint("densify")
     data[-1] ^= 1

@@ -43,7 +43,7 @@ class ScanSource(ABC):
         measured: Whether the measured points of the pixels are available; they are not for range images, prepared
             shards, samples and simulated scans.
         drives: Numbers of the scans of each recording, by its name, if known.
-        contents: What is cheaply known of the scans beside their names, equal for a copy of the data set.
+        contents: Digest of what is cheaply known of the scans, equal for a copy of the data set.
     """
 
     slow = False

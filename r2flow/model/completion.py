@@ -102,9 +102,7 @@ def complete(
         how = sampler.changed(**changes)
     else:
         how = completing(generator, sampler, several=num > 1, **changes)
-    check(
-        num >= 1 and batch_size >= 1, f"needs at least 1 answer and a batch of at least 1; found {num}, {batch_size}."
-    )
+    check(min(num, batch_size) >= 1, f"give answers and a batch of at least 1; found {num}, {batch_size}.")
     plain = generator.sampler if how.completes else how  # for a scan without a known ray
     images = torch.as_tensor(images).detach().float().cpu()
     if state is None:

@@ -145,10 +145,10 @@ def export(
         InputError: an unknown suffix, a generator that is not a flow, a sampler that cannot be exported, a missing
             package, or a network that torch cannot export.
     """
-    path, flow = Path(path), deepcopy(checkpoint.generator)  # tracing moves it to the CPU and sets its mode
+    path, flow = Path(path), checkpoint.generator
     if not isinstance(flow, RectifiedFlow):
         raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
-    write = FORMATS[path.suffix.removeprefix(".")]
+    write, flow = FORMATS[path.suffix.removeprefix(".")], deepcopy(flow)  # which tracing moves and changes
     how = sampler if isinstance(sampler, Sampler) else flow.choose(sampler)
     own = type(flow).velocity is not RectifiedFlow.velocity
     check(not (network and own), f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler.")

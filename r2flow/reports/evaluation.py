@@ -21,7 +21,7 @@ from r2flow.reports.tables import print_table, shown, table
 
 ENDS = (" low", " high")  # suffixes of interval limits
 DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
-UNBIASED = ("kid_", "mmd_unbiased", "speed")
+UNBIASED = ("kid_", "mmd_unbiased", "speed")  # do not depend on the number of scans
 ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
 MARGIN = 1.25  # sets of the same source differ by as much
 HEADLINE = "panel"  # metric of the verdict, if measured
@@ -103,10 +103,10 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
         compared, pair = as_many or (value, comparison)
         scans, of_half = (min(len(c.real), len(c.generated)) for c in (pair, halves))
         farther = compared > MARGIN * max(reference, 0)
-        beside = "" if not baselines else ", below the baselines" if value < best else ", not below the baselines"
+        clause = "" if not baselines else ", below the baselines" if value < best else ", not below the baselines"
         if min(scans, of_half) < ENOUGH:
             judgement = (
-                f"{'above' if compared > reference else 'not above'} the real halves{beside}; too few scans "
+                f"{'above' if compared > reference else 'not above'} the real halves{clause}; too few scans "
                 f"for a verdict: {len(comparison.real)} real, {len(comparison.generated)} generated, {2 * ENOUGH} and "
                 f"{ENOUGH} needed"
             )

@@ -9,6 +9,7 @@ To add a sampler, derive a dataclass from `Sampler` and call `SAMPLERS.add(name,
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -79,13 +80,12 @@ def parse_sampler(text: str) -> dict[str, Any]:
 
 
 def _plain(text: str) -> Any:
+    with suppress(ValueError):  # YAML takes 1e-3 for a word
+        return int(text) if text.lstrip("-").isdigit() else float(text)
     try:
-        return yaml.safe_load(text) if text.lstrip("-").isdigit() else float(text)
-    except ValueError:
-        try:
-            return yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise InputError(f"a sampler's value cannot be read: {text!r}.") from None
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(f"a sampler's value cannot be read: {text!r}.") from None
 
 
 def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:

@@ -177,8 +177,8 @@ def test_a_rolled_ring_gives_a_rolled_velocity_without_position(name):
 
 
 def test_a_turned_image_gives_a_turned_answer():
-    model = tiny("hdit", detail=[2, 8], position="none", window=[3, 5], depths=[1, 1]).double()
-    x = image().double()
+    options = {"detail": [2, 8], "position": "none", "window": [3, 5], "depths": [1, 1]}
+    model, x = tiny("hdit", **options).double(), image().double()
     assert torch.allclose(model(0.4, x.roll(16, -1)), model(0.4, x).roll(16, -1), atol=1e-5)  # rays are float32
 
 

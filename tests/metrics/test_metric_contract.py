@@ -185,6 +185,8 @@ def test_what_is_no_batch_of_scans_is_refused_in_one_line(build, sets):
         with pytest.raises(InputError, match=rf"^'{metric.name}' takes .*sensor"):
             metric.update(wrong, real=True)
     assert metric.given("real") == 0
+    with pytest.raises(InputError, match=r"a tensor of images once it has their sensor: .*; found ndarray\.$"):
+        METRICS["jsd"](sensor=SMALL).update(images().numpy(), real=True)
 
 
 # What torchmetrics promises of every metric
@@ -231,11 +233,6 @@ def test_moving_and_setting_a_dtype_change_no_figure(build, sets):
     metric = told(build(sensor=SMALL), sets).to("cpu").set_dtype(torch.float16).half()
     metric.reset()
     assert told(metric, sets).compute() == expected
-
-
-def test_images_of_numpy_are_refused_as_such():
-    with pytest.raises(InputError, match=r"a tensor of images once it has their sensor: .*; found ndarray\.$"):
-        METRICS["jsd"](sensor=SMALL).update(images().numpy(), real=True)
 
 
 def images(n=3):

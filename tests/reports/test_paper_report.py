@@ -27,9 +27,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def test_every_run_finds_its_role(runs):
     assert {role: role_of(load_checkpoint(run), "label") for role, run in runs.items()} == {r: r for r in runs}
-
-
-def test_a_role_is_also_of_what_a_run_was_learned_from(runs):
     checkpoint = load_checkpoint(runs["2-RF"])
     for parent, role in (("rectify", "2-RF"), ("reflow", "label")):  # reflow of a 2-RF is a 3-RF
         checkpoint.config["parent"] = {"stage": parent}

@@ -35,11 +35,6 @@ LINKS = ("rf1", "rf2", "td2")
 SCANS_ALONE = ("data=", "sensor", "backbone", "data.root")
 
 
-def test_a_chain_is_not_built_as_one_run():
-    with pytest.raises(InputError, match="a chain of runs: train it by `r2flow train`"):
-        build(compose(["experiment=demo"]))
-
-
 def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatch, capsys):
     said: list[str] = []
     out = tmp_path / "preview" / "samples.png"

@@ -96,9 +96,11 @@ def test_a_wrong_value_is_refused(tmp_path: Path, arguments: str, words: str):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_python_explains_a_wrong_key_as_the_command_line():
+def test_python_refuses_a_wrong_key_and_a_chain():
     with pytest.raises(InputError, match=r"no key 'trainer.max_step'. Did you mean 'trainer.max_steps'\?"):
         compose(["trainer.max_step=3"])
+    with pytest.raises(InputError, match="a chain of runs: train it by `r2flow train`"):
+        build(compose(["experiment=demo"]))
 
 
 def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):

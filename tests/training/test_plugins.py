@@ -2,7 +2,6 @@
 
 import importlib
 import importlib.metadata
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -173,4 +172,4 @@ def test_an_example_lacks_its_files_alone(tmp_path: Path, name: str):
     root = ("data.root=runs/street/scenes",) if name == "finetune_map" else ()
     command = ["--plugin", str(EXAMPLE / "street_stage.py"), "--config-dir", str(EXAMPLE), f"experiment={name}"]
     done = in_process(tmp_path, [*command, *of_links, *root], check=False)
-    assert re.search(r"runs/street/scenes", done.refusal)
+    assert "runs/street/scenes" in done.refusal

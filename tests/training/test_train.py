@@ -184,8 +184,7 @@ def test_damaged_checkpoints_of_later_steps_are_set_aside(train: Run, copied: Pa
         newest.with_name(f"step-{step:08d}.ckpt").write_bytes(b"half")
     newest.unlink()
     train("name=copied")
-    assert checkpoints_of(copied) == [newest, older]
-    assert len([*newest.parent.glob("*.damaged")]) == 2
+    assert (checkpoints_of(copied), len([*newest.parent.glob("*.damaged")])) == ([newest, older], 2)
 
 
 @pytest.mark.parametrize(("before", "keep", "options"), [(20, 1, []), (3, 2, ["callbacks.requeue=null"])])
