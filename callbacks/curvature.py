@@ -11,7 +11,7 @@ from .periodic import Periodic
 
 
 class Curvature(Periodic):
-    """Logs int s(t) dt (paper, eq. 5) of a few scans from fixed noise, if the generator is a flow.
+    """Logs int s(t) dt (paper, eq. 6) of a few scans from fixed noise, if the generator is a flow.
 
     The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/s_normalised`: an untrained
     flow is straight because its paths have almost no length. One measurement is one pass of `steps` Euler steps;

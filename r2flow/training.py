@@ -148,7 +148,7 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
     if config.get("chain"):
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
     with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
-        parent, checkpoint = find_parent(config) or (None, None)
+        parent, checkpoint = find_parent(config["stage"].get("init")) or (None, None)
         config = _checked(config, asked, parent)
         encoding = config["encoding"]
         encoding["reflectance"] = resolve_reflectance(encoding.get("reflectance", AUTO), config["data"])
@@ -173,7 +173,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
     """
     check_keys(config)
     if parent is None:
-        parent, _ = find_parent(config) or (None, None)
+        parent, _ = find_parent(config["stage"].get("init")) or (None, None)
     config = _checked(config, asked, parent)
     if config["encoding"].get("reflectance", AUTO) == AUTO:
         config["encoding"]["reflectance"] = True  # decided when the scans are read

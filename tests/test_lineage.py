@@ -28,7 +28,7 @@ def child(parent: Path, reflectance) -> dict:
 
 
 def completed(config: dict, asked: list[str]) -> dict:
-    found = find_parent(config)
+    found = find_parent(config["stage"]["init"])
     assert found is not None
     return inherit(config, asked, found[0])
 

@@ -232,7 +232,8 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
 
     names = separate(options.sampler) if options.sampler else [None]
     steps = numbers("steps", options.steps) if options.steps else [None]
-    sets, samplers = {}, _samplers(flow.generator, names, steps, options.tolerance)
+    own = [flow.generator.sampler] if flow.generator.fixed else None
+    sets, samplers = {}, own or _samplers(flow.generator, names, steps, options.tolerance)
     plain = [str(sampler) for sampler in samplers]
     for sampler in samplers:
         line = f"{label}, {sampler.name}" if len(names) > 1 else label

@@ -179,10 +179,12 @@ def completion(
 
     loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or [DENSIFY]}
     stored = own_reading(real)
+    own = next((m.sensor for m in loaded.values() if not isinstance(m.generator, TransferFlow)), None)
     for name, model in loaded.items():
-        other = stored.sensor if stored and isinstance(model.generator, TransferFlow) else None
+        other = (own or (stored and stored.sensor)) if isinstance(model.generator, TransferFlow) else None
         if sensor or size or other:
             loaded[name] = model.through(named_sensor(sensor or other or model.sensor, rows_and_columns(size)))
+        check(own in (None, loaded[name].sensor), f"{name} is a model of another sensor or size: report it apart.")
     ways = [
         Way(name, model, completing(model.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
         for name, model in loaded.items()

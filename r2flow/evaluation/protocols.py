@@ -22,14 +22,22 @@ WORDS = {"measured": "as measured", "centre": "on rays through bin centres", "re
 
 @dataclass(frozen=True)
 class Rules:
-    """A protocol."""
+    """A protocol.
+
+    Attributes:
+        real, generated: Position of a pixel's point: as measured, or on the ray through its bin's centre or upper left
+            corner ("reference").
+        convention: Default projection of point clouds to images; None: the model's.
+        choose: Sorted indices of at most n scans of a set.
+        chosen: Description of the choice.
+    """
 
     name: str
-    real: Points  # position of a pixel's point: as measured, or on the ray through its bin's centre or upper left
-    generated: Convention  # corner ("reference")
-    convention: Convention | None  # default projection of point clouds to images; None: the model's
-    choose: Callable[[ScanSet, int], Sequence[int]]  # sorted indices of at most n scans of a set
-    chosen: str  # description of the choice
+    real: Points
+    generated: Convention
+    convention: Convention | None
+    choose: Callable[[ScanSet, int], Sequence[int]]
+    chosen: str
 
     def describe(self) -> dict[str, Any]:
         """Entries for the protocol of a result."""

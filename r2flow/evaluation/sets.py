@@ -66,7 +66,7 @@ class SampledScans(MadeScans):
 
     def subset(self, indices: Sequence[int]) -> Self:
         part = super().subset(indices)
-        part.evaluations, part.seconds = [], []
+        part.evaluations, part.seconds, part.unsolved = [], [], 0
         return part
 
     def batch(self, indices: Sequence[int]) -> Tensor:

@@ -1,4 +1,4 @@
-"""Straightness of a flow's paths: the paper's s(t) (eq. 5), its integral, and the most curved pixels.
+"""Straightness of a flow's paths: the paper's s(t) (eq. 6), its integral, and the most curved pixels.
 
     s(t) = |d - v_t|^2,  d = Phi(x_0, 1) - x_0,  v_t = v(t, Phi(x_0, t)),
 

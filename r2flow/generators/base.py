@@ -129,6 +129,8 @@ class Generator(nn.Module):
             sampler = build_sampler(
                 {"name": name, **({"steps": steps} if "steps" in names and "grid" not in given else {}), **given}
             )
+        if self.fixed and sampler != self.sampler:
+            raise InputError(f"this model is distilled for {self.sampler.text} alone: leave the sampler and its steps out.")
         sampler.check(self)
         return sampler
 

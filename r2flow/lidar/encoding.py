@@ -33,7 +33,7 @@ class RangeFormat:
 
 
 class LogScale(RangeFormat):
-    """log2(r + 1) / log2(r_max + 1), the paper's eq. 4: finer near the sensor."""
+    """log2(r + 1) / log2(r_max + 1), the paper's eq. 5: finer near the sensor."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.scale = math.log2(sensor.max_range + 1)

@@ -61,7 +61,6 @@ def default_metrics(reflectance: bool) -> tuple[str, ...]:
     """Default metrics, which need no downloads; the headline first.
 
     KID and the unbiased MMD, which are unbiased for few scans, accompany the usual Frechet distance and MMD.
-    Docs: metrics.md, "The headline".
     """
     features = "handcrafted" if reflectance else "handcrafted_range"
     return ("panel", f"kid_{features}", f"frechet_{features}", "jsd", "mmd", "mmd_unbiased")

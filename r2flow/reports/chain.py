@@ -100,10 +100,10 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 
 def bend(flow: Checkpoint, num: int) -> float:
-    """int s(t) dt over |x_1 - x_0|^2, median over scans: 0 is straight; NaN for generators without paths."""
+    """int s(t) dt over |x_1 - x_0|^2, mean over scans: 0 is straight; NaN for generators without paths."""
     generator = flow.generator
     if not isinstance(generator, Flow):
         return math.nan
     x_0 = Draws(0, range(num)).start(generator.noise_shape).to(generator.device)
     with torch.inference_mode():
-        return float(curvature(generator.velocity, x_0, MANY).normalised.median())
+        return float(curvature(generator.velocity, x_0, MANY).normalised.mean())

@@ -112,7 +112,7 @@ COLUMNS = {
 def curvature_text(flows: Sequence[Paths]) -> list[str]:
     """Text: definition of s(t), and the table of flows."""
     about = (
-        "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 5), the mean over "
+        "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 6), the mean over "
         f"{len(flows[0].s)} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight "
         "path, which one step follows exactly. An untrained flow with v = 0 is straight too: compare int s dt over "
         "the squared length |x_1 - x_0|^2."

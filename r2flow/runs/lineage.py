@@ -34,9 +34,8 @@ class Parent:
     weights: str | None = None
 
 
-def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
-    """The parent named by a config's `stage.init`, if any."""
-    init = config["stage"].get("init")
+def find_parent(init: str | Path | None) -> tuple[Parent, Checkpoint] | None:
+    """The parent that a config's `stage.init` names, if any."""
     if init is None:
         return None
     checkpoint = load_checkpoint(str(init))
@@ -124,7 +123,7 @@ def drawn_by(config: Mapping[str, Any]) -> str | None:
 
 def _drawer(config: Mapping[str, Any], parent: Parent) -> Parent:
     of = (config["data"].get("pairs") or {}).get("of")
-    drawer = find_parent({"stage": {"init": of}})
+    drawer = find_parent(of)
     if drawer is None:
         return parent
     for group in ("sensor", "encoding"):

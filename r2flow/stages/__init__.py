@@ -59,13 +59,7 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
 
 def _choose(generator: Generator, config: Mapping[str, Any]) -> None:
     """Set a generator's default samplers from a config's `sampler` and `few`."""
-    default, options = generator.sampler, dict(config.get("sampler") or {})
-    sampler, few = generator.choose(**options), config.get("few")
-    if generator.fixed and sampler != default:
-        raise InputError(
-            f"this stage trains for one sampler alone, {default}: leave sampler.* out; in a chain give it to one link, "
-            "such as chain.rf1.sampler.steps=32."
-        )
+    sampler, few = generator.choose(**dict(config.get("sampler") or {})), config.get("few")
     if sampler.completes:
         raise InputError(f"sampler.name={sampler.name} completes scans: give it to r2flow complete by --sampler.")
     if few is not None:

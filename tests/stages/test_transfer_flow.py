@@ -223,7 +223,7 @@ def test_the_velocity_leads_to_the_mean_of_the_answers(flow, scans, monkeypatch)
     (answers,) = seen
     p, q = answers.logits.exp().double().numpy(), answers.returns.sigmoid().double().numpy()[:, 0]
     r = np.exp(answers.ranges.double().numpy()).clip(1.45, 80)
-    mean = q * (p * (2 * np.log2(r + 1) / np.log2(81) - 1)).sum(1) - (1 - q)  # the paper's eq. 4; -1 is no return
+    mean = q * (p * (2 * np.log2(r + 1) / np.log2(81) - 1)).sum(1) - (1 - q)  # the paper's eq. 5; -1 is no return
     hidden = (state == Ray.UNKNOWN).numpy() & (x[:, 0] != -1).numpy()  # rows beyond the measured ones stay empty
     assert hidden.sum() > 300
     assert np.allclose(x[:, 0].numpy()[hidden], mean[hidden], atol=1e-5)

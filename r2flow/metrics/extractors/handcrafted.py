@@ -4,7 +4,7 @@ The statistics describe differences of neighbouring returns along rows and colum
 range and reflectance. Each is a mean over half of the rows, invariant to rotation of the scan. Six are also computed
 per azimuth sector, which distinguishes rotated and mirrored scans.
 
-Statistics, bands, sectors and scale were chosen on half of the corruptions in docs/metrics.md.
+Statistics, bands, sectors and scale were chosen on half of a set of corruptions of scans.
 """
 
 from collections.abc import Iterator
