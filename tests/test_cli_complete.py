@@ -369,6 +369,15 @@ def test_a_wrong_sensor_of_the_scans_is_warned_of(tmp_path: Path, caplog: pytest
     assert all(words in caplog.text for words in ("--from os1_64 does not fit", "they fit --from vlp16"))
 
 
+def test_points_of_a_pitched_vehicle_are_warned_of_and_completed(complete, tmp_path: Path):
+    xyz, c, s = sparse_scan(tmp_path / "0.ply"), np.cos(np.radians(5)), np.sin(np.radians(5))
+    assert complete(tmp_path / "0.ply", "--from", "vlp16")[::2] == (0, "")
+    write_points(tmp_path / "1.ply", xyz @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]))
+    code, said, error = complete(tmp_path / "1.ply", "--from", "vlp16", out=tmp_path / "pitched")
+    assert (code, error.count("\n"), "1 scans written" in said) == (0, 1, True), error
+    assert "are the points in the sensor's own frame?" in error
+
+
 def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
     sparse_scan(tmp_path / "0.ply")
     ((scan,), (said,)) = open_partial([str(tmp_path)], Reading(VLP16.resized(64, 900)))

@@ -110,7 +110,7 @@ def sensor(
     Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py (sensor=mine).
     """
     from r2flow.data.sources import spread
-    from r2flow.lidar.beams import estimate_sensor, nearest_sensor
+    from r2flow.lidar.beams import estimate_sensor, is_tilted, nearest_sensor
     from r2flow.lidar.scan_files import read_points
     from r2flow.lidar.sensor_files import ENDINGS, write_sensor
     from r2flow.lidar.sensors import SENSORS
@@ -141,7 +141,7 @@ def sensor(
         ("reflectance", "none: encoding.reflectance=false" if scale is None else f"reflectance_scale={scale:g}"),
     ]
     print_table(rows, ("", ""))
-    if off > MOST_OFF:
+    if off > MOST_OFF or is_tilted(points):
         log.warning("points %.2f degrees off their beams: are they in one sensor's frame, not the vehicle's?", off)
     if out is not None:
         write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")

@@ -17,7 +17,7 @@ import numpy as np
 from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, scale_of
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
-from r2flow.data.sources import LOOKED_AT, spread
+from r2flow.data.sources import LOOKED_AT, spread, warn_of_tilt
 from r2flow.errors import InputError, naming
 from r2flow.lidar.beams import FULL_REFLECTANCE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending
@@ -110,9 +110,6 @@ def _files(
         scans = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
         own = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
         doubt = other_sensor(scans, source or own)
-        if source and doubt and not (stored or doubt.finer):
-            fits = f"; they fit --from {doubt.name}" if doubt.name else ""
-            log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         if not source and not doubt and own.shape[0] < target.shape[0]:
             source = own  # fewer beams than rows of the completions
         same = doubt is None
@@ -122,6 +119,9 @@ def _files(
             fired = sensor_of(scans, source or (target if same else None))
         except InputError as error:
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
+        if not stored and not warn_of_tilt(points[0], scans) and source and doubt and not doubt.finer:
+            fits = f"; they fit --from {doubt.name}" if doubt.name else ""
+            log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         estimated = full_reflectance(scans) or 0.0
         if same and fired.columns >= FEWER * target.columns:
             of_sensor, options = (source or target).reflectance_scale, parse(spec)[0]

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
-from r2flow.errors import InputError
-from r2flow.lidar.beams import Doubt, other_sensor
-from r2flow.lidar.scan_files import read_points, read_range_image, scan_ending
+from r2flow.errors import InputError, warn_odd
+from r2flow.lidar.beams import Doubt, is_tilted, other_sensor
+from r2flow.lidar.scan_files import Points, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import MANIFEST
 
@@ -105,7 +105,7 @@ def made_here(root: str | Path) -> bool:
 
 
 def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> Doubt | None:
-    """The mismatch of a few scan files and a sensor (`other_sensor`).
+    """The mismatch of a few scan files and a sensor (`other_sensor`); warns instead of one due to a tilt.
 
     Only for plain scan files: files that r2flow wrote store their sensor, and range images have no beams. Unreadable
     files are reported when they are read as scans.
@@ -114,7 +114,17 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path)
     for number in spread(len(paths), LOOKED_AT if not made_here(root) else 0):
         with suppress(InputError):
             scans.append(read_points(paths[number], reading.columns))
-    return other_sensor(scans, reading.sensor) if scans else None
+    mismatch = other_sensor(scans, reading.sensor) if scans else None
+    if not scans or (mismatch and mismatch.hopeless):
+        return mismatch
+    return None if warn_of_tilt(paths[0], scans) and not (mismatch and mismatch.sure) else mismatch
+
+
+def warn_of_tilt(path: str | Path, scans: Sequence[Points]) -> bool:
+    """Warn, once per folder, of scans that are not in their sensor's own frame; whether they are not."""
+    if tilted := is_tilted(scans):
+        warn_odd(Path(path), "its beams are clearer if it is tilted: are the points in the sensor's own frame?")
+    return tilted
 
 
 def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:

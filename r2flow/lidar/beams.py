@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +29,9 @@ IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scan
 OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
 MOST_VOID = 0.1  # share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16
 BEATEN = 0.5  # degrees: beyond it, a sensor does not match if another sensor is twice as near
+TILTS = np.arange(-10, 10.5, 0.5)  # degrees
+LEVEL = 1.0  # degrees: a smaller tilt is no other frame; KITTI's odometry scans have half a degree
+CLEARER = 1.12  # beams this much clearer after a larger tilt are of another frame; real scans have 1.03 at most
 
 RINGS = "a ring number at each point"
 FIRINGS = "firing after firing, rays without return kept"
@@ -118,6 +121,23 @@ def _rows_between_beams(elevation: np.ndarray, edges: np.ndarray) -> int:
     count = np.histogram(-elevation, -edges)[0]
     seen = np.flatnonzero(count > 0.02 * np.median(count))
     return int(seen[-1] - seen[0] + 1 - len(seen)) if len(seen) else 0
+
+
+def is_tilted(scans: Sequence[Points]) -> bool:
+    """Whether beams become clearer if the points are pitched and rolled: they are not in the sensor's own frame.
+
+    Beams are clear if few elevations have many points: by the sum of squares of their histogram.
+    """
+    xyz = np.concatenate([scan.xyz[scan.xyz.any(axis=1)] for scan in scans])
+    if len(xyz) < 5 * FEWEST_RETURNS:
+        return False
+    xyz = xyz[np.random.default_rng(0).integers(len(xyz), size=5000)]
+    elevation, azimuth = 110 + elevations_of(xyz), np.arctan2(xyz[:, 1], xyz[:, 0])
+    ahead, clear = np.stack([np.cos(azimuth), np.sin(azimuth)]), {}
+    for tilt in product(TILTS, TILTS):
+        count = np.bincount(((elevation - tilt @ ahead) / 0.05).astype(np.int64))
+        clear[tilt] = float((np.convolve(count, np.ones(5)) ** 2).sum())
+    return max(clear.values()) > CLEARER * max(clear[tilt] for tilt in clear if max(map(abs, tilt)) <= LEVEL)
 
 
 def nearest_sensor(elevations: np.ndarray) -> tuple[str | None, float]:

@@ -17,6 +17,7 @@ from r2flow.lidar.beams import (
     estimate_sensor,
     find_beams,
     full_reflectance,
+    is_tilted,
     nearest_sensor,
     other_sensor,
 )
@@ -255,6 +256,29 @@ def test_real_scans_are_of_their_own_sensor_alone(shared: Path, pattern: str):
     for one in scans:
         for name in HDL64E if true in HDL64E else {true} - {"os1_64"}:
             assert other_sensor([one], SENSORS[name]) is None
+        assert not is_tilted([one])
+
+
+def pitched(points: Points, degrees: float) -> Points:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return Points((points.xyz @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T).astype(np.float32), None, points.ring)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_points_in_the_frame_of_a_pitched_vehicle_are_told(name: str):
+    level = scan(SENSORS[name].resized(columns=384), UNORDERED)
+    for degrees, told in ((0, False), (0.5, False), (2, True), (-5, True)):
+        assert is_tilted([pitched(level, degrees)]) == told, degrees
+
+
+def test_real_scans_are_tilted_only_in_another_frame(shared: Path):
+    for points in real(shared, "other_sensors/vlp16/*.pcd"):
+        assert is_tilted([pitched(points, 5)])
+    for points in real(shared, "*/**/*.bin", step=6):
+        quarter = points.xyz[find_beams([points]).of_point[0] % 4 == 0]
+        noisy = quarter + np.random.default_rng(0).normal(0, 0.02, quarter.shape).astype(np.float32)
+        assert [is_tilted([one]) for one in (points, Points(quarter), Points(noisy))] == [False] * 3
+        assert is_tilted([pitched(Points(quarter), 5)])
 
 
 def test_a_part_of_the_view_is_enough(shared: Path):
