@@ -378,6 +378,19 @@ def test_points_of_a_pitched_vehicle_are_warned_of_and_completed(complete, tmp_p
     assert "are the points in the sensor's own frame?" in error
 
 
+def test_points_next_to_range_images_are_completed(complete, r2flow, tmp_path: Path):
+    folder = tmp_path / "in"
+    r2flow.said("simulate", "--num", 1, "--sensor", "vlp16", "--format", "bin,npy", "--labels", "--out", folder)
+    assert len(open_scans(folder)) == 1
+    assert "16: ring after ring" in r2flow.said("sensor", folder)
+    assert r2flow("show", folder, "--labels", "--out", tmp_path / "seen")[::2] == (0, "")
+    success(complete(folder))
+    xyz, answer = (read_points(path / "000000.bin").xyz for path in (folder, tmp_path / "out"))
+    inside = np.linalg.norm(xyz, axis=1)
+    kept = xyz[(inside >= SENSOR.min_range) & (inside <= SENSOR.max_range)]
+    assert np.array_equal(answer[: len(kept)], kept)
+
+
 def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
     sparse_scan(tmp_path / "0.ply")
     ((scan,), (said,)) = open_partial([str(tmp_path)], Reading(VLP16.resized(64, 900)))

@@ -111,7 +111,7 @@ def sensor(
     """
     from r2flow.data.sources import spread
     from r2flow.lidar.beams import estimate_sensor, is_tilted, nearest_sensor
-    from r2flow.lidar.scan_files import read_points
+    from r2flow.lidar.scan_files import points_beside, read_points
     from r2flow.lidar.sensor_files import ENDINGS, write_sensor
     from r2flow.lidar.sensors import SENSORS
     from r2flow.progress import track
@@ -124,7 +124,7 @@ def sensor(
         raise InputError(f"{out} exists; give another --out, or --overwrite to replace it.")
     name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
     name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
-    paths = [folder[index] for folder in map(scans_of, scans) for index in spread(len(folder), most)]
+    paths = [points_beside(folder[index]) for folder in map(scans_of, scans) for index in spread(len(folder), most)]
     points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
     mine, beams, steps, off, ground = estimate_sensor(points, name)
     e, middle = mine.elevations, len(mine.elevations) // 2

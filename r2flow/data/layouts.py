@@ -212,7 +212,7 @@ def _elsewhere(root: Path) -> str:
 
 
 def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
-    images_last = sorted(paths, key=lambda path: path.endswith(".npy"))
+    images_last = sorted(paths, key=lambda path: path.lower().endswith(".npy"))
     kept = set({path[: len(path) - len(scan_ending(path))]: path for path in images_last}.values())
     return tuple(path for path in paths if path in kept)
 

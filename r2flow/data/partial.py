@@ -20,7 +20,7 @@ from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_tilt
 from r2flow.errors import InputError, naming
 from r2flow.lidar.beams import FULL_REFLECTANCE, full_reflectance, other_sensor
-from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending
+from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.transfer import (
     Partial,
@@ -85,7 +85,7 @@ def open_partial(
             groups.setdefault((file.parent, ""), []).append(file)
         else:
             paths = [Path(path) for drive in SOURCES[options.name].find_drives(options) for path in drive.scans]
-            chosen = [paths[number] for number in spread(len(paths), most or len(paths))]
+            chosen = [points_beside(paths[number]) for number in spread(len(paths), most or len(paths))]
             groups[Path(options.folder).expanduser(), str(spec)] = chosen
     opened += [
         _files(folder, paths, spec or str(paths[0]), reading, source, scale) for (folder, spec), paths in groups.items()

@@ -129,6 +129,8 @@ def test_linked_folders_are_looked_into_and_circles_end(tmp_path: Path):
 def test_scans_are_in_the_order_of_their_numbers_in_whichever_format(tmp_path: Path):
     for name in ("10", "9", "100", "1", "scan_2", "scan_10"):
         write_scan(tmp_path / f"{name}.bin", 1)
-    (tmp_path / "9.ply").touch()  # a scan in two formats
+    for name in ("9.ply", "9.NPY", "9.xyz"):  # a scan in several formats
+        (tmp_path / name).touch()
     (drive,) = find_drives("folder", tmp_path)
     assert [Path(scan).stem for scan in drive.scans] == ["1", "9", "10", "100", "scan_2", "scan_10"]
+    assert Path(drive.scans[1]).name == "9.NPY"

@@ -28,6 +28,7 @@ __all__ = [
     "NoPointsError",
     "Points",
     "check_columns",
+    "points_beside",
     "read_numbers",
     "read_points",
     "read_range_image",
@@ -101,6 +102,12 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
         names, arrays = _READERS[ending](path, columns)
         check(names is None or columns is None, "it names its columns: leave --columns (data.reading.columns) out.")
         return column_points(names or usual_names(len(arrays), columns), arrays, raw)
+
+
+def points_beside(path: Path) -> Path:
+    """The file of points next to a range image of the same name, if there is one; else the path itself."""
+    others = (path.with_suffix(ending) for ending in WRITTEN if ending != ".npy" and path.suffix.lower() == ".npy")
+    return next((other for other in others if other.is_file()), path)
 
 
 def read_range_image(path: str | Path) -> np.ndarray | None:

@@ -21,7 +21,7 @@ from r2flow.errors import InputError
 from r2flow.generators import as_flow
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.labels import labels_beside
-from r2flow.lidar.scan_files import read_range_image
+from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
@@ -101,7 +101,7 @@ def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray |
 
         made = simulate(source.sensor, source.seed, source.numbers[number])
         return made.image[: 1 + source.reflectance], made.labels
-    path = Path(source.paths[number]) if isinstance(source, ScanFiles) else None
+    path = points_beside(Path(source.paths[number])) if isinstance(source, ScanFiles) else None
     if path is None or labels_beside(path) is None or read_range_image(path) is not None:
         return source[number], None
     return read_labelled_scan(path, replace(source.reading, on_bad_scan="error"))  # type: ignore[attr-defined]
