@@ -158,7 +158,7 @@ def unpack(
 ) -> None:
     """Write the PointCloud2 messages of a recording as scan files, named by time in ns.
 
-    The files contain x, y, z and, if present, intensity and ring.
+    The time is header.stamp, if 0 that of recording. The files contain x, y, z and, if present, intensity and ring.
     """
     from r2flow.lidar.bags import read_bag
     from r2flow.lidar.scan_files import write_points

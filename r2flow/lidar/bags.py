@@ -21,7 +21,8 @@ TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points | InputError]]:
     """Time in nanoseconds and points of each PointCloud2 of a topic, in the order of recording.
 
-    A message that is not a valid scan is yielded as an `InputError`.
+    The time is header.stamp, as poses and labels have it; if 0, that of recording. A message that is not a valid scan
+    is yielded as an `InputError`.
 
     Args:
         topic: Name of the topic; None: the only topic of point clouds.
@@ -46,13 +47,13 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points
     with telling(path), (Reader1 if old else Reader2)(folder) as reader:
         chosen = _choose(path, list(reader.connections), topic)
         for connection, stamp, data in reader.messages(connections=chosen):
-            message = (store.deserialize_ros1 if old else store.deserialize_cdr)(data, connection.msgtype)
+            message: Any = (store.deserialize_ros1 if old else store.deserialize_cdr)(data, connection.msgtype)
             try:
                 with naming(f"{path} at {stamp}"):
                     points: Points | InputError = cloud_points(message)
             except InputError as error:
                 points = error
-            yield stamp, points
+            yield 10**9 * message.header.stamp.sec + message.header.stamp.nanosec or stamp, points
 
 
 def _choose(path: Path, connections: list[Any], topic: str | None) -> list[Any]:

@@ -29,7 +29,7 @@ def fields(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(count) % 256, np.arange(count) % 32
 
 
-def message(store, xyz: np.ndarray, order: str = "<", extra: int = 0):
+def message(store, xyz: np.ndarray, order: str = "<", extra: int = 0, time: tuple[int, int] = (0, 0)):
     """A cloud with padding within its points and, in two rows, behind each row."""
     kind, types = POINT.newbyteorder(order), store.types
     table = np.zeros(len(xyz), kind)
@@ -38,7 +38,7 @@ def message(store, xyz: np.ndarray, order: str = "<", extra: int = 0):
     table["intensity"], table["ring"] = fields(len(xyz))
     rows = table.view(np.uint8).reshape(2, -1) if len(xyz) else np.zeros((2, 0), np.uint8)
     data = np.concatenate([rows, np.zeros((2, extra), np.uint8)], 1)
-    stamp = types["builtin_interfaces/msg/Time"](1, 2)
+    stamp = types["builtin_interfaces/msg/Time"](*time)
     header = {"stamp": stamp, "frame_id": "lidar"}
     if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__:
         header["seq"] = 0
@@ -66,7 +66,7 @@ def record(
     kind: str = "cloud",
     stamps: tuple[int, ...] = (1, 2, 3),
 ) -> Path:
-    """A recording of the three clouds in each topic; the file that a user would name."""
+    """A recording of the three clouds in each topic, the last without header.stamp; the file that a user would name."""
     one = storage == "bag"
     store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
     writer = Writer1(path) if one else Writer(path, version=8, storage_plugin=StoragePlugin[storage])
@@ -75,9 +75,8 @@ def record(
         for topic in topics:
             connection = writer.add_connection(topic, name, typestore=store)
             for number, (xyz, stamp) in enumerate(zip(CLOUDS, stamps, strict=True)):
-                content = (
-                    message(store, xyz, "<>"[number % 2], 8 * number) if kind == "cloud" else store.types[name]("text")
-                )
+                how = "<>"[number % 2], 8 * number, (stamp, 5) if number < 2 else (0, 0)
+                content = message(store, xyz, *how) if kind == "cloud" else store.types[name]("text")
                 data = store.serialize_ros1(content, name) if one else store.serialize_cdr(content, name)
                 writer.write(connection, 10**9 * stamp, data)
     return path if one else next(file for file in path.iterdir() if file.suffix != ".yaml")
@@ -88,7 +87,7 @@ def test_each_cloud_is_read_as_it_was_recorded(tmp_path: Path, storage: str):
     file = record(tmp_path / "drive.bag" if storage == "bag" else tmp_path / "drive", storage)
     for path in {file, tmp_path / "drive"} if storage != "bag" else {file}:
         found = list(read_bag(path))
-        assert [stamp for stamp, _ in found] == [10**9, 2 * 10**9, 3 * 10**9]
+        assert [stamp for stamp, _ in found] == [10**9 + 5, 2 * 10**9 + 5, 3 * 10**9]
         for (_, points), xyz in zip(found, CLOUDS, strict=True):
             assert_points(points, xyz, *fields(len(xyz)))
 
@@ -100,7 +99,7 @@ def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):
     assert (code, error.count("\n")) == (2, 1)
     assert "several topics of point clouds; give one by --topic: /front, /rear" in error
     assert r2flow("unpack", file, "--topic", "/rear", "--out", out) == (0, f"3 scans in {out}\n", "")
-    names = [f"{10**9:019d}.ply", f"{10**9:019d}-2.ply", f"{2 * 10**9:019d}.ply"]  # two of one time
+    names = [f"{10**9 + 5:019d}.ply", f"{10**9 + 5:019d}-2.ply", f"{2 * 10**9:019d}.ply"]  # two of one time
     assert {path.name for path in out.iterdir()} == set(names)
     for name, xyz in zip(names, CLOUDS, strict=True):
         assert_points(read_points(out / name), xyz, *fields(len(xyz)))
