@@ -35,8 +35,8 @@ Share = Annotated[float, Bound("in [0, 1]", lambda x: 0 <= x <= 1)]
 
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
     """' Did you mean ...?' with the closest known name, or an empty string if there is none."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    close = close or [other for other in known if other.startswith(name)]
+    others = [other for other in known if other != name]  # a broken link is there under its own name
+    close = difflib.get_close_matches(name, others, n=1, cutoff=0.6) or [o for o in others if o.startswith(name)]
     return f" Did you mean '{close[0]}'?" if close else ""
 
 

@@ -153,8 +153,9 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
         return SourceOptions(FOLDER, str(path.parent)), path
     if not path.exists():
         hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
+        problem = "is a broken link" if path.is_symlink() else "does not exist"
         raise InputError(
-            f"{path} does not exist. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run.{hint}"
+            f"{path} {problem}. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run.{hint}"
         )
     if _manifest(path).get("format") == "r2flow scans":
         return SourceOptions(PREPARED, str(path)), None

@@ -176,6 +176,15 @@ class TestReflectance:
             assert len(scans.source[len(scans) - 1]) == 1 + expected
 
 
+def test_a_broken_link_is_not_suggested_for_itself(tmp_path: Path):
+    (tmp_path / "b.bin").symlink_to("/nonexistent")
+    with pytest.raises(InputError, match=r"b\.bin is a broken link\. Give a scan file.* or a run\.$"):
+        open_scans(tmp_path / "b.bin")
+    (tmp_path / "bb.bin").touch()
+    with pytest.raises(InputError, match=r"Did you mean 'bb\.bin'\?"):
+        open_scans(tmp_path / "b.bin")
+
+
 def test_values_out_of_the_sensor_s_limits_are_dropped_for_a_model_alone(tmp_path: Path):
     image = np.full((2, 8, 32), 0.5, np.float32)
     image[0] = np.resize([1.0, 1.45, 40, 80, 81], (8, 32))
