@@ -129,8 +129,8 @@ def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, 
 
 def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
-        f"{path} has no reflectance, and other scans, a metric or the model (such as stage.init=street) need it. To "
-        "train on range alone give encoding.reflectance=false and no such stage.init; to measure give metrics of range."
+        f"{path} has no reflectance, and other scans, a metric or the model need it. Give scans with it, metrics of "
+        "range or a model of range alone (in training encoding.reflectance=false without a stage.init that has it)."
     )
 
 

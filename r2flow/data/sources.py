@@ -138,7 +138,7 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
     edges = sensor.row_edges
     advice = f"give the right one, or estimate it: r2flow sensor {root} --out mine.yaml"
     if name is not None and name != sensor.name:
-        advice = f"they fit '{name}': sensor={name} in training, --sensor {name} in verbs"
+        advice = f"they fit '{name}': sensor={name} in training, --sensor {name} in verbs that have it"
     log.warning(
         "%s: read as scans of sensor '%s', which sees %+.1f to %+.1f degrees, but %s; %s",
         root, sensor.name, edges[0], edges[-1], seen, advice,
