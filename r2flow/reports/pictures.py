@@ -1,5 +1,6 @@
 """Scans as pictures in the width of a paper's page: range, reflectance, bird's-eye view, 3-D perspective."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import zip_longest
@@ -91,6 +92,7 @@ def completed_figure(
         legend = " (grey: not measured, black: no return)" if row == 0 else ""
         strips[0].set_title(f"{name}: range, m{legend}", fontsize=7, loc="left", pad=2)
         if row == 1 and len(strips) > len(rows[0][1]):  # the scan has no reflectance
+            draw_reflectance(strips[1], image)
             strips[1].set_title("reflectance, estimated", fontsize=7, loc="left", pad=2)
         for axes in strips if row in grey else ():
             axes.imshow(np.where(grey[row][..., None], (0.6, 0.6, 0.6, 1), 0), aspect="auto", interpolation="nearest")
@@ -225,6 +227,7 @@ def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
 
 def take_names_as_they_are(figure: Figure) -> None:
     """Show dollar signs in file names literally: only tick labels parse formulas."""
+    warnings.filterwarnings("ignore", "Glyph .* missing from font")  # no font has all characters of file names
     for text in figure.findobj(Text):
         if isinstance(text, Text) and not text.get_text().isascii():
             text.set_text(printable(text.get_text()))

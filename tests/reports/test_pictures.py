@@ -28,7 +28,14 @@ def test_known_rays_without_reflectance_are_as_high_as_answers_with_it():
     figure = completed_figure([("known", scan[:1]), ("answer", scan)], E > 0, SENSOR.rays())
     known, answer = (axes for axes in figure.axes if "range" in axes.get_title("left"))
     assert known.get_position().height == pytest.approx(answer.get_position().height)
-    assert [axes.get_title("left") for axes in figure.axes].count("reflectance, estimated") == 1
+    (estimated,) = (axes for axes in figure.axes if axes.get_title("left") == "reflectance, estimated")
+    assert [bar.get_yticks().size for bar in estimated.child_axes] == [3]
+
+
+@pytest.mark.filterwarnings("error")
+def test_names_without_glyphs_are_drawn_without_a_warning(tmp_path):
+    figure = scan_figure(image(np.full_like(E, 10.0)), SENSOR.rays(), "点云")
+    assert save_figure(figure, tmp_path / "scan.png").is_file()
 
 
 def test_the_error_of_an_answer_is_in_metres_where_hidden_rays_return_in_both():
