@@ -73,8 +73,9 @@ class Store:
         if (self.folder / MANIFEST).is_file():
             recipe = read_manifest(self.folder, self.kind)["recipe"]
             if other := [*differences(recipe, self.described).values()]:
+                kind = self.kind.replace("simulated", "simulated scans")
                 raise InputError(
-                    f"{self.folder} holds other {self.kind}: {at_most_three(other)}. Give the same settings, or "
+                    f"{self.folder} holds other {kind}: {at_most_three(other)}. Give the same settings, or "
                     f"another folder by {self.option}."
                 )
             return True

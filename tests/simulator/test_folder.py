@@ -52,7 +52,7 @@ def test_files_that_exist_are_kept_and_missing_ones_are_made(tmp_path):
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (SimulatedFolder(Path(), SMALL, 1), "seed=0 there, 1 here"),
+        (SimulatedFolder(Path(), SMALL, 1), "holds other simulated scans: seed=0 there, 1 here"),
         (SimulatedFolder(Path(), SENSORS["vlp16"], 0), r"reading.sensor.columns=\d+ there"),
     ],
     ids=["seed", "sensor"],
