@@ -11,7 +11,7 @@ import torch
 from r2flow.backbones import Backbone, build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
-from r2flow.generators import RectifiedFlow, build_generator
+from r2flow.generators import build_generator
 from r2flow.lidar.sensors import Sensor
 from r2flow.reports.tables import print_table
 
@@ -35,20 +35,22 @@ def backbone_costs(
         except InputError as error:
             yield {**row, "error": str(error)}
             continue
-        yield {**row, **_cost_of(model, (1, 2, *sensor.shape), repeats, device)}
+        yield {**row, **_cost_of(model, repeats, device)}
 
 
 def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> dict[str, Any]:
     """Parameters, GMAC and, if `repeats`, milliseconds of one evaluation for one image of a config's backbone."""
-    generator = build_generator(config)
-    if not isinstance(generator, RectifiedFlow):
+    generator = build_generator(config).eval()
+    model = getattr(generator, "backbone", None)
+    if not isinstance(model, Backbone):
         return {"parameters": count_parameters(generator), "gmac": None, "latency_ms": None}
-    return _cost_of(generator.backbone.eval(), (1, *generator.space.shape), repeats, device)
+    return _cost_of(model, repeats, device)
 
 
-def _cost_of(model: Backbone, shape: tuple[int, ...], repeats: int, device: str) -> dict[str, Any]:
+def _cost_of(model: Backbone, repeats: int, device: str) -> dict[str, Any]:
     row = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9, "latency_ms": None}
     if repeats:
+        shape = 1, model.in_channels, *model.coords.shape[2:]
         model, x, t = model.to(device), torch.randn(shape, device=device), torch.full((1,), 0.5, device=device)
         with torch.inference_mode():
             seconds = [timed(partial(model, t, x), device)[1] for _ in range(repeats + 1)]

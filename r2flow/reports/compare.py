@@ -81,7 +81,7 @@ def labels(folders: Sequence[Path]) -> list[str]:
 
 
 def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
-    """Read all runs; build each backbone once."""
+    """Read all runs; build each network once."""
     folders = find_runs(paths)
     costs: dict[str, dict[str, Any]] = {}
     runs = []
@@ -89,7 +89,8 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
         config = read_config(path) or {}
         if not {"stage", "backbone", "data", "sensor", "encoding"} <= config.keys():
             raise InputError(f"{path / CONFIG} is not the config of a run.")
-        architecture = json.dumps([config.get(key) for key in ("sensor", "encoding", "backbone")], sort_keys=True)
+        keys = ("sensor", "encoding", "backbone", "generator")
+        architecture = json.dumps([config.get(key) for key in keys], sort_keys=True)
         if architecture not in costs:
             with naming(path):
                 costs[architecture] = cost(config)

@@ -13,6 +13,7 @@ import yaml
 from PIL import Image
 
 from r2flow.errors import InputError
+from r2flow.generators import build_generator
 from r2flow.reports.compare import (
     cell,
     compare_page,
@@ -101,6 +102,21 @@ def test_what_a_folder_does_not_say_is_not_made_up(tmp_path):
         assert row[column] is None
         assert cell(row, column) == "-"
     assert row["parameters"] > 0  # which the config says
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_networks_of_other_generators_are_counted_apart(tmp_path, order):
+    generators: dict[str, dict[str, Any]] = {
+        "rectified_flow": {}, "flow_map": {}, "diffusion": {}, "vanilla_gan": {"base_channels": 4, "doublings": 2},
+    }  # fmt: skip
+    made = {name: {"generator": {"name": name, **options}} for name, options in generators.items()}
+    folders = [make_run(tmp_path / name, change) for name, change in made.items()]
+    read = {run.label: run.values for run in read_runs(folders[::order])}
+    for name, change in made.items():
+        assert read[name]["parameters"] == sum(p.numel() for p in build_generator(CONFIG | change).parameters())
+    assert read["flow_map"]["parameters"] > read["rectified_flow"]["parameters"]  # it embeds a second time
+    assert read["diffusion"]["gmac"] == read["rectified_flow"]["gmac"] > 0  # the same backbone
+    assert read["vanilla_gan"]["gmac"] is None
 
 
 def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
