@@ -9,7 +9,7 @@ import lightning as L
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from r2flow.backbones import BACKBONES
+from r2flow.backbones import BACKBONES, configurations
 from r2flow.callbacks import CALLBACKS
 from r2flow.config import RULES, as_override, flatten, key_of
 from r2flow.data.augment import Augmentation
@@ -116,3 +116,10 @@ def test_an_override_that_is_printed_is_read_back(path: str):
 @pytest.mark.parametrize("experiment", ["lidm_autoencoder", "lidargen", "dusty2"])
 def test_an_experiment_of_chosen_drives_takes_other_scans(experiment: str):
     check(compose([f"experiment={experiment}", "data=simulated"]))
+
+
+@pytest.mark.parametrize("backbone", ["adm_unet_18m", "hdit_tiny"])
+def test_a_chosen_backbone_is_whole_at_every_size(backbone: str):
+    for size in ("full", "small"):
+        composed = compose(["experiment=r2dm", f"size={size}", "data.root=x", f"backbone={backbone}"])
+        assert composed["backbone"] == configurations()[backbone]
