@@ -159,7 +159,7 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
         generator = build_generator(config)
         if checkpoint is not None:
             generator.start_from(checkpoint.generator)
-        return _assembled(config, generator)
+        return _assembled(config, generator, asked)
 
 
 def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
         config["encoding"]["reflectance"] = True  # decided when the scans are read
     with torch.device("meta"):
         generator = build_generator(config)
-    run = _assembled(config, generator)
+    run = _assembled(config, generator, asked)
     check_run(run.folder, config)
     return config
 
@@ -220,9 +220,11 @@ def _refuse_unread(key: str, data: Mapping[str, Any], given: Collection[str]) ->
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 
 
-def _assembled(config: dict[str, Any], generator: Generator) -> Run:
+def _assembled(config: dict[str, Any], generator: Generator, asked: Sequence[str]) -> Run:
     space = generator.space
-    if not hasattr(generator, "backbone"):  # the system has its own network
+    if not hasattr(generator, "backbone"):
+        if wrong := [text for text in asked if key_of(text).partition(".")[0] == "backbone"]:
+            raise InputError(f"generator {config['generator']['name']} has its own network: leave {wrong[0]} out.")
         config["backbone"] = None
     data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
     if data.pairs is not None:

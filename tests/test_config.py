@@ -14,6 +14,7 @@ from r2flow.callbacks import CALLBACKS
 from r2flow.config import RULES, as_override, flatten, key_of
 from r2flow.data.augment import Augmentation
 from r2flow.data.options import DataOptions, PairOptions
+from r2flow.errors import InputError
 from r2flow.registry import options_of
 from r2flow.runs.composing import CONF, choices, compose
 from r2flow.stages import STAGES
@@ -123,3 +124,11 @@ def test_a_chosen_backbone_is_whole_at_every_size(backbone: str):
     for size in ("full", "small"):
         composed = compose(["experiment=r2dm", f"size={size}", "data.root=x", f"backbone={backbone}"])
         assert composed["backbone"] == configurations()[backbone]
+
+
+@pytest.mark.parametrize("asked", ["backbone=hdit_small", "backbone.depths=[1]"])
+def test_a_backbone_for_a_system_with_its_own_network_is_refused(asked: str):
+    command = ["experiment=vanilla_gan", "size=small"]
+    assert check(compose(command), command)["backbone"] is None
+    with pytest.raises(InputError, match="vanilla_gan has its own network: leave backbone.* out"):
+        check(compose([*command, asked]), [*command, asked])
