@@ -21,7 +21,7 @@ from r2flow.registry import Registry, UnknownName
 
 GROUP = "r2flow.plugins"
 
-_loaded: set[str] = set()  # names and files of loaded modules
+_loaded: dict[str, str] = {}  # names and files of loaded modules, and the names that were given for them
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -50,7 +50,12 @@ def load_plugins(names: Sequence[str]) -> None:
         except (Exception, SystemExit) as error:  # modules may raise any exception
             message = " ".join(str(error).split()) or "no message"
             raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {message}") from None
-        _loaded.update({_identity(name), file})
+        _loaded.update({_identity(name): name, file: name})
+
+
+def loaded_plugins() -> list[str]:
+    """Names of the loaded modules, as they were given."""
+    return list(dict.fromkeys(_loaded.values()))
 
 
 def _identity(name: str) -> str:

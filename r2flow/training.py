@@ -34,7 +34,7 @@ from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
 from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.noise import seed_torch
-from r2flow.plugins import made_with
+from r2flow.plugins import loaded_plugins, made_with
 from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
 from r2flow.reports.training import finish, read_curves
 from r2flow.runs.composing import check_keys, compose
@@ -150,6 +150,7 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
     with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
         parent, checkpoint = find_parent(config["stage"].get("init")) or (None, None)
         config = _checked(config, asked, parent)
+        config["plugins"] = config.get("plugins") or loaded_plugins()
         encoding = config["encoding"]
         encoding["reflectance"] = resolve_reflectance(encoding.get("reflectance", AUTO), config["data"])
         levels = reflectance_levels(config["data"])

@@ -335,8 +335,8 @@ def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False) -> None:
     """Write a generator with its config as a `.safetensors`.
 
-    The bytes depend on the generator alone: of its config, the file stores the keys of `r2flow.config.learned`, without
-    paths of this machine.
+    The bytes depend on the generator alone: of its config, the file stores the keys of `r2flow.config.learned` and the
+    names of plug-ins, without paths of this machine.
 
     Args:
         half: Round large matrices to float16, which halves the file size.
@@ -352,7 +352,9 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     if half:
         large = [n.replace(COMPILED, "") for n, value in parameters if value.ndim > 1 and value.numel() > SMALL]
         weights |= {n: weights[n].half() for n in large}
-    notes = {"config": learned(checkpoint.config), "step": checkpoint.step, **checkpoint.generator.drawing()}
+    plugins = [Path(name).name for name in checkpoint.config.get("plugins") or ()]
+    config = learned(checkpoint.config) | ({"plugins": plugins} if plugins else {})
+    notes = {"config": config, "step": checkpoint.step, **checkpoint.generator.drawing()}
     # Under one key, since the order of several metadata keys is not fixed.
     write_file(path, save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})}))
 

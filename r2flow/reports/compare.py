@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from r2flow.config import flatten, rule
 from r2flow.errors import InputError, naming
 from r2flow.model.checkpoint import checkpoints_of, step_of
+from r2flow.plugins import made_with
 from r2flow.reports.backbones import cost
 from r2flow.reports.pages import Page
 from r2flow.reports.tables import shown, table
@@ -92,7 +93,7 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
         keys = ("sensor", "encoding", "backbone", "generator")
         architecture = json.dumps([config.get(key) for key in keys], sort_keys=True)
         if architecture not in costs:
-            with naming(path):
+            with naming(path), made_with(config, str(path)):
                 costs[architecture] = cost(config)
         curves = read_curves(path, tuple(CURVES))
         runs.append(ComparedRun(label, config, {**costs[architecture], **_read_values(path, config, curves)}, curves))

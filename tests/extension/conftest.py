@@ -60,7 +60,7 @@ def loaded(*families: Family) -> Iterator[None]:
     """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
     tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS, SAMPLERS), ConfigStore.instance()
     choices = {group: copy.deepcopy(store.repo.get(group, {})) for group in REGISTRIES}  # Hydra's own stay
-    before, known = [dict(table.items()) for table in tables], set(plugins._loaded)
+    before, known = [dict(table.items()) for table in tables], dict(plugins._loaded)
     try:
         plugins.load_plugins([str(FAMILIES / f"{family.file}.py") for family in families])
         yield

@@ -10,10 +10,12 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 from r2flow import plugins
+from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import checkpoints_of
+from r2flow.model.checkpoint import Checkpoint, checkpoints_of, load_checkpoint, save_checkpoint
 from r2flow.plugins import load_plugins, made_with, take_plugins
 from r2flow.registry import Registry
+from r2flow.reports.compare import read_runs
 from r2flow.runs.composing import REGISTRIES, choices, compose
 from r2flow.runs.folder import read_config, write_config
 from r2flow.stages import STAGES
@@ -57,7 +59,7 @@ def eager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file with a stage of its own, forgotten again after the test."""
     path = tmp_path / "eager.py"
     path.write_text(STAGE)
-    monkeypatch.setattr(plugins, "_loaded", set(plugins._loaded))
+    monkeypatch.setattr(plugins, "_loaded", dict(plugins._loaded))
     monkeypatch.setattr(STAGES, "_entries", dict(STAGES._entries))
     return path
 
@@ -104,6 +106,23 @@ def test_a_forgotten_plugin_is_named_by_the_run(tmp_path: Path, wanted: str):
     assert "--plugin their.module" in line
 
 
+def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    deep = tmp_path / "deep.py"
+    deep.write_text("from r2flow.backbones import BACKBONES\nBACKBONES.add('deep', BACKBONES['local'])\n")
+    monkeypatch.setattr(plugins, "_loaded", {})
+    monkeypatch.setattr(BACKBONES, "_entries", dict(BACKBONES._entries))
+    load_plugins([str(deep)])
+    run = build(compose(["backbone=deep", f"run_dir={tmp_path}/run"]))
+    write_config(run.folder, run.config)
+    save_checkpoint(Checkpoint(run.stage.generator, run.config), tmp_path / "deep.safetensors")
+    plugins._loaded.clear()
+    del BACKBONES._entries["deep"]
+    with pytest.raises(InputError, match=f"no backbone named 'deep'; .*: give --plugin {deep}"):
+        read_runs([run.folder])
+    with pytest.raises(InputError, match="no backbone named 'deep'; .*: give --plugin deep.py"):
+        load_checkpoint(tmp_path / "deep.safetensors")
+
+
 def test_a_stage_that_takes_its_own_steps_clips_for_itself(eager: Path, scans: Path):
     load_plugins([str(eager)])
     config = compose(tiny(scans, "stage=eager", "trainer.gradient_clip_val=0.5"))
@@ -144,7 +163,7 @@ def test_an_installed_plugin_is_looked_for_where_a_name_is_missing(tmp_path: Pat
     (tmp_path / "somebodys.py").write_text("from tests.training.test_plugins import TABLE\nTABLE.add('mine', 1)\n")
     found = importlib.metadata.EntryPoint("somebodys", "somebodys", plugins.GROUP)
     monkeypatch.setattr(plugins, "entry_points", lambda group: [found])
-    monkeypatch.setattr(plugins, "_loaded", set())
+    monkeypatch.setattr(plugins, "_loaded", {})
     monkeypatch.setattr(Registry, "on_missing", [plugins.load_installed])
     monkeypatch.syspath_prepend(tmp_path)
     assert TABLE["mine"] == 1
