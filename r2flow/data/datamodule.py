@@ -217,6 +217,7 @@ class ScanDataModule(L.LightningDataModule):
         return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further, sensors)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
+        """The held-out scans, each once, without those that are left when the devices share them equally."""
         self._ready()
         assert self.validation_source is not None
         if len(self.validation_source) == 0:
