@@ -119,6 +119,11 @@ def test_an_experiment_of_chosen_drives_takes_other_scans(experiment: str):
     check(compose([f"experiment={experiment}", "data=simulated"]))
 
 
+@pytest.mark.parametrize("plus", ["", "+", "++"])
+def test_a_generator_is_named_by_its_key(plus: str):
+    assert compose([f"{plus}generator.name=diffusion"])["generator"] == {"name": "diffusion"}
+
+
 @pytest.mark.parametrize("backbone", ["adm_unet_18m", "hdit_tiny"])
 def test_a_chosen_backbone_is_whole_at_every_size(backbone: str):
     for size in ("full", "small"):

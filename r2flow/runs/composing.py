@@ -216,7 +216,8 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
         else:
             named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
             replaced = named and parsed.type == OverrideType.CHANGE
-            converted += [f"{key}=null", f"++{text}"] if replaced else [text]
+            taken = f"++{text.lstrip('+')}" if key == "generator.name" else text  # generator is null by default
+            converted += [f"{key}=null", f"++{text}"] if replaced else [taken]
             continue
         raise InputError(f"{text}{problem}.")
     if "size=small" in converted and not any(re.match(r"\+?experiment=[^\[]", text) for text in converted):
