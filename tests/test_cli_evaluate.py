@@ -134,6 +134,14 @@ def test_each_number_of_steps_takes_the_sampler_that_the_generator_has_for_it(po
     ]  # fmt: skip
 
 
+def test_a_distilled_model_keeps_its_steps_among_others(points, tmp_path):
+    generator = build_generator(CONFIG).eval()
+    generator.run_by(build_sampler("euler", steps=2), fixed=True)
+    save_checkpoint(Checkpoint(generator, CONFIG), tmp_path / "td.safetensors")
+    rows, _ = points(tmp_path / "td.safetensors", "--sampler", "heun2,adams3", "--steps", "1,4")
+    assert [row["evaluations"] for row in rows] == [2]
+
+
 def test_an_adaptive_solver_is_one_set(points, saved):
     rows, _ = points(saved[0], "--sampler", "dopri5,euler", "--steps", "1,2", "--tolerance", 1e-2)
     assert [row["flow"].partition(", ")[2] for row in rows] == ["dopri5", "euler", "euler"]

@@ -130,7 +130,7 @@ class Generator(nn.Module):
                 {"name": name, **({"steps": steps} if "steps" in names and "grid" not in given else {}), **given}
             )
         if self.fixed and sampler != self.sampler:
-            raise InputError(f"this model is distilled for {self.sampler.text} alone: leave the sampler and its steps out.")
+            raise InputError(f"this model is distilled for {self.sampler} alone: leave sampler and steps out.")
         sampler.check(self)
         return sampler
 

@@ -123,12 +123,12 @@ def incidence(scan: Scan) -> np.ndarray:
 
 
 def range_pairs(scan: Scan) -> np.ndarray:
-    """Joint histogram of ranges of pixels 2.8 degrees apart, or one column, 16 x 16 logarithmic bins."""
+    """Joint histogram of ranges of pixels 2.8 degrees or one column apart, 16 x 16 logarithmic bins."""
     return _pairs(scan.r, scan.r > 0, np.geomspace(scan.sensor.min_range, scan.sensor.max_range, PAIRS + 1), APART[0])
 
 
 def reflectance_pairs(scan: Scan) -> np.ndarray:
-    """Joint histogram of reflectances of pixels 0.7 degrees apart, or one column, 13 x 13 bins; 0 without reflectance."""
+    """Joint histogram of reflectances of pixels 0.7 degrees or one column apart, 13 x 13 bins; 0 without."""
     if scan.q is None:
         return np.zeros((len(REFLECTANCES) - 1) ** 2)
     return _pairs(scan.q, scan.r > 0, REFLECTANCES, APART[1])

@@ -293,6 +293,16 @@ def test_a_stiff_equation_that_is_not_linear_is_solved():
     assert found.evaluations.max() < 1000
 
 
+@pytest.mark.parametrize(("k", "t_1", "tolerance"), [(1e4, 0.1, 1e-2), (1e6, 0.02, 1e-3), (1e6, 0.1, 1e-2)])
+def test_a_quadratic_remainder_has_an_error(k, t_1, tolerance):
+    """x' = 1 - k x^2 from 0, where J = 0: x = tanh(sqrt(k) t) / sqrt(k). Below -1 / sqrt(k) it runs away."""
+    x_0 = torch.zeros(1, 1, dtype=torch.float64)
+    found = solve(lambda t, x: 1 - k * x**2, x_0, 0.0, t_1, "exprb43", tolerance=tolerance)
+    exact = math.tanh(math.sqrt(k) * t_1) / math.sqrt(k)
+    assert not found.converged or abs(found.x.item() - exact) < tolerance
+    assert found.converged or tolerance > 1 / math.sqrt(k)
+
+
 def test_the_order_is_at_least_4():
     # Error against the number of steps; the reference is dopri5 at 1e-13.
     def velocity(t, x):

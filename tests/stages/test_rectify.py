@@ -185,5 +185,5 @@ def test_a_distilled_flow_keeps_the_steps_that_it_learns():
     config = {"stage": {"name": "distill", "steps": 2}, "data": {"batch_size": 4, "name": "pairs"}, "seed": 0}
     assert build_stage({**config, "sampler": {"steps": 2}}, affine()).generator.sampler.steps == 2
     for other in ({"steps": 8}, {"name": "adams3"}):
-        with pytest.raises(InputError, match=r"distilled for euler:steps=2 alone"):
+        with pytest.raises(InputError, match=r"distilled for euler, 2 steps alone"):
             build_stage({**config, "sampler": other}, affine())
