@@ -49,8 +49,8 @@ def flow(name: str, generator: str = "rectified_flow") -> Checkpoint:
             [0, 0.375, 0.75],
             [[1, 0, 0, 0], [1, 0.375, 0, 0], [1, 0, 0.75, 0], [1, 0, 0.75, 0.25]],
         ),
-        # Adams and Bashforth: after Euler's first step h (3/2 v_1 - 1/2 v_0)
-        ("ab2:steps=2", [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0.25, 0.75]]),
+        # After Euler's first step, the trapezoidal rule corrects it: h (v_0 + v_1) / 2 + h (3 v_1 - v_0) / 2
+        ("adams3:steps=2:grid=uniform:finish=0", [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0, 1]]),
         (
             "rk4:steps=1",
             [0, 0.5, 0.5, 1],

@@ -136,7 +136,7 @@ class SamplerOptions:
     sampler: Annotated[
         str | None,
         typer.Option(
-            help="NAME or NAME:FIELD=VALUE:...: adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, "
+            help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: dopri5, "
             "auto, torchdiffeq; stochastic: sde; flow maps: jump, chord, renoise; completion: mmps, replace, repaint. "
             "For other systems see docs/systems.md."
         ),

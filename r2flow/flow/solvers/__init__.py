@@ -13,7 +13,7 @@ from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
 from r2flow.flow.solvers.exponential import ExponentialMethod, automatic, exprb43
 from r2flow.flow.solvers.external import TORCHDIFFEQ, TorchDiffEqMethod
-from r2flow.flow.solvers.fixed import FixedStep, adams, euler, heun2, heun3, midpoint, rk4
+from r2flow.flow.solvers.fixed import Adams3, FixedStep, euler, heun2, midpoint, rk4
 from r2flow.flow.solvers.grids import build_grid, named_grid
 from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity, finite, flat, selected, wide
 from r2flow.registry import Registry
@@ -30,12 +30,8 @@ SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
     euler=FixedStep(euler, order=1, evaluations=1),
     midpoint=FixedStep(midpoint, order=2, evaluations=2),
     heun2=FixedStep(heun2, order=2, evaluations=2),
-    heun3=FixedStep(heun3, order=3, evaluations=3),
     rk4=FixedStep(rk4, order=4, evaluations=4),
-    ab2=adams(2),
-    adams2=adams(2, 2),
-    adams3=adams(2, 3),
-    adams4=adams(3, 4),
+    adams3=FixedStep(Adams3, order=3, evaluations=1, multistep=True),
     dopri5=dopri5,
     exprb43=exprb43,
     auto=automatic,
@@ -114,8 +110,8 @@ def method_of(name: str) -> Method:
 
 
 def usual_grid(name: str) -> str:
-    """The default grid of a method: denser towards t = 1 for predictor-correctors, else uniform."""
-    return "power:1.75" if getattr(SOLVERS[name], "corrects", False) else "uniform"
+    """The default grid of a method: denser towards t = 1 for multistep methods, else uniform."""
+    return "power:1.75" if getattr(SOLVERS[name], "multistep", False) else "uniform"
 
 
 def _with_global_error(

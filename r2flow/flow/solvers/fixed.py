@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -24,9 +23,7 @@ class FixedStep:
             of a solution, (N + 1,) float64.
         order: Order of the global error.
         evaluations: Evaluations of v per step.
-        start: Additional evaluations in the first step.
         multistep: Whether `step` is a factory.
-        corrects: Whether the step function has a corrector.
     """
 
     adapts: ClassVar[bool] = False  # whether step sizes follow from a tolerance
@@ -34,13 +31,11 @@ class FixedStep:
     step: Callable[..., Any]
     order: int
     evaluations: int
-    start: int = 0
     multistep: bool = False
-    corrects: bool = False
 
     def cost(self, steps: int) -> int:
         """Evaluations of v for a number of steps."""
-        return self.start + steps * self.evaluations
+        return steps * self.evaluations
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Take the steps of a time grid, (N + 1,) float64; keep inner states at equal numbers of steps.
@@ -78,13 +73,6 @@ def heun2(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
     return x + h / 2 * (k_1 + k_2)
 
 
-def heun3(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
-    k_1 = v(t, x)
-    k_2 = v(t + h / 3, x + h / 3 * k_1)
-    k_3 = v(t + 2 * h / 3, x + 2 * h / 3 * k_2)
-    return x + h / 4 * (k_1 + 3 * k_3)
-
-
 def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
     """The classical Runge-Kutta method."""
     k_1 = v(t, x)
@@ -94,60 +82,33 @@ def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
     return x + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4)
 
 
-def adams(predictor: int, corrector: int = 0) -> FixedStep:
-    """An Adams method for variable step sizes, with one evaluation per step.
+class Adams3:
+    """Step function of one solution by an Adams method of order 3 for variable step sizes, one evaluation per step.
 
-    The predictor x_n + integral of P dt, where the polynomial P interpolates the last velocities, gives the point at
+    The predictor x_n + integral of P dt, where the line P interpolates the last two velocities, gives the point at
     which v is evaluated next. The corrector repeats the step with this velocity included in P (PEC mode: Hairer,
     Norsett, Wanner, Solving Ordinary Differential Equations I, III.1 and III.5). The last step is not corrected, which
-    would need v(1, x). The order is the larger one of predictor and corrector.
-
-    The first steps have fewer velocities, which preserves the order up to 3. A corrector of 4 starts with Heun's step,
-    at one more evaluation, and corrects the first two steps together.
-
-    Args:
-        predictor: Number of velocities in the predictor.
-        corrector: Number of velocities in the corrector, including the new one; 0: no corrector (Adams-Bashforth).
-    """
-    return FixedStep(
-        partial(_Adams, predictor, corrector), max(predictor, corrector), evaluations=1, start=int(corrector > 3),
-        multistep=True, corrects=corrector > 0,
-    )  # fmt: skip
-
-
-class _Adams:
-    """Step function of one solution.
+    would need v(1, x). The first steps have fewer velocities, which preserves the order.
 
     The state between two steps is predicted: each call evaluates v there, corrects the previous step and predicts.
     """
 
-    def __init__(self, predictor: int, corrector: int, times: Tensor) -> None:
-        self.predictor, self.corrector, self.times = predictor, corrector, times.tolist()
-        self.heun_first = corrector > 3
-        self.taken = 0
+    def __init__(self, times: Tensor) -> None:
+        self.times, self.taken = times.tolist(), 0
         self.velocities: list[Tensor] = []  # at the last times, newest last
-        self.corrected: tuple[int, Tensor] | None = None  # step and state at which the next correction starts
+        self.corrected: Tensor | None = None  # state at which the last step starts
 
     def __call__(self, v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
-        n = self.taken
-        self.velocities = [*self.velocities, v(t, x)][-max(self.predictor, self.corrector) :]
+        n, self.velocities = self.taken, [*self.velocities, v(t, x)][-3:]
         self.taken += 1
-        if self.corrector and self.corrected is None:
-            self.corrected = 0, x
-        elif self.corrected is not None and not (self.heun_first and n == 1):
-            start, state = self.corrected
-            x = self._moved(state, start, n, self.corrector)
-            self.corrected = n, x
-        if self.heun_first and n == 0:
-            k = self.velocities[0]
-            return x + h / 2 * (k + v(t + h, x + h * k))
-        return self._moved(x, n, n + 1, self.predictor)
+        self.corrected = x if self.corrected is None else self._moved(self.corrected, n - 1, 3)
+        return self._moved(self.corrected, n, 2)
 
-    def _moved(self, x: Tensor, first: int, last: int, nodes: int) -> Tensor:
-        """x plus the integral, over the steps `first` to `last`, of the polynomial through the last velocities."""
+    def _moved(self, x: Tensor, step: int, nodes: int) -> Tensor:
+        """x plus the integral, over a step, of the polynomial through the last velocities."""
         velocities = self.velocities[-nodes:]
         times = self.times[self.taken - len(velocities) : self.taken]
-        for weight, velocity in zip(weights(times, self.times[first], self.times[last]), velocities, strict=True):
+        for weight, velocity in zip(weights(times, *self.times[step : step + 2]), velocities, strict=True):
             x = x + weight * velocity
         return x
 
