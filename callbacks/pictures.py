@@ -35,7 +35,8 @@ class SamplePictures(Periodic):
         generator: Generator = pl_module.generator  # type: ignore[assignment]
         if path.exists() or not generator.draws:
             return
-        drawn = draw(generator, range(self.num), self.seed, generator.choose(steps=None if generator.fixed else self.steps))
+        steps = None if generator.fixed else self.steps
+        drawn = draw(generator, range(self.num), self.seed, generator.choose(steps=steps))
         figure = contact_sheet(list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"])
         save_figure(figure, path)
         log_picture(trainer.loggers, "samples", figure_pixels(figure), step)

@@ -66,7 +66,7 @@ class ADMUNet(UNet):
             skips.append(h)
         for block in self.mid_blocks:
             h = block(h, condition)
-        for first, *resampling in cast(Iterable[Iterable[ADMBlock]], self.up_blocks):
+        for first, *resampling in cast("Iterable[Iterable[ADMBlock]]", self.up_blocks):
             h = first(torch.cat([h, skips.pop()], dim=1), condition)
             for block in resampling:
                 h = block(h, condition)

@@ -164,7 +164,7 @@ class HDiT(Backbone):
 
     def _blocks(self, level: int) -> list["Block"]:
         if level == self.levels - 1:
-            return list(cast(Iterable[Block], self.mid_levels))
+            return list(cast("Iterable[Block]", self.mid_levels))
         return [*_level(self.down_levels, level), *_level(self.up_levels, level)]
 
 
@@ -174,7 +174,7 @@ def time_embedding(channels: int, dropout: float) -> nn.Sequential:
 
 
 def _level(side: nn.ModuleDict, level: int) -> Iterable["Block"]:
-    return cast(Iterable[Block], side[f"level_{level}"])
+    return cast("Iterable[Block]", side[f"level_{level}"])
 
 
 def _shared_rotation(level: int, blocks: Sequence["Block"]) -> Rotary:

@@ -155,7 +155,8 @@ class StepController:
         """
         decade = 2 ** np.floor(-np.log10(h / self.length)).astype(int)
         self.decades[places] |= np.where(share > FAR, decade, 0)
-        self.give_up(places[np.bitwise_count(self.decades[places]) >= DECADES - (back & (share > FAR))])
+        seen = np.array([int(decades).bit_count() for decades in self.decades[places]])
+        self.give_up(places[seen >= DECADES - (back & (share > FAR))])
 
     def cross(self) -> np.ndarray:
         """Move scenes across their jump; returns the time after it and the signed length of the crossing, (2, N)."""
