@@ -1,3 +1,5 @@
-"""python -m r2flow VERB."""
+"""python -m r2flow VERB, for torchrun."""
 
-from r2flow.cli import __main__  # noqa: F401
+from r2flow.cli import main
+
+main()

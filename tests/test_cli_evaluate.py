@@ -226,7 +226,7 @@ def test_a_scan_is_no_place_for_figures(r2flow, real, generated):
 def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path, ranks):
     def run(out: Path, *launcher: str) -> dict[str, float]:
         options = ("--metrics", "jsd,mmd,frechet_handcrafted", "--size", "8x64", "--batch-size", "2", "--workers", "0")
-        command = [*launcher, "-m", "r2flow.cli", "evaluate", str(real), str(generated), *options, "--json", str(out)]
+        command = [*launcher, "-m", "r2flow", "evaluate", str(real), str(generated), *options, "--json", str(out)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "R2FLOW_CACHE": str(out.with_suffix(""))}
         done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr

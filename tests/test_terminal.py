@@ -17,7 +17,7 @@ from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from r2flow.progress import Bar, track
 from tests.training.conftest import scans, tiny  # noqa: F401  a fixture
 
-R2FLOW = [sys.executable, "-m", "r2flow.cli"]
+R2FLOW = [sys.executable, "-m", "r2flow"]
 
 
 def one_line_of(arguments: list[str], cwd: Path) -> tuple[str, int, str]:

@@ -21,10 +21,10 @@ def train(context: typer.Context) -> int:
     """Train a model; set config keys as KEY=VALUE. --help lists the choices, --cfg job prints all keys."""
     from r2flow.runs.launch import main
 
-    return main(context.args, [sys.executable, "-m", "r2flow.cli", "train"])
+    return main(context.args, [sys.executable, "-m", "r2flow", "train"])
 
 
-@app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs runs/r2flow_1rf --num 1000000")
+@app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow pairs runs/r2flow_1rf --num 1000000")
 @grouped
 def pairs(
     model: Annotated[str, typer.Argument(help="A model, a run folder or a checkpoint file.")],

@@ -247,7 +247,7 @@ def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(sa
     path, _ = saved
 
     def make(out: Path, **environment: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", "r2flow.cli", "pairs", path, *QUICK, "--out", out, "--shard-mib", "0.01"]
+        command = [sys.executable, "-m", "r2flow", "pairs", path, *QUICK, "--out", out, "--shard-mib", "0.01"]
         full = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
         return subprocess.Popen([str(one) for one in command], env=full, stdout=subprocess.PIPE, text=True)
 

@@ -149,17 +149,14 @@ def test_tables_of_arrow(tmp_path: Path):
         read_points(tmp_path / "c.parquet")
 
 
-@pytest.mark.parametrize("ending", ["las", "laz"])
 @pytest.mark.parametrize(("version", "form"), [("1.2", 0), ("1.4", 6)])
-def test_las_and_laz(tmp_path: Path, ending: str, version: str, form: int):
+def test_las(tmp_path: Path, version: str, form: int):
     laspy = pytest.importorskip("laspy", reason="laspy is not installed")
-    if ending == "laz":
-        pytest.importorskip("lazrs", reason="lazrs is not installed")
     header = laspy.LasHeader(version=version, point_format=form)
     header.scales = [0.001] * 3
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = XYZ.T
-    path = tmp_path / f"a.{ending}"
+    path = tmp_path / "a.las"
     cloud.write(path)
     points = read_points(path)
     np.testing.assert_allclose(points.xyz, XYZ, atol=6e-4)
@@ -174,7 +171,7 @@ def test_las_and_laz(tmp_path: Path, ending: str, version: str, form: int):
         read_points(path, ("x", "y", "z"))
 
 
-@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.feather", "a.parquet"])
+@pytest.mark.parametrize("name", ["a.las", "a.feather", "a.parquet"])
 def test_an_extra_that_is_missing_is_one_line_with_the_command(tmp_path: Path, monkeypatch, name: str):
     monkeypatch.setattr("r2flow.errors.find_spec", lambda package: None)
     (tmp_path / name).write_bytes(b"something")
@@ -183,17 +180,15 @@ def test_an_extra_that_is_missing_is_one_line_with_the_command(tmp_path: Path, m
 
 
 def test_a_small_file_takes_little_memory(tmp_path: Path):
-    """Headers of a .laz that declare many points, long records or many chunks."""
+    """Headers of a .las that declare many points or long records."""
     laspy = pytest.importorskip("laspy", reason="laspy is not installed")
-    pytest.importorskip("lazrs", reason="lazrs is not installed")
     cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
     cloud.x, cloud.y, cloud.z = XYZ.T
-    path = tmp_path / "a.laz"
+    path = tmp_path / "a.las"
     cloud.write(path)
     whole = path.read_bytes()
-    points = int.from_bytes(whole[96:100], "little")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for place, width in ((96, 4), (100, 4), (105, 2), (243, 4), (247, 8), (points - 34, 4), (points, 8)):
+    for place, width in ((96, 4), (100, 4), (105, 2), (243, 4), (247, 8)):
         for value in (2 ** (8 * width - 1) - 1, 1 << 20):
             path.write_bytes(whole[:place] + (value % 256**width).to_bytes(width, "little") + whole[place + width :])
             with suppress(InputError):

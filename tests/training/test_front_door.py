@@ -82,7 +82,6 @@ REFUSED = {
     "stage.time.name=discrete": "needs the option 'k'",
     "+data.validation.data={name: folder, root: x, splt: test}": "no option 'splt' | Did you mean 'split'?",
     "data.augment.roll=true": "data.augment.roll | backbone.position=learnable | backbone.position=none",
-    "data.augment.ray_dropout=1.5": "data.augment: ray_dropout must be a finite number in [0, 1) | 1.5",
     "data.validation.data={name: mixed}": "needs the name of a data set",
 }
 

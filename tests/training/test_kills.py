@@ -19,7 +19,7 @@ from tests.training.test_train import assert_bit_equal
 
 pytestmark = pytest.mark.slow
 
-VERB = [sys.executable, "-m", "r2flow.cli"]
+VERB = [sys.executable, "-m", "r2flow"]
 TIMES = 10
 
 

@@ -48,7 +48,6 @@ _READERS = {
     ".feather": read_arrow,
     ".parquet": read_arrow,
     ".las": read_las,
-    ".laz": read_las,
 }
 # Formats that are not supported, with advice on conversion.
 ELSEWHERE = {
@@ -58,7 +57,7 @@ ELSEWHERE = {
         "holds packets, which the maker's tool turns into scans (Ouster: ouster-cli source {path} save scan.ply; "
         "Velodyne: VeloView, Save As CSV; Hesai, RoboSense: their ROS driver and r2flow unpack)",
     ),
-    **dict.fromkeys((".e57", ".pts", ".ptx", ".rcp", ".fls"), "is read by CloudCompare, which saves it as .ply"),
+    **dict.fromkeys((".laz", ".e57", ".pts", ".ptx", ".rcp", ".fls"), "is read by CloudCompare, which saves .ply"),
     **dict.fromkeys((".h5", ".hdf5", ".zarr", ".mat", ".pkl"), "holds arrays: write x, y, z, intensity by numpy.savez"),
     ".tfrecord": "is read by Waymo's own tools: write x, y, z, intensity by numpy.savez",
     **dict.fromkeys((".lvx", ".lvx2", ".lvx3"), "is of a Livox, which has no beams; r2flow needs a spinning LiDAR"),
@@ -76,7 +75,7 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     """The points of a scan file, in the order of the file; rows that are not finite are dropped and counted.
 
     The ending is the format. .bin: KITTI's float32 rows x y z reflectance. .pcd.bin: nuScenes' x y z intensity ring.
-    .pcd, .ply, .las, .laz, .feather, .parquet: fields x y z and, where present, intensity (or reflectance,
+    .pcd, .ply, .las, .feather, .parquet: fields x y z and, where present, intensity (or reflectance,
     reflectivity, remission, i) and ring, of any type. .npy, .npz: (N, 3) or (N, 4), or named fields. .csv, .xyz, .txt:
     three or four columns, or columns named in the first line. LAS needs laspy, Arrow tables pyarrow.
 

@@ -1,4 +1,4 @@
-"""Readers of columns: rows of floats, NumPy's .npy and .npz, text, Arrow tables, LAS and LAZ."""
+"""Readers of columns: rows of floats, NumPy's .npy and .npz, text, Arrow tables and LAS."""
 
 import io
 import math
@@ -145,41 +145,25 @@ def read_arrow(path: Path, columns: object = None) -> Table:
 
 
 def read_las(path: Path, columns: object = None) -> Table:
-    """LAS and LAZ, read with laspy: scaled x, y, z in the sensor's frame, intensity if measured, extra fields."""
-    require(str(path), "formats", "laspy", "lazrs")
+    """LAS, read with laspy: scaled x, y, z in the sensor's frame, intensity if measured, extra fields."""
+    require(str(path), "formats", "laspy")
     import laspy
-    import lazrs
 
     content = path.read_bytes()
     records = 54 * int.from_bytes(content[100:104], "little")
     records += 60 * int.from_bytes(content[243:247], "little") if content[24:26] == b"\x01\x04" else 0
     check(content[:4] == b"LASF" and records <= len(content), "it is not a LAS file, or its header is damaged.")
-    # Read from memory, which limits the size: laspy and lazrs allocate what a header declares.
-    with laspy.open(io.BytesIO(content), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
+    # Read from memory, which limits the size: laspy allocates what a header declares.
+    with laspy.open(io.BytesIO(content), laz_backend=(), read_evlrs=False) as reader:
         header = reader.header
         check_unpacked(path, header.point_count * header.point_format.size)
-        if header.are_points_compressed:
-            size = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data).item_size()
-            check(size == header.point_format.size, f"its points have {header.point_format.size} and {size} bytes.")
-            _check_chunks(content, header.offset_to_point_data)
+        check(not header.are_points_compressed, "its points are compressed: uncompress them by laszip.")
         points = reader.read()
     check(len(points.points) == header.point_count, f"it declares {header.point_count} points. Is it whole?")
     extra = [name for name in points.point_format.dimension_names if name not in ("X", "Y", "Z")]
     extra = [name for name in extra if name != "intensity" or np.asarray(points[name]).any()]
     names = ["x", "y", "z", *extra]
     return names, [np.asarray(points[name]) for name in names]
-
-
-def _check_chunks(content: bytes, start: int) -> None:
-    """Refuse compressed points with more chunks than the file has bytes: lazrs aborts the process if memory runs out.
-
-    Points begin with the offset of the chunk table, int64, or -1 if the offset is in the last 8 bytes; the table begins
-    with its version and number of chunks, uint32 each.
-    """
-    places = (int.from_bytes(content[at : at + 8], "little", signed=True) for at in (start, len(content) - 8))
-    table = max(next((place for place in places if place != -1), 0), 0)
-    head = content[table : table + 8]
-    check(len(head) == 8 and int.from_bytes(head[4:], "little") <= len(content), "its table of points is damaged.")
 
 
 def check_unpacked(path: Path, size: int) -> None:
