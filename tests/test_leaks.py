@@ -2,21 +2,14 @@
 
 import gc
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning as L
-import numpy as np
 import pytest
 import torch
 
-from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanSource
-from r2flow.evaluation.measuring import Work, gather_real, measure
 from r2flow.generators import build_generator
-from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics import METRICS
 from r2flow.model.sampling import sample
 from r2flow.training import build, compose, fit
 from tests.conftest import CONFIG
@@ -78,39 +71,4 @@ def test_a_thousand_samples():
         assert len(drawn.images) == 10
         if number % 20 == 0:
             held.note()
-    held.check()
-
-
-class Noted(ScanSource):
-    """100,000 images, eight in turn."""
-
-    def __init__(self, held: Held, numbers: Sequence[int] = range(100_000)) -> None:
-        self.held, self.numbers = held, numbers
-        draw = np.random.default_rng(0)
-        self.images = np.stack([draw.uniform(2, 70, (8, 8, 64)), draw.uniform(0, 1, (8, 8, 64))], 1).astype(np.float32)
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        if index % 20_000 == 19_999:
-            self.held.note()
-        return self.images[self.numbers[index] % 8]
-
-    @property
-    def names(self) -> list[str]:
-        return [str(number) for number in self.numbers]
-
-    def subset(self, indices: Sequence[int]) -> "Noted":
-        return Noted(self.held, [self.numbers[i] for i in indices])
-
-
-def test_a_hundred_thousand_scans_evaluated():
-    held, sensor = Held(), SENSORS["hdl64e"].resized(8, 64)
-    metrics = {name: METRICS[name]() for name in ("jsd", "frechet_handcrafted")}
-    work = Work(batch_size=100)
-    real = gather_real(metrics, ScanSet("real", Noted(Held(), range(64)), sensor, about={"reflectance": True}), work)
-    results = measure(metrics, real, ScanSet("other", Noted(held), sensor, about={"reflectance": True}), work)
-    assert {result.metric for result in results} == set(metrics)
-    assert len(held.noted) == 5
     held.check()

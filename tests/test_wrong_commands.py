@@ -33,7 +33,6 @@ from tests.conftest import CONFIG, ground, write_checkpoint
 VERBS = """
 nope # No such command 'nope'
 sampel -c run -o out # Did you mean 'sample'?
-report nope
 sample empty -o out
 sample run -o out --sampler torchdiffeq:nope
 sample run -o out --sampler euler --tolerance 0.1 # tolerance
@@ -42,19 +41,13 @@ sample run -o out --device cuda:99
 sample run -o out --format las
 sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column
-sample run -o out --sector a,b
-sample run -o out --sector nan,3
 sample run -o out --rows 5-3
-sample run -o out --rows 0-99
-sample run -o out --rows ' -1-3'
-sample run -o out --grid nope
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
 sample run -o out --plugin nope
 sample run -o out extra
 sample run -o out -o # '-o' requires an argument
 sample '' -o out # an argument is empty
 info nowhere
-info scans/000000.bin
 info run --jsn
 sample run -o out --steps 10000000 # 1,000,000
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
@@ -67,18 +60,14 @@ export run --sampler dopri5 # give --sampler adams3 --steps 16
 report backbones --only nope
 report backbones --size ²x²
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels
-report backbones extra
 complete scans/000000.bin -c run -o out --mask nope # no mask
-complete scans/000000.bin -c run -o out --from nope
 complete scans/000000.bin -c run -o out --to os1_64
 view scans -o out # ends in .html
 view scans -o file.txt/a.html
 view scans -o out.html --steps 1,2 # of a run, a checkpoint or a model
 view run -o out.html --size 64x1024 --sensor vlp16 --reflectance-scale 7 # are of scans; found none
-view run -o out.html --steps 1,a
 view run -o out.html --times 3 --steps 1,2 # one number of --steps
 view run scans -o out.html --times 3 --sequence # --sequence
-simulate -o out --sensor bad.yaml
 simulate -o out --size 1x1 # found 1
 simulate -o out --format npy --labels
 simulate -o scans --num 1 --size 8x64 # holds scans
@@ -100,12 +89,9 @@ prepare simulated:3 -o out
 prepare scans/000000.bin -o out
 prepare scans -o out --split train # no split named 'train'
 prepare scans -o out --drives 77
-prepare kitti_360:scans -o out
-prepare prepared:scans -o out
 pairs stopped
 pairs run --num 1 --seed 99999999999999999999
 weights --add
-weights --add nope file.txt
 weights --add rangenet53 file.txt
 evaluate scans # nothing to compare with
 evaluate scans scans --generated-split train # no split named 'train'
@@ -117,13 +103,9 @@ evaluate scans run --sensor vlp16
 evaluate scans scans --sensor vlp # Did you mean 'vlp16'? Your own is a YAML file
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
 report solvers nowhere -o out
-report solvers -o out --samplers nope
-report solvers -o out --budgets 0
-report solvers -o out --problems nope
 report solvers -o out --budgets 1 --samplers rk4 # --budgets
 report solvers -o out --problems none # nothing to measure
 report paper run -o out --results nowhere
-report paper run -o out --real nowhere
 """
 
 # What each verb's wrong values are tried on, and words that no option takes.
@@ -177,22 +159,17 @@ name=x +samples.steps=3
 name=x backbone.base_channels=7
 name=x backbone=
 name=x backbone.name=null
-name=x encoding.format=null
 name=x data=folder data.root=scans data.reading.projection=flat
 name=x data=folder data.root=scans data.validation.data=3
 name=x data=prepared
 name=x data=mixed 'data.parts=[{name: folder, root: empty}]'
-name=x data=pairs
 name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
 name=x stage=reflow data=pairs stage.init=run backbone=hdit
-name=x stage=base
 name=x trainer.max_time=foo
-name=x +plugins.a=3
 name=x --plugin nowhere.py
 --plugin
 name=x experiment=nope
 name=x 'chain={a: {init: b}}'
-name=x 'chain={a: {stage: 3}}'
 name=x 'chain={a/b: {seed: 3}}'
 name=x experiment=demo chain.rf1=null
 name=a/../../b
@@ -202,10 +179,8 @@ name=x 'data={' # data={ cannot be read
 name=x seed=${seed} # interpolation
 name=x --cfg foo
 name=x --config-dir nowhere
-name=x --config-name nope
 -m seed=1,2 hydra/launcher=nope
 name=x hydra.run.dir=file.txt
-name=x hydra=3
 name=x data@foo=kitti_raw
 name=x scans=3 # no key 'scans'
 name=x +parent=3

@@ -14,7 +14,7 @@ Backends, with equal values and gradients:
 import functools
 import importlib.util
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -54,7 +54,8 @@ def check_window(window: Sequence[int]) -> None:
         raise InputError(f"the attention window must have odd sizes of at least 1, found {tuple(window)}.")
 
 
-class _Axis(NamedTuple):
+@dataclass(frozen=True)
+class _Axis:
     """An axis of the map: `size` tokens, each of which attends to `asked` tokens, or to all if there are fewer."""
 
     size: int

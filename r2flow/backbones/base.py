@@ -71,7 +71,7 @@ class Backbone(ExactBuffers):
         self.in_channels, self.out_channels = in_channels, in_channels if out_channels is None else out_channels
         self._check(rays)
         # on the device of the parameters, which `with torch.device(...)` may have set
-        device = torch.empty(0).device if rays.device.type == "cpu" else rays.device  # the default device
+        device = torch.empty(0).device if rays.device.type == "cpu" else rays.device
         self.register_buffer("coords", rays[None].to(device, torch.float32, copy=True))
         self.register_load_state_dict_post_hook(_follow_loaded_rays)
 

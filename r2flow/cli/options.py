@@ -143,9 +143,7 @@ class SamplerOptions:
     ] = None
     steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, for fixed-step samplers.")] = None
     tolerance: Annotated[float | None, typer.Option(help="Error tolerance per step, for adaptive samplers.")] = None
-    grid: Annotated[str | None, typer.Option(help="Time grid of fixed steps: uniform, power:P or power-start:P.")] = (
-        None
-    )
+    grid: Annotated[str | None, typer.Option(help="Time grid of fixed steps: uniform or power:P.")] = None
 
     @property
     def given(self) -> dict[str, Any]:

@@ -25,8 +25,7 @@ class Rules:
     """A protocol.
 
     Attributes:
-        real, generated: Position of a pixel's point: as measured, or on the ray through its bin's centre or upper left
-            corner ("reference").
+        real, generated: A pixel's point: as measured, or on the ray through its bin's centre or corner ("reference").
         convention: Default projection of point clouds to images; None: the model's.
         choose: Sorted indices of at most n scans of a set.
         chosen: Description of the choice.

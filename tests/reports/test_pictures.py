@@ -32,12 +32,6 @@ def test_known_rays_without_reflectance_are_as_high_as_answers_with_it():
     assert [bar.get_yticks().size for bar in estimated.child_axes] == [3]
 
 
-@pytest.mark.filterwarnings("error")
-def test_names_without_glyphs_are_drawn_without_a_warning(tmp_path):
-    figure = scan_figure(image(np.full_like(E, 10.0)), SENSOR.rays(), "点云")
-    assert save_figure(figure, tmp_path / "scan.png").is_file()
-
-
 def test_the_error_of_an_answer_is_in_metres_where_hidden_rays_return_in_both():
     truth, answer = np.full_like(E, 10.0), np.full_like(E, 11.5)
     answer[:, :8], truth[:, 8:16] = 0, 0

@@ -45,10 +45,10 @@ def opened(chromium, tmp_path):
     """Opens the page of some arguments; no error of its own, no request but for itself."""
     contexts, errors, requests = [], [], []
 
-    def open(*arguments, size=DESKTOP, scheme="dark", touch=False, **options):
+    def open(*arguments, size=DESKTOP, **options):
         path = tmp_path / "page.html"
         path.write_text(page(*arguments, **options), encoding="utf-8")
-        contexts.append(chromium.new_context(viewport=size, color_scheme=scheme, has_touch=touch))
+        contexts.append(chromium.new_context(viewport=size, color_scheme="dark"))
         shown = contexts[-1].new_page()
         shown.on("pageerror", lambda error: errors.append(str(error)))
         shown.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -185,29 +185,6 @@ def test_mouse_and_keys_move_the_camera(opened):
     assert camera_of(shown) == first
 
 
-def test_two_fingers_zoom_and_one_finger_turns(opened):
-    shown = opened([lone()], RAYS, size=PHONE, touch=True)
-    first, box = camera_of(shown), shown.locator(".points").bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    hand = shown.context.new_cdp_session(shown)
-
-    def touch(kind, *fingers):
-        points = [{"x": x + dx, "y": y, "id": number} for number, dx in enumerate(fingers)]
-        hand.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-
-    touch("touchStart", -40, 40)
-    for reach in (50, 60, 70, 80):
-        touch("touchMove", -reach, reach)
-    touch("touchEnd")
-    pinched = camera_of(shown)
-    assert pinched["distance"] == pytest.approx(first["distance"] / 2, rel=0.05)
-    touch("touchStart", 0)
-    for reach in (10, 20, 30):
-        touch("touchMove", reach)
-    touch("touchEnd")
-    assert camera_of(shown)["yaw"] == pytest.approx(pinched["yaw"] - 0.24, abs=0.01)
-
-
 def test_the_cursor_finds_the_point_and_back(opened):
     shown = opened([lone(), lone(0.8)], RAYS, ["a", "b"])
     first, second = shown.locator(".points").all()
@@ -225,13 +202,6 @@ def test_the_cursor_finds_the_point_and_back(opened):
         assert shown.locator("#readout").inner_text().startswith(f"row {row}, column {column} ·")
     shown.mouse.move(strip["x"] + 3, strip["y"] + strip["height"] / 2)
     assert "no return" in shown.locator("#readout").inner_text()
-
-
-def test_a_tap_finds_a_point(opened):
-    shown = opened([lone()], RAYS, size=PHONE, touch=True)
-    at = projected(points_of(lone())[6, 35], camera_of(shown), shown.locator(".points").bounding_box())
-    shown.touchscreen.tap(*at)
-    assert shown.locator("#readout").inner_text().startswith("row 6, column 35 · 14.00 m")
 
 
 def test_the_slider_goes_through_the_frames(opened):
@@ -256,16 +226,6 @@ def test_only_what_is_there_can_be_coloured(opened):
     box, point = shown.locator(".points").bounding_box(), points_of(lone())[6, 35]
     x, y = projected(point, camera_of(shown), box)
     assert np.abs(screen(shown)[round(y - 0.5), round(x - 0.5)] - [0x9A, 0x86, 0xC9]).max() <= 4
-
-
-@pytest.mark.parametrize("scheme", ["dark", "light"])
-def test_the_page_is_dark_or_light_as_the_system_is_and_on_request(opened, scheme):
-    shown = opened([lone()], RAYS, scheme=scheme)
-    before = screen(shown)[60, 600].mean()
-    shown.keyboard.press("d")
-    settle(shown)
-    after = screen(shown)[60, 600].mean()
-    assert (before < 60 and after > 200) if scheme == "dark" else (before > 200 and after < 60)
 
 
 @pytest.mark.parametrize(("size", "count"), [(DESKTOP, 16), (PHONE, 6)])

@@ -75,8 +75,8 @@ def solve(
             at t_1. Tolerances below `LEAST_TOLERANCE` of the state's or the velocity's type are raised to it, with a
             warning.
         progress: Called after every evaluation.
-        grid: Time grid of a fixed-step method: `uniform`, `power:P` (t = 1 - (1 - u)^P), `power-start:P` (t = u^P),
-            or the times themselves, (N + 1,) from t_0 to t_1.
+        grid: Time grid of a fixed-step method: `uniform`, `power:P` (t = 1 - (1 - u)^P), or the times
+            themselves, (N + 1,) from t_0 to t_1.
         max_evaluations: Budget of a scene in an adaptive method; the second solution of `global_error` has another.
         max_step: Longest step of r2flow's adaptive methods as a share of the interval. They evaluate v in every 0.16 of
             the interval and locate jumps of v in time; a narrower pulse can be missed without a flag. 1/64 finds all

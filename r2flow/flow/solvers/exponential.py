@@ -149,8 +149,7 @@ class _Scene:
     def _try(self, f: Tensor, krylov: "_Krylov", h: float) -> tuple[float, float, Tensor, Tensor]:
         """Try a step: its error in tolerances, its length (at most h), its end and the velocity there.
 
-        The estimate of order 3, 12 R(1) - 48 R(1/2), vanishes for a remainder R = c h^2, however large. The remainder
-        at the end must therefore be the one at 1 that the step is made of, up to their effect on the end.
+        The estimate, 12 R(1) - 48 R(1/2), vanishes for any R = c h^2: the remainder at the end must be R(1), too.
         """
         scale = self.tolerance * (1 + self.u.abs())
         while not krylov.enough(1, self.direction * h, scale):

@@ -16,23 +16,12 @@ def uniform(t_0: float, t_1: float, steps: int) -> Tensor:
 
 def power(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
     """t = 1 - (1 - u)^p at equal steps of u: for p > 1 denser towards t = 1, where a 1-RF is most curved."""
-    return 1 - power_start(1 - t_0, 1 - t_1, steps, p)
-
-
-def power_start(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
-    """t = u^p at equal steps of u: for p > 1 denser towards t = 0."""
-    check(min(t_0, t_1) >= 0, "a power grid ends at the time towards which it gets denser: give grid=uniform.")
-    return uniform(t_0 ** (1 / p), t_1 ** (1 / p), steps) ** p
-
-
-NAMED = {"power": power, "power-start": power_start}
+    check(max(t_0, t_1) <= 1, "a power grid ends at the time towards which it gets denser: give grid=uniform.")
+    return 1 - uniform((1 - t_0) ** (1 / p), (1 - t_1) ** (1 / p), steps) ** p
 
 
 def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
-    """A time grid by name: uniform, power:P or power-start:P with 1 <= P <= 10.
-
-    The times are the same forward and backward in time.
-    """
+    """A time grid by name, uniform or power:P with 1 <= P <= 10, the same forward and backward in time."""
     if name == "uniform":
         return uniform
     kind, _, text = name.partition(":")
@@ -40,9 +29,9 @@ def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
         p = float(text)
     except ValueError:
         p = math.nan
-    if kind not in NAMED or not 1 <= p <= 10:
-        raise InputError(f"a time grid is uniform, power:P or power-start:P with P from 1 to 10; found {name!r}.")
-    return lambda t_0, t_1, steps: NAMED[kind](t_0, t_1, steps, p)
+    if kind != "power" or not 1 <= p <= 10:
+        raise InputError(f"a time grid is uniform or power:P with P from 1 to 10; found {name!r}.")
+    return lambda t_0, t_1, steps: power(t_0, t_1, steps, p)
 
 
 def build_grid(grid: str | Sequence[float] | Tensor, t_0: float, t_1: float, steps: int) -> Tensor:
