@@ -111,11 +111,6 @@ def make_pairs(
     sampler.check(generator)
     if not sampler.paired:
         raise InputError(f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
-    if generator.fixed and sampler != generator.sampler:
-        raise InputError(
-            f"this generator was distilled for {generator.sampler} and draws no pairs by {sampler}: give the same "
-            "data.pairs.sampler, or pairs of the flow that it comes from."
-        )
     made, start = Made(), time.monotonic()
 
     def make_shard(shard: int) -> None:

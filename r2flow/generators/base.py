@@ -129,8 +129,6 @@ class Generator(nn.Module):
             sampler = build_sampler(
                 {"name": name, **({"steps": steps} if "steps" in names and "grid" not in given else {}), **given}
             )
-        if self.fixed and sampler != self.sampler:
-            raise InputError(f"this model is distilled for {self.sampler} alone: leave sampler and steps out.")
         sampler.check(self)
         return sampler
 

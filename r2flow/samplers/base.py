@@ -102,6 +102,8 @@ class Sampler(ABC):
         if getattr(generator, self.needs, None) is None:
             kind = type(generator).__name__
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}; a {kind} has none.")
+        if getattr(generator, "fixed", False) and self != generator.sampler:
+            raise InputError(f"this model is distilled for {generator.sampler} alone: leave sampler and steps out.")
 
     def solve(self, *args: Any, **options: Any) -> Solution:
         """Solve the ODE to t_1; only an `ODESampler` can."""
