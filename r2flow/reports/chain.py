@@ -58,7 +58,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     draw_pages(shown, rays, out, f"{last}, seed 0")
     text = [
         f"{num} scans of each generator and number of steps, all from the same noise, against {len(real)} held-out "
-        "scans. *Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 "
+        "scans. *Bend* is the integral of the paper's s(t) over the squared length of the path (mean over scans, 0 "
         "is straight); an untrained flow is straight too, so read it together with the *distance*: the mean of "
         "the panel's lines, 0 is equal.",
         table(rows, COLUMNS | {line: line for line in PANEL}),
