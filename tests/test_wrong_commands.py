@@ -43,7 +43,6 @@ sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column
 sample run -o out --rows 5-3
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
-sample run -o out --plugin nope
 sample run -o out extra
 sample run -o out -o # '-o' requires an argument
 sample '' -o out # an argument is empty
@@ -102,7 +101,6 @@ evaluate scans run --sampler euler,heun2 --tolerance 0.1 # tolerance
 evaluate scans run --sensor vlp16
 evaluate scans scans --sensor vlp # Did you mean 'vlp16'? Your own is a YAML file
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
-report solvers nowhere -o out
 report solvers -o out --budgets 1 --samplers rk4 # --budgets
 report solvers -o out --problems none # nothing to measure
 report paper run -o out --results nowhere
@@ -161,7 +159,6 @@ name=x backbone=
 name=x backbone.name=null
 name=x data=folder data.root=scans data.reading.projection=flat
 name=x data=folder data.root=scans data.validation.data=3
-name=x data=prepared
 name=x data=mixed 'data.parts=[{name: folder, root: empty}]'
 name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
 name=x stage=reflow data=pairs stage.init=run backbone=hdit

@@ -232,8 +232,10 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
 
     names = separate(options.sampler) if options.sampler else [None]
     steps = numbers("steps", options.steps) if options.steps else [None]
-    own = [flow.generator.sampler] if flow.generator.fixed else None
-    sets, samplers = {}, own or _samplers(flow.generator, names, steps, options.tolerance)
+    sets, samplers = {}, _samplers(flow.generator, names, steps, options.tolerance)
+    if not samplers:
+        samplers = [flow.generator.sampler]
+        log.warning("%s is distilled for %s alone", label, *samplers)
     plain = [str(sampler) for sampler in samplers]
     for sampler in samplers:
         line = f"{label}, {sampler.name}" if len(names) > 1 else label
@@ -268,7 +270,7 @@ def _samplers(
                 continue
             if sampler not in chosen:
                 chosen.append(sampler)
-    if refused and not chosen:
+    if refused and not chosen and not generator.fixed:
         raise refused
     return chosen
 

@@ -121,7 +121,9 @@ def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
 
 def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: Sequence[int] = ()) -> list[Panel]:
     """Samples 0 to num - 1 of a seed, a panel each; with `steps`, a panel per number of steps, samples as frames."""
-    steps = [flow.generator.sampler.steps] if steps and flow.generator.fixed else steps  # type: ignore[attr-defined]
+    if steps and flow.generator.fixed:
+        steps = [flow.generator.sampler.steps]  # type: ignore[attr-defined]
+        print(f"{label} is distilled for {flow.generator.sampler} alone")
     samplers = [flow.generator.choose(steps=count) for count in steps] or [flow.generator.sampler]
     evaluations = num * sum(sampler.evaluations(flow.generator) or 0 for sampler in samplers)
     sets = []
