@@ -61,7 +61,7 @@ def warn_odd(path: Path, kind: str, points: int = 0) -> None:
     """Warn about odd values of a file, once per folder and kind in a process."""
     if (path.parent, kind) not in _warned:
         _warned.add((path.parent, kind))
-        number = f" ({points:,} points; told once per folder)" if points else ""
+        number = f" ({points:,} points; reported once per folder)" if points else ""
         log.warning("%s: %s%s", path, kind, number)
 
 

@@ -43,7 +43,6 @@ sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column
 sample run -o out --rows 5-3
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
-sample run -o out extra
 sample run -o out -o # '-o' requires an argument
 sample '' -o out # an argument is empty
 info nowhere
@@ -170,7 +169,6 @@ name=x 'chain={a: {init: b}}'
 name=x 'chain={a/b: {seed: 3}}'
 name=x experiment=demo chain.rf1=null
 name=a/../../b
-name=x foo
 name=x a=b=c
 name=x 'data={' # data={ cannot be read
 name=x seed=${seed} # interpolation

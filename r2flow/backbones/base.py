@@ -70,7 +70,7 @@ class Backbone(ExactBuffers):
         self.unit, self.second_time, self.data_std = unit, second_time, data_std
         self.in_channels, self.out_channels = in_channels, in_channels if out_channels is None else out_channels
         self._check(rays)
-        # on the device of the parameters, which `with torch.device(...)` may have set
+        # on the parameters' device: torch 2.6's `get_default_device` does not see `with torch.device(...)`
         device = torch.empty(0).device if rays.device.type == "cpu" else rays.device
         self.register_buffer("coords", rays[None].to(device, torch.float32, copy=True))
         self.register_load_state_dict_post_hook(_follow_loaded_rays)

@@ -142,7 +142,7 @@ def sensor(
     ]
     print_table(rows, ("", ""))
     if off > MOST_OFF or is_tilted(points):
-        log.warning("points %.2f degrees off their beams: are they in one sensor's frame, not the vehicle's?", off)
+        log.warning("the beams are not clear: are the points in one sensor's frame, not the vehicle's?")
     if out is not None:
         write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
         print(out)

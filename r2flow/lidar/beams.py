@@ -30,7 +30,7 @@ OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another 
 MOST_VOID = 0.1  # share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16
 BEATEN = 0.5  # degrees: beyond it, a sensor does not match if another sensor is twice as near
 TILTS = np.arange(-10, 10.5, 0.5)  # degrees
-LEVEL = 1.0  # degrees: a smaller tilt is no other frame; KITTI's odometry scans have half a degree
+LEVEL = 1.0  # degrees: a smaller tilt is not another frame; KITTI's odometry scans have half a degree
 CLEARER = 1.12  # beams this much clearer after a larger tilt are of another frame; real scans have 1.03 at most
 
 RINGS = "a ring number at each point"

@@ -50,7 +50,7 @@ def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, ca
     rows = np.array([[10, 0, -1, 0.5], [np.nan, 0, 0, 0.5], [10, np.inf, 0, 0.5]] + [[11, 2, -1, 0.5]] * 5, np.float32)
     rows.tofile(tmp_path / "scan.bin")
     image = read_image(tmp_path / "scan.bin", STRICT)
-    assert "infinite or beyond 10000 m are dropped (2 points; told once per folder)" in caplog.text
+    assert "infinite or beyond 10000 m are dropped (2 points; reported once per folder)" in caplog.text
     assert (image[0] > 0).sum() == 2
 
 

@@ -267,8 +267,8 @@ def pitched(points: Points, degrees: float) -> Points:
 @pytest.mark.parametrize("name", SENSORS)
 def test_points_in_the_frame_of_a_pitched_vehicle_are_told(name: str):
     level = scan(SENSORS[name].resized(columns=384), UNORDERED)
-    for degrees, told in ((0, False), (0.5, False), (2, True), (-5, True)):
-        assert is_tilted([pitched(level, degrees)]) == told, degrees
+    for degrees, tilted in ((0, False), (0.5, False), (2, True), (-5, True)):
+        assert is_tilted([pitched(level, degrees)]) == tilted, degrees
 
 
 def test_real_scans_are_tilted_only_in_another_frame(shared: Path):

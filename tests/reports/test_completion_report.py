@@ -18,6 +18,7 @@ from r2flow.reports.completion import Way, completion_rows, measured_by
 from r2flow.samplers import build_sampler
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
+from tests.conftest import CONFIG as FLOW
 from tests.simulator.test_folder import write_folder
 from tests.stages.test_transfer_flow import CONFIG
 
@@ -97,14 +98,15 @@ def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: P
     assert "coverage" in (out / "completion.md").read_text()
 
 
-def test_scans_without_reflectance_have_no_column_of_it(r2flow, checkpoint, tmp_path: Path):
-    checkpoint.save(tmp_path / "model.safetensors")
-    np.save(tmp_path / "scan.npy", simulate(checkpoint.sensor, 3, 0).image[:1])
-    r2flow.said(
-        "report", "completion", tmp_path / "scan.npy", tmp_path / "model.safetensors", "--tasks", "rows:2",
-        "--out", tmp_path / "out",
-    )  # fmt: skip
+def test_a_densifier_takes_a_flow_s_size_and_range_alone_has_no_reflectance(r2flow, checkpoint, tmp_path: Path):
+    flow = Checkpoint(build_generator(FLOW).eval(), FLOW)
+    models = tmp_path / "dense.safetensors", tmp_path / "flow.safetensors"
+    checkpoint.save(models[0])
+    flow.save(models[1])
+    np.save(tmp_path / "scan.npy", simulate(flow.sensor, 3, 0).image[:1])
+    r2flow.said("report", "completion", tmp_path / "scan.npy", *models, "--tasks", "rows:2", "--out", tmp_path / "out")
     rows = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
+    assert [row["evaluations"] for row in rows[-2:]] == [1, 30]
     assert all(math.isfinite(row["panel"]) and "reflectance_mae" not in row for row in rows)
     assert "reflectance MAE" not in (tmp_path / "out" / "completion.md").read_text()
 
