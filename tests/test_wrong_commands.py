@@ -175,6 +175,7 @@ name=x seed=${seed} # interpolation
 name=x --cfg foo
 name=x --config-dir nowhere
 -m seed=1,2 hydra/launcher=nope
+-m seed=1,2 --cfg job # one of
 name=x hydra.run.dir=file.txt
 name=x data@foo=kitti_raw
 name=x scans=3 # no key 'scans'

@@ -140,6 +140,8 @@ def _checked_arguments(arguments: list[str]) -> list[str]:
     parser.error = refuse  # type: ignore[method-assign]  # the default prints all flags
     parsed = parser.parse_intermixed_args(arguments)  # flags may stand between them
     overrides = parsed.overrides
+    if sum(map(bool, (parsed.run, parsed.multirun, parsed.cfg, parsed.info))) > 1:
+        raise InputError("give one of --run, --multirun, --cfg and --info.")
     for text in overrides if parsed.multirun or "hydra.mode=MULTIRUN" in overrides else ():
         # A sweep over several names is valid.
         if key_of(text) == "run_dir" or (key_of(text) == "name" and "," not in text):
@@ -299,4 +301,4 @@ def _check_links(links: Sequence[Any]) -> None:
         try:
             configs[link.name] = check(configs[link.name], link.overrides, parent)
         except InputError as error:
-            raise InputError(f"chain.{link.name}: {error}") from None
+            raise InputError(f"chain.{link.name}: {error} For another link alone: +chain.LINK.KEY=VALUE.") from None
