@@ -34,13 +34,10 @@ def real_scans(
     most: int = 16,
     need_reflectance: bool = True,
 ) -> list[Real]:
-    """Read scans with the projection of the checkpoint's training scans.
+    """Read scans (`open_scans`), at most `most` per set, evenly spread, projected as the checkpoint's training scans.
 
-    Args:
-        specs: As for `r2flow.data.opening.open_scans`.
-        reflectance_scale: Value of full reflectance in the files; None: as in training.
-        most: Maximum number of scans per set, evenly spread.
-        need_reflectance: Whether a set without reflectance is refused if the checkpoint has it, or read without it.
+    `reflectance_scale` is the value of full reflectance in the files; None: as in training. `need_reflectance`: a set
+    without reflectance is refused if the checkpoint has it.
     """
     trained = reading_for([], checkpoint)
     scale = trained.reflectance_scale if reflectance_scale is None else reflectance_scale
@@ -65,14 +62,9 @@ class Inversion(NamedTuple):
 
 
 def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, progress: Progress = None) -> Inversion:
-    """Solve the flow's ODE backward from x_1 to x_0, and forward again.
+    """Solve the flow's ODE backward from x_1 to x_0, and forward again, for images in metres, (B, 2 or 1, H, W).
 
     A scan with NaN is not converged and has NaN as noise; other scans of the batch are unaffected.
-
-    Args:
-        images: Range in metres and reflectance, (B, 2 or 1, H, W), 0 for dropped rays.
-        sampler: Solver of both directions.
-        progress: Called after every network evaluation.
     """
     flow = as_flow(checkpoint.generator, "inversion")
     assert images.shape[2:] == checkpoint.sensor.shape
@@ -86,11 +78,10 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
 
 
 def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> dict[str, Tensor]:
-    """Errors of scans after inversion and generation, each (B,).
+    """Errors of scans after inversion and generation, each (B,); NaN for scans that are not finite.
 
-    Returns:
-        `rms` in model space, [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`; `noise_std`, the standard
-        deviation of x_0, far from 1 for scans unlike the training set. NaN for scans that are not finite.
+    `rms` in model space, [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`; `noise_std`, the standard
+    deviation of x_0, far from 1 for scans unlike the training set.
     """
     error = rms(inversion.again - inversion.x_1)
     median_m, rms_m, dropped = metres_apart(*(checkpoint.encoding.decode(x) for x in (inversion.x_1, inversion.again)))
@@ -108,9 +99,8 @@ def rms(x: Tensor) -> Tensor:
 def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Errors between decoded images, (B, 2 or 1, H, W), per scan, each (B,) float64.
 
-    Returns:
-        Lower median and root mean square of |r' - r| in metres over the rays that return in both, NaN without any;
-        share of all rays that return in only one.
+    Lower median and root mean square of |r' - r| in metres over the rays that return in both, NaN without any; share of
+    all rays that return in only one.
     """
     before, after = image[:, 0].double(), other[:, 0].double()
     apart = (after - before).abs().masked_fill((before <= 0) | (after <= 0), math.nan).flatten(1)
@@ -122,14 +112,8 @@ def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     """Spherical linear interpolation, (sin((1 - w) a) x + sin(w a) y) / sin a, with a the angle between x and y.
 
     Unlike linear interpolation, it keeps the norm of noise, since independent samples are nearly orthogonal (Shoemake
-    1985, "Animating rotation with quaternion curves"). For a vanishing angle it is linear.
-
-    Args:
-        x, y: Ends, (...).
-        weights: w of each point, (N,); 0 gives x and 1 gives y.
-
-    Returns:
-        (N, ...).
+    1985, "Animating rotation with quaternion curves"). For a vanishing angle it is linear. Ends are (...), weights w
+    (N,), the result (N, ...).
     """
     u, v = x.double().flatten(), y.double().flatten()
     lengths = torch.linalg.vector_norm(u), torch.linalg.vector_norm(v)
@@ -164,13 +148,9 @@ def interpolate_scans(
     progress: Progress = None,
     arrived: Callable[[int], None] = lambda done: None,
 ) -> Interpolation:
-    """Invert two scans, `slerp` between their noise, and generate scans: the paper's figure 3.
+    """Invert two scans, (2, 2 or 1, H, W), `slerp` between their noise, and generate scans: the paper's figure 3.
 
-    Args:
-        pair: Two scans in metres and reflectance, (2, 2 or 1, H, W).
-        frames: Number of scans, including both ends; at least 2.
-        progress: Called after every network evaluation.
-        arrived: Called with the number of finished frames, the ends first.
+    `frames`, at least 2, counts both ends; `arrived` is called with the number of finished frames, the ends first.
     """
     flow = as_flow(checkpoint.generator, "interpolation")
     ends = invert(checkpoint, pair, sampler, progress)

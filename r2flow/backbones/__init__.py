@@ -26,14 +26,9 @@ def build_backbone(
     out_channels: int | None = None,
     second_time: bool = False,
 ) -> Backbone:
-    """Build the backbone `options["name"]` for images of `in_channels` channels along `rays`, (2, H, W).
+    """Build the backbone `options["name"]`, as in conf/backbone, along rays (elevation, azimuth) in radians, (2, H, W).
 
-    Args:
-        options: `name` and keyword options of the constructor, as in conf/backbone/*.yaml.
-        rays: Elevation and azimuth of every pixel in radians.
-        in_channels: Channels of the image plus those of the condition concatenated to it.
-        out_channels: Channels of the output; None: `in_channels`.
-        second_time: Whether the network takes a second time s.
+    `in_channels` includes the channels of a condition; `out_channels` None means as many.
     """
     arguments: dict[str, Any] = {"in_channels": in_channels}
     if out_channels is not None:

@@ -28,18 +28,14 @@ from r2flow.registry import Registry
 def neighbourhood_attention(
     q: Tensor, k: Tensor, v: Tensor, window: tuple[int, int], wrap: bool = True, backend: str = "auto"
 ) -> Tensor:
-    """softmax_{j in window(i)}(q_i . k_j) v_j.
+    """softmax_{j in window(i)}(q_i . k_j) v_j for N heads of D channels, (B, H, W, N, D) as q, k and v.
 
     The logits are not scaled: q and k must be scaled.
 
     Args:
-        q, k, v: (B, H, W, N, D), N heads of D channels.
         window: Rows and columns, both odd; at most the rows (and without wrap the columns) of the map.
         wrap: Whether the columns are a ring; if not, windows are shifted inside in both directions.
         backend: A name in `BACKENDS`, or "auto" (above).
-
-    Returns:
-        (B, H, W, N, D).
     """
     check_window(window)
     rows = _Axis(q.shape[1], window[0], wrap=False)

@@ -76,15 +76,9 @@ class Backbone(ExactBuffers):
         self.register_load_state_dict_post_hook(_follow_loaded_rays)
 
     def forward(self, t: Tensor | float, x: Tensor, s: Tensor | float | None = None) -> Tensor:
-        """v(t, x), or u(x, t, s) for networks with a second time.
+        """v(t, x), or u(x, t, s) for networks with a second time, (B, C', H, W) in the dtype of x.
 
-        Args:
-            t: Time, a scalar or (B,).
-            x: Image and condition, (B, C, H, W).
-            s: Second time, a scalar or (B,); None for s = t.
-
-        Returns:
-            (B, C', H, W), in the dtype of x.
+        x, (B, C, H, W), is the image and its condition; times are scalars or (B,), and s None means s = t.
         """
         expected = self.in_channels, *(x.shape[2:] if self.any_size else self.coords.shape[2:])
         if x.shape[1:] != expected:
@@ -132,12 +126,8 @@ class Backbone(ExactBuffers):
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
         """The backbone for a part of its image, (B, C, len(rows), len(columns)), with shared parameters.
 
-        The part ignores the rest of the image and does not wrap a cropped turn, so that its field differs, mostly near
-        the edges of the crop.
-
-        Args:
-            rows: Numbers of neighbouring rows, ascending.
-            columns: Numbers of neighbouring columns, which may wrap around the ring.
+        Rows and columns are neighbours, ascending; columns may wrap around the ring. The part ignores the rest of the
+        image and does not wrap a cropped turn, so that its field differs, mostly near the edges of the crop.
         """
         if not self.croppable:
             raise InputError(

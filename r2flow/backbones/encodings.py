@@ -22,14 +22,8 @@ def mean_rays(rays: Tensor, patch: tuple[int, int]) -> Tensor:
 class Rotary(ExactBuffers):
     """Rotary embedding by ray angles, theta = (e f_h, a f_w), with integer harmonics f.
 
-    For integers, azimuth +pi and -pi are the same rotation (paper, section III-B). Frequencies are
-    round(exp(linspace(0, ln M, heads D / 4))) with M the highest harmonic of the axis, distributed to the heads in
-    turn.
-
-    Args:
-        heads: Attention heads N.
-        head_channels: Channels D of a head, a multiple of 4.
-        highest: Highest harmonics (M_h, M_w).
+    For integers, azimuth +pi and -pi are the same rotation (paper, section III-B). N heads of D channels, a multiple of
+    4, take in turn from the frequencies round(exp(linspace(0, ln M, N D / 4))) of an axis, with M its highest harmonic.
     """
 
     freqs_h: Tensor

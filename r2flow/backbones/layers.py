@@ -102,11 +102,7 @@ class GEGLU(nn.Module):
 
 
 class RandomFourierFeatures(ExactBuffers):
-    """W [cos(2 pi f t), sin(2 pi f t)] with fixed frequencies f ~ N(0, 1).
-
-    Args:
-        channels: Width of the embedding, twice the number of frequencies.
-    """
+    """W [cos(2 pi f t), sin(2 pi f t)] with `channels` // 2 fixed frequencies f ~ N(0, 1)."""
 
     freqs: Tensor
 
@@ -165,9 +161,8 @@ BAND = 1024  # tokens
 def rows_at_once(x: Tensor) -> int:
     """Number of rows of a map (B, H, W, ...) to process at a time.
 
-    All rows, except on a CPU without gradients: a band of about `BAND` tokens, so that intermediate results stay in
-    the cache and in mapped memory. The paper's HDiT then reaches 0.75 instead of 0.62 of the speed of plain matrix
-    products.
+    All rows, except on a CPU without gradients: a band of about `BAND` tokens, so that intermediate results stay in the
+    cache and in mapped memory, which makes the paper's HDiT a fifth faster.
     """
     batch, rows, columns = x.shape[:3]
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or not x.is_cpu:

@@ -32,13 +32,9 @@ def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
 
 
 class Paths:
-    """A path per scan, interpolated between states at given times by a polynomial through the four nearest.
+    """A path per scan through N >= 2 states, (B, N, ...), by a polynomial through the four nearest.
 
-    With only the two ends, the path is a straight line.
-
-    Args:
-        times: Increasing times of the states, (N,), N >= 2.
-        states: (B, N, ...).
+    Times, (N,), increase. With only the two ends, the path is a straight line.
     """
 
     def __init__(self, times: Tensor, states: Tensor) -> None:

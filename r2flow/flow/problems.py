@@ -31,8 +31,7 @@ class Problem:
 class Gaussian(Problem):
     """x_1 ~ N(mean, std^2): x_t = t mean + sigma_t x_0 with sigma_t^2 = (1 - t)^2 + t^2 std^2.
 
-    Args:
-        std: Standard deviation; smaller values give later and sharper turns of the paths.
+    A smaller std gives later and sharper turns of the paths.
     """
 
     def __init__(self, mean: float = 0.7, std: float = 0.25) -> None:

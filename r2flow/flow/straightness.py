@@ -99,11 +99,9 @@ def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progr
 def straightness(
     velocity: Velocity, x_0: Tensor, steps: int = 256, most_curved: int = 0, progress: Progress = None
 ) -> Straightness:
-    """s(t) per scan at the times of `steps` Euler steps, in two passes: 2 x steps evaluations.
+    """s(t) per scan at the times of `steps` Euler steps from noise, (B, ...), in two passes: 2 x steps evaluations.
 
-    Args:
-        x_0: Noise, (B, ...).
-        most_curved: Number of elements, over all scans, whose path is returned.
+    The paths of the `most_curved` elements, over all scans, are kept.
     """
     total = curvature(velocity, x_0, steps, progress)
     d = total.x_1 - total.x_0

@@ -41,12 +41,9 @@ class Surroundings(NamedTuple):
 
     @classmethod
     def of(cls, space: ModelSpace, condition: Condition, ring: bool, steps: Tensor) -> "Surroundings":
-        """Candidates and features from a condition.
+        """Candidates and features from a condition (`condition_of`), whose interpolated values are ignored.
 
-        Args:
-            condition: `image` and `known` of `r2flow.generators.condition_of`; interpolated values are ignored.
-            ring: Whether the columns span a full turn.
-            steps: Angle between rows and between columns in radians, (B, 2).
+        `ring`: the columns are a full turn; `steps`: angles between rows and between columns in radians, (B, 2).
         """
         image, known = condition[IMAGE].float(), condition[KNOWN].float()
         measured = known[:, :1]
@@ -85,10 +82,8 @@ class Surroundings(NamedTuple):
 class RowFeatures(nn.Embedding):
     """Features of each row: a learned vector, the elevation, and the angles between rows and between columns.
 
-    There is one learned vector per row of the training sensor and per pair of rows; other sensors share one vector.
-
-    Args:
-        elevations: Elevations of the training sensor's rows in radians, (H,).
+    There is one learned vector per row of the training sensor (`elevations` in radians, (H,)) and per pair of rows;
+    other sensors share one vector.
     """
 
     FEATURES = ROW + 3
@@ -106,12 +101,9 @@ class RowFeatures(nn.Embedding):
     def forward(  # type: ignore[override]
         self, elevations: Tensor, steps: Tensor, known: Tensor | None = None
     ) -> Tensor:
-        """Row features, (B, `FEATURES`, H, 1).
+        """Row features, (B, `FEATURES`, H, 1), from elevations in radians, (B, H), and `steps` of `Surroundings.of`.
 
-        Args:
-            elevations: Elevations of the rows in radians, (B, H).
-            steps: Angle between rows and between columns in radians, (B, 2).
-            known: Whether to use the vectors learned per row, (B,) bool; None: yes.
+        `known`, (B,) bool, tells which scans use the vectors learned per row; None: all.
         """
         same = self.known(elevations)
         nearest = (elevations[..., None] - self.elevations.to(elevations)).abs().argmin(-1)

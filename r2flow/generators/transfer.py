@@ -128,11 +128,7 @@ class TransferFlow(Flow):
         self._take(parent, {**weights, "backbone.coords": self.backbone.coords})
 
     def at(self, space: ModelSpace, numbered: bool = True) -> Self:
-        """This flow for another sensor; it shares the weights.
-
-        Args:
-            numbered: Whether to use the vectors learned per row (`RowFeatures`).
-        """
+        """This flow for another sensor, with shared weights; `numbered`: use the vectors learned per row."""
         part = copy(self)
         part.space, part.noise_shape, part.elevations = space, space.shape, space.rays[0, :, 0]
         part.foreign = self.foreign or not numbered or space.sensor.name != self.space.sensor.name
@@ -140,14 +136,7 @@ class TransferFlow(Flow):
         return part
 
     def answers(self, t: Tensor, x: Tensor, about: Surroundings, rows: Tensor) -> Answers:
-        """p(x_1 | x_t, condition).
-
-        Args:
-            t: (B,) or ().
-            x: x_t, (B, C, H, W).
-            about: Candidates and features of the condition.
-            rows: Output of `RowFeatures`.
-        """
+        """p(x_1 | x_t, condition) at times t, (B,) or (), with x = x_t, (B, C, H, W); `rows` are of `RowFeatures`."""
         shape = len(x), -1, *x.shape[2:]
         inputs = torch.cat([x - about.start, about.features, rows.expand(*shape)], 1)
         output = self.backbone(t, inputs).float()
@@ -249,13 +238,8 @@ class TransferFlow(Flow):
     ) -> Mapping[str, Tensor]:
         """Losses over the hidden rays: negative log-likelihood of log r and of a return, mean |error| of reflectance.
 
-        Args:
-            x_1: Crops of scans that do not span a full turn, (B, C, H, W).
-            condition: `image` and `known` of the crops.
-            t: Times, (B,).
-            noise: (B, C, H, W).
-            steps: As in `Surroundings.of`.
-            rows: Output of `RowFeatures`.
+        x_1, (B, C, H, W), are crops that do not span a full turn, t their times, (B,); `steps` are those of
+        `Surroundings.of`, `rows` the output of `RowFeatures`.
         """
         about = Surroundings.of(self.space, condition, ring=False, steps=steps)
         known = condition[KNOWN]
@@ -279,14 +263,10 @@ class TransferFlow(Flow):
 
 
 def smoothed(e: Tensor, hidden: Tensor, elevations: Tensor) -> Tensor:
-    """Standard normal numbers of hidden rays, correlated over `TOGETHER` in both angles.
+    """Standard normal numbers of hidden rays, (B, 1, H, W), correlated over `TOGETHER` in both angles.
 
-    z = sum_k w_k e_k / sqrt(sum_k w_k^2) over hidden rays k, with w_k = exp(-d^2 / 2) for d the angle over `TOGETHER`.
-
-    Args:
-        e: Independent standard normal numbers, (B, 1, H, W).
-        hidden: Rays to smooth over, (B, 1, H, W) bool; others get no meaningful number.
-        elevations: Of the rows, in radians, (H,).
+    z = sum_k w_k e_k / sqrt(sum_k w_k^2) over hidden rays k, with e_k independent and w_k = exp(-d^2 / 2) for d the
+    angle over `TOGETHER`. Other rays get no meaningful number. Elevations are those of the rows in radians, (H,).
     """
     rows, columns = e.shape[2:]
     steps = (abs(float(elevations[0] - elevations[-1])) / max(rows - 1, 1), 2 * math.pi / columns)

@@ -19,13 +19,10 @@ TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points | InputError]]:
-    """Time in nanoseconds and points of each PointCloud2 of a topic, in the order of recording.
+    """Time in nanoseconds and points of each PointCloud2 of a topic (None: the only one), in the order of recording.
 
     The time is header.stamp, as poses and labels have it; if 0, that of recording. A message that is not a valid scan
     is yielded as an `InputError`.
-
-    Args:
-        topic: Name of the topic; None: the only topic of point clouds.
     """
     require(str(path), "formats", "rosbags")
     from rosbags.rosbag1 import Reader as Reader1

@@ -14,14 +14,10 @@ Rule = Literal["nearest", "linear", "inverse"]  # inverse: linear in 1 / range
 
 
 def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse") -> np.ndarray:
-    """Fill the unknown rays of an image, float32; an image without known rays is 0.
+    """Fill the unknown rays of an image, (2 or 1, H, W) float32; an image without known rays is 0.
 
-    Along a column on a plane, such as the ground, 1 / range is nearly linear in elevation.
-
-    Args:
-        image: Range in metres and reflectance, (2 or 1, H, W); 0 without a return. Unknown rays are ignored.
-        measured: True for known rays, (H, W) bool.
-        rule: Interpolation of ranges; reflectance is nearest or linear.
+    Along a column on a plane, such as the ground, 1 / range is nearly linear in elevation. `measured` marks known rays,
+    (H, W) bool. The rule is that of ranges; reflectance is nearest or linear.
     """
     if measured.all() or not measured.any():
         return image * measured

@@ -45,11 +45,7 @@ def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
 
 
 def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
-    """Share of the unknown rays in sectors of at least `least` degrees without any known ray.
-
-    Args:
-        state: `Ray` of each ray, (H, W).
-    """
+    """Share of the unknown rays of a state, (H, W), in sectors of at least `least` degrees without any known ray."""
     unknown = state == Ray.UNKNOWN
     empty = unknown.all(0)
     width = math.ceil(least / 360 * len(empty))

@@ -47,9 +47,7 @@ def labels_beside(scan: str | Path) -> Path | None:
 def read_labels(path: str | Path, scan: str | Path, points: Points | None = None) -> np.ndarray:
     """The semantic id of each point of a scan, (N,) uint16, in the order of `read_points`, without dropped rows.
 
-    Args:
-        path: A `.label` file: a uint32 per row of the scan's file, class id in the low 16 bits, instance in the high.
-        points: The points of the scan, if already read.
+    A `.label` file has a uint32 per row of the scan's file, class id in the low 16 bits, instance in the high.
     """
     path = Path(path)
     points = read_points(scan) if points is None else points

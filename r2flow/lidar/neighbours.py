@@ -7,18 +7,11 @@ from torch import Tensor
 
 
 def nearest_returns(returned: Tensor, steps: Tensor, ring: bool = True) -> Tensor:
-    """Offsets from each ray to the nearest returns above, below, left and right.
+    """Rows and columns from each ray to the nearest returns above, below, left and right, (4, 2, B, H, W) float32.
 
     `Above` is the quadrant of previous rows whose distance in columns is at most the distance in rows; the others are
-    alike. The nearest return has the smallest angle.
-
-    Args:
-        returned: True for known returns, (B, H, W) bool.
-        steps: Angle between two rows and between two columns, (B, 2).
-        ring: Whether the columns are a full turn.
-
-    Returns:
-        Rows and columns from the ray to the return, (4, 2, B, H, W) float32; infinite without a return.
+    alike. Of the returns, (B, H, W) bool, the nearest has the smallest angle, by the angles between two rows and
+    between two columns, (B, 2). Offsets are infinite without a return. `ring`: the columns are a full turn.
     """
     twice = steps.repeat(2, 1).mT[..., None]  # (2, 2 B, 1)
     upright = torch.stack([returned, returned.flip(1)]).flatten(0, 1)

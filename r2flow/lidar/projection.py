@@ -73,8 +73,7 @@ def project_indices(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The return of each pixel, see `project`.
 
-    Returns:
-        Pixels with a return, h W + w, ascending; indices of their points in `xyz`; their ranges in metres: (M,) each.
+    Pixels with a return, h W + w, ascending; indices of their points in `xyz`; their ranges in metres: (M,) each.
     """
     assert convention in get_args(Convention), convention
     assert projection in get_args(Projection), projection
@@ -156,14 +155,9 @@ def _nearest_by_sorting(pixel: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, n
 
 
 def unproject(r: Tensor, rays: Tensor) -> Tensor:
-    """Points along rays, p = r (cos e cos a, cos e sin a, sin e).
+    """Points along rays, p = r (cos e cos a, cos e sin a, sin e) in metres, (B, 3, H, W): x ahead, y left, z up.
 
-    Args:
-        r: Ranges in metres, (B, 1, H, W); 0 marks a ray without return.
-        rays: Elevation e and azimuth a in radians, (2, H, W).
-
-    Returns:
-        Points in metres, (B, 3, H, W), sensor frame: x ahead, y left, z up.
+    Ranges, (B, 1, H, W), are 0 for rays without return; rays are elevation e and azimuth a in radians, (2, H, W).
     """
     e, a = rays.to(r)
     direction = torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()])

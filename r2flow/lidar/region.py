@@ -83,16 +83,11 @@ def region(
     rows: tuple[int, int] | None = None,
     margin: float = 0.0,
 ) -> Region:
-    """The pixels of an azimuth sector and a block of rows.
+    """The pixels of an azimuth sector and a block of rows of an image of shape (H, W); None for all.
 
-    Args:
-        shape: Rows and columns (H, W) of the image; column 0 begins at +180 degrees and azimuth decreases with w.
-        sector: Azimuths in degrees, counter-clockwise from the first to the second: (-45, 45) is the quarter ahead,
-            (135, -135) the quarter behind. Pixels partly inside are included. Azimuths a full turn apart, such as
-            (-180, 180), are the full turn. None: all columns.
-        rows: First and last row, both included, 0 at the top. None: all rows.
-        margin: Degrees on either side of the sector that are generated and cropped, because a crop changes the
-            generated scan near its edges.
+    The sector runs counter-clockwise in degrees: (-45, 45) is the quarter ahead, (135, -135) the quarter behind; ends a
+    full turn apart are the full turn. Pixels partly inside are included, as are both rows, 0 at the top. `margin`
+    degrees on either side are generated and cropped, because a crop changes the generated scan near its edges.
     """
     height, width = shape
     first_row, last_row = rows or (0, height - 1)

@@ -16,11 +16,7 @@ LARGEST_FILE = 1 << 20  # bytes; a sensor is a dozen lines
 
 
 def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
-    """Read a sensor from a YAML file with the options of `build_sensor`.
-
-    Args:
-        rows, columns: Image size; None: as in the file.
-    """
+    """Read a sensor from a YAML file with the options of `build_sensor`, in another size if given."""
     path = Path(path)
     with reading(path, LARGEST_FILE, "sensor's YAML"):
         options = yaml.safe_load(path.read_text(encoding="utf-8"))

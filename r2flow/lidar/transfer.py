@@ -52,13 +52,10 @@ def rows_of(elevations: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 
 def points_through(points: Points, source: Sensor, target: Sensor, reflectance: np.ndarray | None = None) -> Partial:
-    """The target's partially measured image, from a scan of another sensor (`sensor_of`).
+    """The target's partially measured image, from a scan of another sensor (`sensor_of`) with reflectance in [0, 1].
 
-    All points of a beam are in the row of their median elevation. Rays without return are evenly spaced between the
-    two neighbouring returns of their beam, one per missing azimuth step.
-
-    Args:
-        reflectance: Reflectance of each point in [0, 1], or None.
+    All points of a beam are in the row of their median elevation. Rays without return are evenly spaced between the two
+    neighbouring returns of their beam, one per missing azimuth step.
     """
     elevation, azimuth = elevations_of(points.xyz), _azimuth(points.xyz)
     beam = rows_of(elevation, source)

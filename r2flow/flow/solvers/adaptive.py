@@ -39,11 +39,7 @@ def attainable(limits: Limits, dtype: torch.dtype) -> float:
 def advance(
     v: Evaluations, x: Tensor, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits
 ) -> tuple[Solution, np.ndarray]:
-    """Solve every scene of x, (B, ...), from t_0 to t_1, each with its own steps.
-
-    Returns:
-        The solution, and the time reached by each scene, (B,).
-    """
+    """Solve every scene of x, (B, ...), from t_0 to t_1, each with its own steps; return the times reached too."""
     control = StepController(v.scenes, t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
     results = x.clone()
     k_1 = v(control.now(x), x)

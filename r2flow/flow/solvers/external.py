@@ -48,8 +48,7 @@ class TorchDiffEqMethod:
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Solve scenes one after another: torchdiffeq's error norm of a whole batch would hide a hard scene.
 
-        Args:
-            times: Time grid of a fixed-step method; an adaptive method uses its first and last time.
+        An adaptive method uses only the first and last time.
         """
         import torchdiffeq
 

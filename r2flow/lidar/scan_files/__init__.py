@@ -145,14 +145,9 @@ def read_numbers(path: str | Path) -> np.ndarray:
 def write_points(
     path: str | Path, xyz: np.ndarray, reflectance: np.ndarray | None = None, ring: np.ndarray | None = None
 ) -> None:
-    """Write a scan as little-endian float32, atomically.
+    """Write a scan in metres as little-endian float32, atomically: .bin, .pcd or .ply (binary), or .npy, by its ending.
 
-    Args:
-        path: The file; its ending determines the format: .bin, .pcd or .ply (binary), or .npy. Missing folders are
-            created, an existing file is replaced.
-        xyz: Points in metres, (N, 3), sensor frame.
-        reflectance: (N,), or None.
-        ring: Number of each point's beam, (N,), or None; only for .ply.
+    Missing folders are created, an existing file is replaced. `ring`, each point's beam, is only for .ply.
     """
     check_xyz(xyz)
     path = Path(path)
