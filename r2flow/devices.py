@@ -4,11 +4,7 @@ from r2flow.errors import InputError
 
 
 def choose_device(name: str, option: str = "--device") -> str:
-    """Check the name of a device; `auto`: a GPU if available.
-
-    Args:
-        option: Option's name for messages.
-    """
+    """Check the name of a device; `auto`: a GPU if available. `option` is its name in messages."""
     import torch
 
     if name == "auto":

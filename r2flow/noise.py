@@ -25,11 +25,8 @@ PURPOSES = (
 def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.Generator:
     """Random stream of an index and step: Philox with key (seed, purpose) and counter from [0, 0, step, index].
 
-    Args:
-        seed: Run seed, 0 <= seed < 2^64.
-        purpose: One of `PURPOSES`.
-        index: Number of the image, scene or epoch, 0 <= index < 2^64.
-        step: Step of a sampler, or part of a GAN's step, for the same index, 0 <= step < 2^64.
+    `index` is the number of an image, scene or epoch, `step` a step of a sampler, or part of a GAN's step, for the same
+    index; all numbers are in [0, 2^64).
     """
     assert purpose in PURPOSES, purpose
     assert index >= 0 <= step, (index, step)

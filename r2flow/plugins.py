@@ -95,11 +95,7 @@ Registry.on_missing.append(load_installed)
 
 @contextmanager
 def made_with(config: Mapping[str, Any], what: str) -> Iterator[None]:
-    """Add the plug-ins that may define an unknown name of a stored config to the error message.
-
-    Args:
-        what: Owner of the config for the message, such as "the checkpoint".
-    """
+    """Add the plug-ins that may define an unknown name of a stored config to the error; `what` is its owner."""
     try:
         yield
     except UnknownName as error:

@@ -75,11 +75,7 @@ class _Rate(ProgressColumn):
 
 
 def track(items: Iterable[T], doing: str, unit: str = "", total: int | None = None, least: int = 0) -> Iterator[T]:
-    """Iterate over items, with a bar if there are at least `least`.
-
-    Args:
-        total: Number of items, for iterables without a length.
-    """
+    """Iterate over items, with a bar if there are at least `least`; `total` is for iterables without a length."""
     count = length_hint(items) if total is None else total
     with Bar(doing, count, unit, shown=None if count >= least else False) as bar:
         for item in items:

@@ -116,11 +116,7 @@ class Registry(Generic[T]):
 
 
 def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> None:
-    """Check options against the signature of their constructor.
-
-    Args:
-        given: Number of positional arguments passed in addition to the options.
-    """
+    """Check options against the signature of a constructor that takes `given` further arguments by position."""
     if not isinstance(options, Mapping):
         raise InputError(f"{what} must be a group of keys, found {options!r}.")
     parameters = _parameters(constructor)
@@ -151,8 +147,7 @@ def _problems(known: Mapping[str, inspect.Parameter], options: Mapping[str, Any]
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
     """Keyword options of a constructor with their defaults; `MISSING` for an option without a default.
 
-    Args:
-        given: Number of positional arguments passed in addition to the options.
+    `given` positional arguments are passed in addition.
     """
     options = _by_keyword(_parameters(constructor)[given:])
     defaults = {name: MISSING if p.default is p.empty else p.default for name, p in options.items()}

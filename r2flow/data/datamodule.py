@@ -34,15 +34,9 @@ log = logging.getLogger(__name__)
 class ScanDataModule(L.LightningDataModule):
     """Projected scans with their noise, or pairs that a flow has drawn, for training and validation.
 
-    `r2flow.data.loader.FlowDataset` describes a batch. Noise, times and order derive from the run's seed
-    (`r2flow.noise`).
-
-    Args:
-        noise_shape: Shape of one scan's noise; None: the encoding's, (C, H, W).
-        keys: The keys of `r2flow.data.options.DataOptions`.
-
-    Attributes:
-        further: Function of the run's stage that adds items to each scan of a batch.
+    `r2flow.data.loader.FlowDataset` describes a batch; `further`, a function of the run's stage, adds items to each of
+    its scans. Noise, of `noise_shape` or the encoding's (C, H, W), times and order derive from the run's seed
+    (`r2flow.noise`). `keys` are those of `r2flow.data.options.DataOptions`.
     """
 
     def __init__(

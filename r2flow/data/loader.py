@@ -29,9 +29,7 @@ class FlowDataset(Dataset[Item]):
     - k, (B,): number of the image in the run; a stage derives further draws for an image from (seed, purpose, k);
     - the keys of `further`: a stage's conditions, the same for every seed in validation.
 
-    Args:
-        sensors: Sensor of each part of a mixture; None: one sensor. Images of several sizes need a `further` that
-            crops them.
+    A mixture has a sensor per part; images of several sizes need a `further` that crops them.
     """
 
     def __init__(

@@ -194,13 +194,9 @@ def reading_for(
 ) -> Reading:
     """How scans become images: arguments first, then the model's training scans, the scans' manifest, the defaults.
 
-    The default sensor is hdl64e, or the built-in sensor whose beams plain scan files have.
-
-    Args:
-        scans: Names as for `open_scans`; None is skipped.
-        model: The checkpoint that the scans are for; another sensor or size than the model's is refused.
-        sensor, size, ...: Requested fields; None: not requested.
-        estimate_scale: Estimate full reflectance from each plain scan file, if the sensor does not tell it.
+    The default sensor is hdl64e, or the built-in sensor whose beams plain scan files have. Scans have names as for
+    `open_scans`; None is skipped. `model` is the checkpoint that they are for: another sensor or size than its own is
+    refused. `estimate_scale` estimates full reflectance from each plain scan file, if the sensor does not tell it.
     """
     specs = [str(spec) for spec in scans if spec is not None]
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)

@@ -95,15 +95,12 @@ def make_pairs(
     progress: Callable[[Made], None] = lambda made: None,
     wait: bool = True,
 ) -> Made:
-    """Make the missing or damaged pairs of a store, except those that other processes are making.
+    """Make the missing or damaged pairs of a store; `wait`: await those that others are making.
 
     x_1 is the generator's sample for x_0 = `pair_noise`, neither clamped nor snapped, in half precision. With `chord`
     or `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function
     of (seed, index, step). Batches do not depend on the process: shards are byte-identical for any number of processes.
     Rank r of R starts with shards r, r + R, ... `progress` is called after each batch.
-
-    Args:
-        wait: Whether to wait for shards that other processes are making.
     """
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")

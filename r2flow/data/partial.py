@@ -71,7 +71,6 @@ def open_partial(
 
     Args:
         reading: How the model's training scans became images.
-        source: The sensor of the scans, if known.
         scale: The value in scan files that means full reflectance; None: the default.
         most: Maximum number of scans per name, evenly spread; None: all scans, or `FEW` simulated scans.
     """

@@ -135,14 +135,10 @@ def prepare(
     checked: Advance = lambda shard: None,
     made: Advance = lambda shard: None,
 ) -> list[dict[str, Any]]:
-    """Check the shards of a folder, and make missing or damaged shards.
+    """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves out unusable scans.
 
-    Args:
-        on_bad_scan: `error`, or `skip` to leave out unusable scans.
-        checked, made: Callbacks, called with each shard.
-
-    Returns:
-        The headers of the shards: numbers of the scans left out, and maximum errors of range and reflectance.
+    The headers of the shards have the numbers of the scans left out, and maximum errors of range and reflectance.
+    `checked` and `made` are called with each shard.
     """
     store = plan.store(folder)
     if not store.check() or store.missing(plan.shards):
@@ -199,11 +195,7 @@ def refuse_other_images(folder: Path, recipe: Mapping[str, Any], reading: Readin
 
 
 class PreparedScans(ScanSource):
-    """A source of prepared scans.
-
-    Args:
-        numbers: Numbers of scans in the data set; scans left out in preparation are skipped.
-    """
+    """A source of the prepared scans of these numbers in the data set, without those left out in preparation."""
 
     def __init__(self, folder: Path, numbers: Sequence[int], reflectance: bool) -> None:
         self.folder, self.reflectance = folder, reflectance

@@ -19,9 +19,8 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     """Fill in the defaults of a run's `data`: every `reading` gets all fields of `ReadingOptions`, and parts and
     held-out scans inherit missing keys of the run, except split and drives.
 
-    Args:
-        scale: The value of full reflectance in files of the sensor.
-        parent: The reading of the run that this run starts from, or of the flow that draws its pairs.
+    `scale` is the value of full reflectance in files of the sensor; `parent` the reading of the run that this run
+    starts from, or of the flow that draws its pairs.
     """
     check_options("data", DataOptions, data)
     run = DataOptions(**data)

@@ -44,11 +44,7 @@ class Comparison:
 def pairs_of(
     real: ScanSet, judged: Mapping[str, ScanSet], reference: bool | None = None, baselines: bool | None = None
 ) -> list[Pair]:
-    """The judged sets against the real one, real scans against real scans, and baselines.
-
-    Args:
-        reference, baselines: Whether to include them; None: if any set is judged.
-    """
+    """The judged sets against the real one, with references and baselines; by default (None), if any set is judged."""
     pairs: list[Pair] = [("judged", name, real, scans) for name, scans in judged.items()]
     if reference or (judged and reference is None and len(real) > 1):
         pairs += [("reference", name, *sets) for name, sets in reference_sets(real, judged).items()]
@@ -75,11 +71,8 @@ def with_equal_panels(comparisons: Sequence[Comparison]) -> list[Comparison]:
 class Comparer:
     """Measures pairs of sets; statistics of a real set are gathered once.
 
-    Args:
-        metrics: Built with `keep=True` if `draws` > 0.
-        draws: Bootstrap resamples, except for baselines.
-        folder: Folder of the results of sampled sets, in files named by a hash of everything that these depend on;
-            None: store nothing.
+    `draws` bootstrap resamples, not of baselines, need metrics built with `keep=True`. Results of sampled sets are
+    stored in `folder`, if given, in files named by a hash of everything that these depend on.
     """
 
     def __init__(

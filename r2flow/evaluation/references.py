@@ -40,12 +40,7 @@ def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None
 
 
 class Baseline(MadeScans):
-    """Scans (2 or 1, H, W) of a baseline without a model.
-
-    Args:
-        word: Name in `BASELINES`.
-        training: Real scans, (N, 2 or 1, H, W).
-    """
+    """Scans (2 or 1, H, W) of the baseline `word` of `BASELINES`; `training` are real scans, (N, 2 or 1, H, W)."""
 
     def __init__(self, word: str, training: np.ndarray, sensor: Sensor, numbers: Sequence[int], seed: int = 0) -> None:
         self.word, self.training, self.sensor, self.numbers, self.seed = word, training, sensor, numbers, seed

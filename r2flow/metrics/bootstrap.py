@@ -28,18 +28,13 @@ def bootstrap(
 
     so that sigma^2 = Var l - Var q estimates its variance, L + Q (Efron and Stein 1981). Efron's bootstrap, which
     repeats scans, has variance L + 3 Q: for nearly equal sets, where L vanishes, its intervals are 1.7 times too wide.
-    The weights change little, because repeated or missing scans also bias the distance. t is Student's quantile. If
-    t sigma > d, the interval is d +- t sigma, for positive d cut off at 0.
+    The weights change little, because repeated or missing scans also bias the distance. t is Student's quantile. If t
+    sigma > d, the interval is d +- t sigma, for positive d cut off at 0.
 
-    Weights act on the stored rows of all processes, without copies or further network evaluations.
-
-    Args:
-        metric: Built with `keep=True`, after both sets.
-        draws: Number of weighted sets, two per draw of signs; draw r depends only on the seed and r.
-        advance: Called with the number of finished weighted sets.
-
-    Returns:
-        (low, high) of each value that exists and can be resampled (`ScanMetric.resamples`, `resampled`, `fewest`).
+    Weights act on the stored rows of all processes (`keep=True`), without copies or further network evaluations. Of the
+    `draws` weighted sets, two are made per draw r of signs, which depends only on the seed and r; `advance` is called
+    with the number of finished ones. A value that cannot be resampled (`ScanMetric.resamples`, `resampled`, `fewest`)
+    has no interval.
     """
     if not metric.resamples:
         return {}

@@ -13,12 +13,7 @@ from r2flow.metrics.scans import Scans
 
 
 class FeatureMetric(ScanMetric):
-    """A metric whose rows are a network's features.
-
-    Args:
-        extractor: A network, or a name in `EXTRACTORS`, which loads it with its weights.
-        keep, options: As in `ScanMetric`.
-    """
+    """A metric whose rows are a network's features; a name in `EXTRACTORS` loads the network with its weights."""
 
     representation = "features of a network"
     kind: ClassVar[str]

@@ -23,11 +23,8 @@ def frechet_distance(mean_1: Tensor, covariance_1: Tensor, mean_2: Tensor, covar
 
     With S_i = A_i A_i^T, A_i eigenvectors times square roots of eigenvalues, tr (S_1 S_2)^(1/2) is the sum of the
     singular values of A_1^T A_2. This avoids complex roots and a regularised diagonal. The usual eigenvalues of
-    S_1^(1/2) S_2 S_1^(1/2) have a rounding error of eps |S|^2, and their roots an error of sqrt(eps) |S|.
-
-    Args:
-        mean_1: (D,), like mean_2.
-        covariance_1: (D, D), like covariance_2: symmetric, positive semidefinite up to rounding.
+    S_1^(1/2) S_2 S_1^(1/2) have a rounding error of eps |S|^2, and their roots an error of sqrt(eps) |S|. S_i are
+    positive semidefinite up to rounding.
     """
     a_1, a_2 = root(covariance_1.double()), root(covariance_2.double())
     return distance_from_roots(mean_1.double(), a_1, mean_2.double(), a_2)

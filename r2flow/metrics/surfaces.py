@@ -12,12 +12,8 @@ GAP = 16  # columns; longer gaps are sky or occluded, not dropped rays
 def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals n ~ (p(h - 1, w) - p(h + 1, w)) x (p(h, w - 2) - p(h, w + 2)), p = r d, towards the sensor.
 
-    Args:
-        r: Ranges in metres, (N, H, W); 0 where missing.
-
-    Returns:
-        n_z, the upward part, and |n . d| = cos i, i the angle of incidence, (N, H, W) float32 each; NaN where one
-        of the five pixels is missing or its range differs by more than 15 % from the centre.
+    n_z, the upward part, and |n . d| = cos i, i the angle of incidence, (N, H, W) float32 each as the ranges r in
+    metres; NaN where one of the five pixels is missing or its range differs by more than 15 % from the centre.
     """
     e, a = sensor.rays().numpy()
     d = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -40,12 +36,9 @@ def _above_and_below(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bridged(x: np.ndarray, known: np.ndarray, gap: int = GAP) -> np.ndarray:
-    """Fill unknown values by the mean of the nearest known values to the left and right; NaN in long gaps.
+    """Fill unknown values of x, (..., W), by the mean of the nearest known values to the left and right, periodic in W.
 
-    Args:
-        x: (..., W), periodic in W.
-        known: Where x is known, (..., W), bool.
-        gap: Maximum length of a filled gap, in columns.
+    Gaps of more than `gap` columns are NaN.
     """
     width = x.shape[-1]
     gap = min(gap, width - 1)

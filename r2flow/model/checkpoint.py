@@ -197,14 +197,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> Any:
 
 
 def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
-    """Read tensors and plain values from a torch file, without code execution.
-
-    Args:
-        name: Name of the file in messages.
-
-    Raises:
-        InputError: not a torch file, a damaged one, or one with other objects than tensors and plain values.
-    """
+    """Read tensors and plain values from a torch file, without code execution; `InputError` for any other content."""
     _refuse_unpacking(file, name)
     try:
         with warnings.catch_warnings(action="ignore"), inert():  # torch may warn
@@ -244,11 +237,7 @@ def _refuse_unpacking(file: IO[bytes], name: object) -> None:
 def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averaged: bool = True) -> Checkpoint:
     """Load a generator from a checkpoint file (of r2flow or published), a run folder, or by a model's name.
 
-    Args:
-        averaged: Load the averaged weights, the default for evaluation; False: the raw weights of an r2flow run.
-
-    Raises:
-        InputError: no usable checkpoint, or weights that do not fit the config.
+    The averaged weights are the default for evaluation; `averaged=False` loads the raw weights of an r2flow run.
     """
     path = find_checkpoint(path)
     with telling(path):
@@ -333,13 +322,10 @@ def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False) -> None:
-    """Write a generator with its config as a `.safetensors`.
+    """Write a generator with its config as a `.safetensors`; `half` rounds large matrices to float16.
 
     The bytes depend on the generator alone: of its config, the file stores the keys of `r2flow.config.learned` and the
     names of plug-ins, without paths of this machine.
-
-    Args:
-        half: Round large matrices to float16, which halves the file size.
     """
     from safetensors.torch import save
 

@@ -42,9 +42,7 @@ class Completed(Samples):
 def completing(generator: Generator, name: str | None = None, *, several: bool = False, **changes: Any) -> Sampler:
     """The sampler for completion: the generator's default if it takes a condition, else the flow's first completer.
 
-    Args:
-        several: Whether answers must differ; a transfer flow then uses `transport`.
-        changes: Fields of the sampler.
+    For `several` different answers, a transfer flow uses `transport`. `changes` are fields of the sampler.
     """
     if not (generator.told or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
         raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")

@@ -38,11 +38,8 @@ def sampler_graph(
     """Graph from noise to scan and points: a loop over the sampler's evaluations, then the decoding.
 
     The loop state `known` stacks the noise and the network's outputs, with zeros for evaluations not yet made.
-
-    Args:
-        network: `t` (), `x` and, for a flow map, `s` () to `v`.
-        decoded: `x_1` to `scan` and `points`.
-        times, second, states: As in `r2flow.model.export.Tableau`.
+    `network` maps `t` (), `x` and, for a flow map, `s` () to `v`, and `decoded` maps `x_1` to `scan` and `points`; the
+    other arguments are as in `r2flow.model.export.Tableau`.
     """
     network = compose.add_prefix(network, "network.", rename_inputs=False, rename_outputs=False)
     decoded = compose.add_prefix(decoded, "decoded.", rename_inputs=False, rename_outputs=False)

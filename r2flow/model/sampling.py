@@ -97,13 +97,7 @@ def draw(
     precision: Precision = "32-true",
     progress: Progress = None,
 ) -> Samples:
-    """Draw the scans of these numbers as one batch; all generated images come from this function.
-
-    Args:
-        numbers: Numbers of the scans, (B,).
-
-    See `sample` for the other arguments.
-    """
+    """Draw the scans of these numbers as one batch (see `sample`); all generated images come from this function."""
     draws, space = Draws(seed, numbers), generator.space
     noise = draws.start(generator.noise_shape)
     evaluated = None if region is None or region.share == 1 else evaluated_region(generator, region)

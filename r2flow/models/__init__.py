@@ -45,11 +45,7 @@ def model_file(name: str) -> Path:
 
 
 def find_model(name: str) -> Path:
-    """Find and verify the file of a model.
-
-    Raises:
-        InputError: unknown model, or missing or damaged file.
-    """
+    """Find and verify the file of a model."""
     path = model_file(name)
     if not path.is_file():
         raise InputError(f"the model {name} is not here (no {path}): install r2flow again.")

@@ -36,12 +36,7 @@ class Extractor(nn.Module, ABC):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
-        """Build the network from published weights, with sizes from the tensors.
-
-        Args:
-            tensors: Tensors by published name.
-            config: Config of the published archive; may be empty.
-        """
+        """Build the network from published tensors by name, with sizes from them; `config` may be empty."""
         return cls().filled(tensors)
 
     @classmethod

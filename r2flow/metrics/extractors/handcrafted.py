@@ -93,9 +93,7 @@ SCALES = {
 def statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tensor | None]]:
     """Yield names in `SCALES`, values per pixel, and the mask of pixels (None: all), (B, H, W) each.
 
-    Args:
-        r: Ranges in metres, (B, H, W); 0 without a return.
-        q: Reflectances, or None.
+    r are ranges in metres, (B, H, W), 0 without a return; q reflectances.
     """
     m = (r > 0).to(r)
     right, left, lower = _right(m), _right(m, -1), _lower(m)

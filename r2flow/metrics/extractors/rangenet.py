@@ -68,9 +68,8 @@ class Level(nn.Module):
 class RangeNet(Extractor):
     """RangeNet of 21 or 53 layers on range, x, y, z and optionally reflectance.
 
-    Args:
-        num_classes: Classes of the segmentation head, which features precede; None: no head.
-        mean, std: Statistics of the channels; further values are ignored.
+    Features precede the segmentation head of `num_classes` (None: no head). Of the channels' statistics `mean` and
+    `std`, further values are ignored.
     """
 
     layers: ClassVar[int]

@@ -32,11 +32,10 @@ def offsets(size: int) -> list[tuple[int, int, int]]:
 
 
 class VoxelGrid:
-    """Voxels of one size: distinct integer coordinates, and their neighbours within a kernel.
+    """Voxels of one size at distinct integer coordinates, (N, 4) int64: scan, x, y, z, and their neighbours in a
+    kernel.
 
-    Args:
-        coords: Scan, x, y, z of each voxel, (N, 4), int64, in units of the voxel size.
-        finer: The grid of half the voxel size that `coarser` was called on; None for the finest.
+    `finer` is the grid of half the voxel size that `coarser` was called on; None for the finest.
     """
 
     def __init__(self, coords: Tensor, finer: Self | None = None) -> None:
@@ -108,16 +107,10 @@ class Sparse:
 
 
 class SparseConv3d(nn.Module):
-    """A sparse convolution without bias.
+    """A sparse convolution without bias, with a kernel of `size` voxels along each axis.
 
     Stride 1 keeps the voxels; stride 2, with a kernel of 2, doubles their size; a transposed convolution returns to the
     finer voxels by the inverse map. A kernel of 1 is a linear map.
-
-    Args:
-        channels, out: C_in, C_out.
-        size: Voxels of the kernel along each axis.
-        stride: 1, or 2 with a kernel of 2.
-        transposed: Whether to invert a stride.
     """
 
     def __init__(self, channels: int, out: int, size: int = 3, stride: int = 1, transposed: bool = False) -> None:

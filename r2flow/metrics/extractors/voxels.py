@@ -9,14 +9,10 @@ NEAR, FAR = 4.0, 56.0  # metres: evenly spaced edges of distance sectors, except
 
 
 def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Occupied voxels of 5 cm, and the first point of each.
+    """Occupied voxels of 5 cm, and the first point of each, of one scan's points in metres, (N, 3), off the origin.
 
-    Args:
-        points: Points of one scan in metres, (N, 3), float32; points at the origin are ignored.
-
-    Returns:
-        Coordinates round(p / 0.05) minus their minimum, (M, 3), int64, in the order of points; and features
-        (x, y, z, -1), (M, 4), where -1 replaces reflectance, without which the networks were trained.
+    Coordinates are round(p / 0.05) minus their minimum, (M, 3) int64, in the order of points. Features, (M, 4), are x,
+    y, z and -1, which replaces reflectance: the networks were trained without.
     """
     points = points[points.norm(dim=1) > 0]
     if not len(points):
@@ -34,11 +30,7 @@ def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
 def mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
     """Means over 16 sectors of distance from the centroid of the voxels, the published "depth"; (16 C,), C fastest.
 
-    Voxels 56 m or more from the centroid are ignored; an empty sector has the mean 0.
-
-    Args:
-        features: Features of voxels, (M, C).
-        coords: Integer coordinates of voxels, (M, 3).
+    Features are (M, C). Voxels 56 m or more from the centroid are ignored; an empty sector has the mean 0.
     """
     edges = torch.linspace(NEAR, FAR, SECTORS + 1, device=coords.device)
     edges[0] = 0
