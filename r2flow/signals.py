@@ -18,12 +18,9 @@ LATER = 75  # exit code EX_TEMPFAIL of an unfinished run: the same command resum
 
 
 class Stopped(BaseException):
-    """Work was stopped by a signal.
+    """Work was stopped by a signal; `code` is the exit code of the process: 143 after SIGTERM, 130 after Ctrl-C.
 
     Not an `Exception`, so that handlers of errors (in readers, in Hydra) do not catch it.
-
-    Attributes:
-        code: Exit code of the process: 143 after SIGTERM, 130 after Ctrl-C.
     """
 
     def __init__(self, code: int, message: str = "stopped") -> None:

@@ -50,12 +50,7 @@ class Damaged(Exception):
 
 
 class Store:
-    """A folder of items of one kind and one recipe.
-
-    Args:
-        kind: Prefix of the files, `KIND-000003.safetensors`, and format in the manifest, `r2flow KIND`.
-        recipe: Everything that the items depend on, as plain values.
-    """
+    """A folder of items of one kind, `KIND-000003.safetensors`, and of one recipe, plain values that they depend on."""
 
     option = "--out FOLDER"  # in messages: how a user gives another folder
 
@@ -122,13 +117,7 @@ class Store:
         write_file(path, save(dict(tensors), metadata={"r2flow": json.dumps(note)}))
 
     def read(self, item: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Read tensors and notes of an item and verify its checksum.
-
-        Raises:
-            FileNotFoundError: the item is missing.
-            Damaged: the file is damaged.
-            InputError: the item has another recipe.
-        """
+        """Read tensors and notes of an item and verify its checksum: raises `FileNotFoundError` or `Damaged`."""
         with self._opened(item) as (file, note):
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  not a mapping
             if note["sha256"] != _digest(tensors, note["notes"]):
@@ -185,12 +174,9 @@ class Store:
         advance: Advance = lambda item: None,
         wait: bool = True,
     ) -> None:
-        """Make items, and wait for items that other commands are making.
+        """Make items by `work`, which any process must be able to unpickle, in `workers` processes (1: this one).
 
-        Args:
-            work: Makes and writes an item, in any process; must be picklable.
-            workers: Number of processes; 1: this process.
-            wait: Whether to wait for items that other commands are making; else skip them.
+        `wait`: await items that other commands are making; else skip them.
         """
         left, since = list(items), time.monotonic()
         while left:

@@ -166,11 +166,7 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
 def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
     """Check a config by building its run with weights on the meta device; no scans are read, no files written.
 
-    Args:
-        parent: The parent, if it has not been trained yet.
-
-    Returns:
-        The config, completed with values of its parent.
+    The result is completed with values of its parent; `parent` is one that has not been trained yet.
     """
     check_keys(config)
     if parent is None:

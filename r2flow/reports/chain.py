@@ -30,11 +30,9 @@ COLUMNS = {
 
 
 def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu") -> None:
-    """Sample every generator, compare the samples with held-out scans, and write figure, table and scans.
+    """Sample every run, compare the samples with held-out scans, and write figure, table and scans.
 
-    Args:
-        runs: Run folders by name, the first one trained on scans.
-        num: Scans of each, for each number of steps.
+    The first run was trained on scans. Each makes `num` scans for each number of steps.
     """
     out = Path(out)
     flows = {name: load_checkpoint(run, device) for name, run in runs.items()}

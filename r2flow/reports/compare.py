@@ -36,17 +36,12 @@ TELLING = {"trainer.precision", "data.root", "parent.step"}
 
 
 class ComparedRun(NamedTuple):
-    """A run, read from its folder.
-
-    Attributes:
-        values: By the columns of `FIXED` and `MEASURED`; None where the folder does not hold one.
-        curves: (steps, values) by logged name.
-    """
+    """A run, read from its folder."""
 
     label: str
     config: dict[str, Any]
-    values: dict[str, Any]
-    curves: dict[str, Curve]
+    values: dict[str, Any]  # by the columns of `FIXED` and `MEASURED`; None where the folder does not hold one
+    curves: dict[str, Curve]  # (steps, values) by logged name
 
 
 Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ only in their seed, or a single run

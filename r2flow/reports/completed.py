@@ -37,21 +37,14 @@ SHOWN = 4  # answers on a page
 
 @dataclass(frozen=True)
 class Job:
-    """Settings of completion.
+    """Settings of completion."""
 
-    Attributes:
-        num: Answers per scan.
-        mask: Measured rays to use; None: all.
-        fill_gaps: Treat rays without a return as unmeasured.
-        pictures: Number of scans with a picture and a 3-D page.
-    """
-
-    num: int = 1
+    num: int = 1  # answers per scan
     seed: int = 0
-    mask: Mask | None = None
-    fill_gaps: bool = False
+    mask: Mask | None = None  # measured rays to use; None: all
+    fill_gaps: bool = False  # treat rays without a return as unmeasured
     batch_size: int = 1
-    pictures: int = 8
+    pictures: int = 8  # number of scans with a picture and a 3-D page
     precision: Precision = "32-true"
 
 
@@ -65,14 +58,8 @@ def write_completed(
 ) -> dict[str, np.ndarray | None]:
     """Complete scans and write answers, their spread, pictures and 3-D pages.
 
-    Skips scans whose answers are all in the folder.
-
-    Args:
-        about: Other settings that affect the answers, as plain values.
-
-    Returns:
-        The scans completed in this call, by name, with their `hidden_errors` if a mask has hidden rays, else
-        None.
+    Scans whose answers are all in the folder are skipped. The result has the others by name, with their `hidden_errors`
+    if a mask has hidden rays, else None. `about` has the other settings that affect the answers, as plain values.
     """
     digits = len(str(job.num - 1))
     numbers = [""] if job.num == 1 else [f"_{answer:0{digits}d}" for answer in range(job.num)]

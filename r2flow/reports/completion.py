@@ -63,12 +63,9 @@ def completion_rows(
     batch_size: int = 4,
     progress: Progress = None,
 ) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """One row per task and method, means over scans and answers, and the first answer to the first scan.
+    """One row per task and method, means over scans and their `num` answers, and the first answer to the first scan.
 
-    Args:
-        truths: Range images, (2 or 1, H, W).
-        num: Answers to each scan; interpolations have one.
-        batch_size: Answers at once.
+    Interpolations have one answer.
     """
     reference = panel(np.stack(truths), sensor)
     for task in tasks:

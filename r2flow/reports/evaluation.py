@@ -137,11 +137,7 @@ def evaluation_page(
     nearest: Mapping[str, Nearest] | None = None,
     training: ScanSet | None = None,
 ) -> Page:
-    """Build the page of an evaluation: table, sets, protocols and pictures.
-
-    Args:
-        nearest: Nearest training scans of the judged sets, if computed; drawn with `training`.
-    """
+    """Build the page of an evaluation: table, sets, protocols and pictures, with nearest training scans if computed."""
     columns, lines = _table(comparisons)
     remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
     sets = [

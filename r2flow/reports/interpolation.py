@@ -46,11 +46,7 @@ def interpolation(
     out: str | Path,
     sampler: Sampler = TIGHT,
 ) -> Page:
-    """Write `frames` interpolated scans as `out/frames/NNN.ply` and `.npy`.
-
-    Returns:
-        The page with the figure, to be written by the caller.
-    """
+    """Write `frames` interpolated scans as `out/frames/NNN.ply` and `.npy`; return the page, not yet written."""
     pair, names, rays = torch.stack([scan.image for scan in scans]), [s.name for s in scans], checkpoint.sensor.rays()
     with ScanBar("interpolating", frames, frames * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
         result = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.set)

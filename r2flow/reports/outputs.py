@@ -51,15 +51,10 @@ def write_samples(
 ) -> None:
     """Sample scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
 
-    Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes.
-
-    Args:
-        sampler: Sampler; default: the generator's.
-        formats: File formats; default: all of `formats_of`. `ply` and `bin`: points in metres with reflectance; `npy`:
-            range image, float32 (2 or 1, H, W).
-        pictures: Number of scans with pictures; the contact sheet shows at most 8.
-        region: See `r2flow.model.sampling.sample`. Files have the sensor's shape, 0 outside the region.
-        replace: Whether to delete samples of other settings in the folder.
+    Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes; `replace` deletes samples of
+    other settings in the folder. The contact sheet shows at most 8 of `pictures`. Files have the sensor's shape, 0
+    outside the region (`r2flow.model.sampling.sample`). Of `formats_of`, the default, `ply` and `bin` are points in
+    metres with reflectance, `npy` is the range image, float32 (2 or 1, H, W).
     """
     generator, out, rays = checkpoint.generator, Path(out), checkpoint.sensor.rays()
     sampler = sampler or generator.sampler
@@ -143,9 +138,7 @@ def recipe_of(checkpoint: Checkpoint, seed: int, sampler: Sampler, **more: Any) 
 class ScanBar(Bar):
     """Progress bar of scans that also advances with network evaluations.
 
-    Args:
-        evaluations: Total network evaluations, one per batch; 0: unknown, as for adaptive solvers.
-        unit: Unit instead of scans.
+    `evaluations` is their total, one per batch; 0: unknown, as for adaptive solvers.
     """
 
     def __init__(self, doing: str, num: int, evaluations: int = 0, unit: str = "scans") -> None:

@@ -68,13 +68,9 @@ def paper_page(
     steps: int = 256,
     device: str = "cpu",
 ) -> Page:
-    """Build the page.
+    """Build the page from rows of `read_results`; without `real` scans it has no figure 3.
 
-    Args:
-        rows: Rows of `read_results`.
-        real: Scans for figures 3, 5 and 7; None: no figure 3.
-        num: Scans per generator in figures 5 and 7.
-        steps: Euler steps of the four paths in figure 8.
+    Figures 5 and 7 have `num` scans per generator, figure 8 four paths of `steps` Euler steps.
     """
     roles = {weights_hash(run.checkpoint): run.role for run in runs}
     evaluated = [{**row, "role": roles[row["weights"]]} for row in rows if row["weights"] in roles]

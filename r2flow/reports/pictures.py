@@ -72,11 +72,9 @@ def completed_figure(
 ) -> Figure:
     """Draw the known rays of a scan, its answers with their errors in metres, the truth and the answers' spread.
 
-    Args:
-        rows: Name and image, (2 or 1, H, W), of each; the known rays first.
-        unknown: Rays that were not measured, (H, W) bool; drawn in grey.
-        spread: Standard deviation of the range in metres and share of answers with a return, (2, H, W).
-        truth: The whole scan, (2 or 1, H, W), and its rays that were not measured, (H, W) bool.
+    Rows are names and images, (2 or 1, H, W), the known rays first. Rays that were not measured, (H, W) bool, are grey,
+    also in the truth. The spread is the standard deviation of the range in metres and the share of answers with a
+    return, (2, H, W).
     """
     shown: list[tuple[str, np.ndarray, np.ndarray | None]] = [(name, image, None) for name, image in rows]
     grey = {0: unknown}

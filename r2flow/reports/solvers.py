@@ -61,22 +61,15 @@ def configurations(
 
 @dataclass(frozen=True)
 class Subject:
-    """A velocity with known ends.
-
-    Attributes:
-        x_0: Starts of the scans, (N, ...), on the velocity's device.
-        x_1: Ends of the scans, (N, ...), float64.
-        floor: Smallest RMS error that can be measured against `x_1`.
-        encoding: Encoding of a trained flow; None for exact problems.
-    """
+    """A velocity with known ends."""
 
     name: str
     velocity: Velocity
-    x_0: Tensor
-    x_1: Tensor
+    x_0: Tensor  # starts of the scans, (N, ...), on the velocity's device
+    x_1: Tensor  # their ends, float64
     batch_size: int
-    floor: float = ROUNDING
-    encoding: Encoding | None = None
+    floor: float = ROUNDING  # smallest RMS error that can be measured against `x_1`
+    encoding: Encoding | None = None  # of a trained flow; None for exact problems
 
 
 def problem_subjects(names: Sequence[str], scans: int = 16, elements: int = 64) -> list[Subject]:

@@ -85,8 +85,7 @@ def finish(
 ) -> None:
     """Draw the loss curve and a few scans of a run; print its files and the commands that come next.
 
-    Args:
-        kept: Whether the run keeps checkpoints.
+    `kept`: the run keeps checkpoints.
     """
     from r2flow.reports.pictures import save_figure
 

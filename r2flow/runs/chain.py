@@ -24,27 +24,18 @@ RECORD = "link.json"
 
 @dataclass(frozen=True)
 class Link:
-    """One run of a chain.
+    """One run of a chain."""
 
-    Attributes:
-        name: Name in the chain, and of the folder.
-        overrides: Command line of the run.
-        parent: Name of the link that it starts from, if any.
-    """
-
-    name: str
+    name: str  # in the chain, and of the folder
     run_dir: Path
-    overrides: tuple[str, ...]
-    parent: str | None = None
+    overrides: tuple[str, ...]  # command line of the run
+    parent: str | None = None  # name of the link that it starts from, if any
 
 
 def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: Sequence[str]) -> list[Link]:
-    """The runs of a chain in the order of their parents.
+    """The runs of a chain in the order of their parents; `init` names a link's parent.
 
-    Args:
-        chain: Config differences by name; `init` names the link that a link starts from.
-        folder: The chain's folder; each link has a subfolder of its name.
-        given: The user's command line. Its overrides follow the link's own, for every link that they concern.
+    The user's command line, `given`, follows each link's own overrides, as far as it concerns the link.
     """
     if any(key_of(text) == "stage.init" for text in given):
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
@@ -74,13 +65,9 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
 
 
 def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]:
-    """Run the links that are not finished, each in its own process.
+    """Run the links that are not finished, each in its own process, by `command` and the link's overrides.
 
-    Args:
-        command: Command that starts a run; a link's overrides are appended.
-
-    Returns:
-        The exit code of the first link that does not finish, or 0, and whether any link was run.
+    The result is the exit code of the first link that does not finish, or 0, and whether any link was run.
     """
     skipping = True
     for number, link in enumerate(links, 1):
@@ -130,11 +117,7 @@ def _record(link: Link) -> dict[str, Any]:
 
 
 def run_process(command: Sequence[str]) -> int:
-    """Run a command; forwards stop signals to it, and ends it with this process.
-
-    Returns:
-        The exit code as in a shell: 143 after SIGTERM.
-    """
+    """Run a command, forward stop signals to it, and end it with this process; its exit code is that of a shell."""
     received: list[int] = []
 
     def pass_on(number: int, frame: FrameType | None) -> None:

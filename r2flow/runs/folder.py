@@ -77,8 +77,7 @@ def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
 def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor] | None = None) -> Path | None:
     """Open a run folder: returns the newest checkpoint to resume from, or None for a new run.
 
-    Args:
-        state: The stage's state_dict; checkpoints with other names or shapes are skipped.
+    Checkpoints with other names or shapes than the stage's state_dict, `state`, are skipped.
     """
     for leftover in Path(run, FOLDER).glob(".*.part"):  # of killed writers
         leftover.unlink(missing_ok=True)

@@ -50,14 +50,10 @@ class JobEnded(RuntimeError):
 
 
 def main(arguments: Sequence[str], command: Sequence[str]) -> int:
-    """Compose a command line's config and execute it: a run, a chain of runs or a sweep.
+    """Compose a command line's config and execute it: a run, a chain of runs or a sweep; return the exit code.
 
-    Args:
-        arguments: Hydra's overrides and flags, and any number of `--plugin NAME`.
-        command: Command that starts this program, for the processes of sweeps and chains.
-
-    Returns:
-        The exit code; errors are printed in one line.
+    Arguments are Hydra's overrides and flags, and any number of `--plugin NAME`. `command` starts this program, for the
+    processes of sweeps and chains. Errors are printed in one line.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself, over many lines, and exits with 1
     ended: list[tuple[int, str]] = []  # unfinished jobs of a sweep

@@ -20,18 +20,12 @@ from r2flow.stages import STAGES
 
 @dataclass(frozen=True)
 class Parent:
-    """The run that another run starts from.
-
-    Attributes:
-        path: Checkpoint of the parent, or its folder if it has none yet.
-        step: Optimiser steps taken.
-        weights: `weights_hash` of the averaged weights; None if the parent is not trained yet.
-    """
+    """The run that another run starts from."""
 
     config: Mapping[str, Any]
-    path: Path
+    path: Path  # its checkpoint, or its folder if it has none yet
     step: int = 0
-    weights: str | None = None
+    weights: str | None = None  # `weights_hash` of the averaged weights; None if it is not trained yet
 
 
 def find_parent(init: str | Path | None) -> tuple[Parent, Checkpoint] | None:
@@ -52,10 +46,8 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     """Complete a run's config with values of its parent.
 
     Encoding and backbone come from the parent; also sensor, projection and convention unless the command line gives
-    them. Pairs are drawn by the parent's averaged weights or by another flow (`data.pairs.of`), with its sensor.
-
-    Args:
-        asked: Overrides of the command line, as `backbone=hdit` or `backbone.depths=[1]`.
+    them (`asked`, as `backbone=hdit`). Pairs are drawn by the parent's averaged weights or by another flow
+    (`data.pairs.of`), with its sensor.
     """
     config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     if parent is None:

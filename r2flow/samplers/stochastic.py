@@ -46,11 +46,8 @@ def sde_step(t: float, s: float, c: float, t_b: float | None = None) -> Step:
         x_s = (1 - s) / (1 - t) e^(-ch) x_t + s a int e^(-a(l_s - l)) x_1hat dl + (1 - s) (1 - e^(-2ch))^(1/2) e
 
     with l = log o from l_t to l_s = l_t + h. The integral of a constant is 1 - e^(-ah), that of (t' - t) is, by parts,
-    s - t - int_t^s (o' / o_s)^a dt'. A step from t = 0 adds no fresh noise; a step to s = 1 ends at x_1hat (Euler).
-
-    Args:
-        c: Churn, at least 0.
-        t_b: Time of the previous step; None in the first step.
+    s - t - int_t^s (o' / o_s)^a dt'. A step from t = 0 adds no fresh noise; a step to s = 1 ends at x_1hat (Euler). c
+    is the churn; the first step has no t_b.
     """
     if s >= 1:
         return Step(0.0, 1.0, 0.0, 0.0)

@@ -98,14 +98,10 @@ def rows_of(sensor: Sensor, slope: np.ndarray) -> np.ndarray:
 
 
 class Rays:
-    """B lasers by W azimuths.
+    """B lasers by W azimuths; `ground` is the height of the sensor's origin above the scene's z = 0, in metres.
 
-    Every ray is p(s) = (s cos a, s sin a, z + s T) with horizontal distance s, azimuth a of the column, slope
-    T = tan E and height z of the laser. The s of an intersection with an upright surface depends on the column only.
-
-    Args:
-        columns: Number W of azimuths; column w has azimuth a = pi - 2 pi (w + 1/2) / W.
-        ground: Height of the sensor's origin above the scene's z = 0, in metres.
+    Every ray is p(s) = (s cos a, s sin a, z + s T) with horizontal distance s, azimuth a of the column, slope T = tan E
+    and height z of the laser. The s of an intersection with an upright surface depends on the column only.
     """
 
     def __init__(self, lasers: Lasers, columns: int, ground: float = 0.0) -> None:

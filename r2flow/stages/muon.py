@@ -18,13 +18,9 @@ class Muon(torch.optim.AdamW):
 
         M <- m M + (1 - m) G,    W <- W - rate sqrt(max(1, rows / columns)) orthogonalised((1 - m) G + m M)
 
-    All singular directions of the momentum are learned at the same speed, instead of the few large ones first. AdamW
-    trains biases, norms and matrices with fewer than 8 rows or columns, such as those of an image's channels.
-
-    Args:
-        rate: Learning rate of the matrices.
-        momentum: m.
-        options: Options of AdamW, for all other parameters.
+    All singular directions of the momentum are learned at the same speed, instead of the few large ones first. AdamW,
+    with `options`, trains biases, norms and matrices with fewer than 8 rows or columns, such as those of an image's
+    channels.
     """
 
     def __init__(self, parameters: Iterable[Tensor], rate: float, momentum: float = 0.95, **options: Any) -> None:

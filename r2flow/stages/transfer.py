@@ -50,9 +50,7 @@ class Tasks:
     def __call__(self, own: ModelSpace, x_1: Tensor, sensor: Sensor, draws: np.random.Generator) -> Batch:
         """`x_1`, `image` and `known` of a crop in model space, (C, h, w); `elevations` (h,), `steps` (2,).
 
-        Args:
-            own: The generator's space, which determines the size of the crops.
-            sensor: Sensor of the scan x_1.
+        `own`, the generator's space, determines the size of the crops; x_1 is a scan of `sensor`.
         """
         space = own if sensor == own.sensor else own.through(sensor)
         if sensor.name != own.sensor.name and space.encoding.reflectance:  # as in use: intensities of sensors differ

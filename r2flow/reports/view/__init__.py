@@ -108,14 +108,10 @@ def write_page(path: str | Path, *args: Any, **options: Any) -> Path:
 
 
 def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = None) -> str:
-    """Encode an image as byte planes of H W each, compressed by zlib, in base64.
+    """Encode an image, (2 or 1, H, W), as byte planes of H W each, compressed by zlib, in base64.
 
     Planes: high and low bytes of range codes, as differences along each row modulo 2^16; optionally reflectance in 255
     levels; optionally class numbers. Code c means c `step` metres, 0 no return.
-
-    Args:
-        image: (2 or 1, H, W).
-        numbers: Class numbers, (H, W) uint8.
     """
     r = np.nan_to_num(image[0].astype(np.float64), posinf=0, neginf=0)
     codes = np.where(r > 0, np.clip(np.rint(r / step), 1, CODES - 1), 0).astype(np.int32)

@@ -31,18 +31,12 @@ from r2flow.samplers import OnGrid
 
 
 class Panel(NamedTuple):
-    """One scan of a page, or a sequence of scans for the slider.
-
-    Attributes:
-        images: (T, 2 or 1, H, W).
-        rays: (2, H, W).
-        labels: (T, H, W), or None.
-    """
+    """One scan of a page, or a sequence of scans for the slider."""
 
     caption: str
-    images: np.ndarray
-    rays: Tensor
-    labels: np.ndarray | None = None
+    images: np.ndarray  # (T, 2 or 1, H, W)
+    rays: Tensor  # (2, H, W)
+    labels: np.ndarray | None = None  # (T, H, W)
 
 
 def write_panels(path: str | Path, panels: Sequence[Panel], frames: Sequence[str] = (), title: str = "r2flow") -> Path:
@@ -64,13 +58,10 @@ def _print_choice(what: str | Path, count: int, most: int) -> None:
 
 
 def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -> Iterator[Panel]:
-    """A panel for each of up to `most` scans of a set (`open_scans`), evenly spread.
+    """A panel for each of up to `most` scans of a set (`open_scans`), evenly spread; `labelled`: with semantic ids.
 
     The caption is the file name, with the folder where names are ambiguous. Files not written by r2flow are opened one
     by one, since sizes of range images and reflectance may differ.
-
-    Args:
-        labelled: Whether to read semantic ids, of .label files or of the simulator.
     """
     reading = replace(reading, on_bad_scan="error")
     options, file = parse(spec)
