@@ -23,10 +23,6 @@ class Cosine:
 
     alpha_t is the cosine and sigma_t the sine of that angle (Nichol and Dhariwal 2021; Hoogeboom et al. 2023, "Simple
     diffusion", eq. 4, with the ends cut off).
-
-    Args:
-        lowest: lambda(1).
-        highest: lambda(0).
     """
 
     def __init__(self, lowest: float = -15.0, highest: float = 15.0) -> None:

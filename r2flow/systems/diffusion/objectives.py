@@ -17,10 +17,7 @@ class Prediction:
 
         x = (sigma y - q z) / d,    eps = (p z - alpha y) / d,    d = p sigma - q alpha
 
-    Its error is |p - q alpha / sigma| times that of x.
-
-    Args:
-        coefficients: p and q from alpha and sigma.
+    Its error is |p - q alpha / sigma| times that of x. `coefficients` are p and q from alpha and sigma.
     """
 
     def __init__(self, coefficients: Coefficients) -> None:
@@ -42,10 +39,7 @@ class Prediction:
         """min(SNR, gamma) over the squared ratio of the errors of y and x, in the shape of log_snr.
 
         The loss of y is then min(SNR, gamma) times that of x for any prediction (Hang et al. 2023, "Efficient diffusion
-        training via min-SNR weighting strategy").
-
-        Args:
-            min_snr: gamma; None for the SNR itself.
+        training via min-SNR weighting strategy"). gamma is `min_snr`; None: the SNR itself.
         """
         alpha, sigma = alpha_sigma(log_snr)
         p, q = self.coefficients(alpha, sigma)

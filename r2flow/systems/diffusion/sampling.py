@@ -47,13 +47,10 @@ def forward_step(z: Tensor, log_snr: Tensor, next_log_snr: Tensor, noise: Tensor
 def walk(
     denoise: Denoise, z: Tensor, log_snrs: Tensor, eta: float, noise: Noise | None, times: Tensor | None = None
 ) -> Iterator[Tensor]:
-    """Yield the states from noise z, (B, ...), to data, after each step.
+    """Yield the states from noise z, (B, ...), to data, after each step of N + 1 rising log-SNRs with `eta` of `step`.
 
-    Args:
-        log_snrs: Rising, (N + 1,) for N steps.
-        eta: See `step`.
-        noise: Noise of step 1, 2, ..., also called in the last step; None if eta = 0.
-        times: Time argument of `denoise` per step, (N,); None: the log-SNR.
+    `noise` is called with 1, 2, ..., also in the last step; None if eta = 0. `times` are those of `denoise`, (N,);
+    None: the log-SNRs.
     """
     times = log_snrs if times is None else times
     for j, (t, (start, end)) in enumerate(zip(times, pairwise(log_snrs), strict=False), start=1):
@@ -75,18 +72,11 @@ def repaint(
 
     Each step denoises in `jump` parts with resampled known pixels, then returns by forward steps and denoises again,
     `repeats` times in total, to harmonise both parts (Lugmayr et al. 2022, algorithm 1, with resampling inside each
-    step). The last step is not repeated. Evaluations: jump (repeats (N - 1) + 1).
+    step). The last step is not repeated. N steps of N jump + 1 rising log-SNRs take jump (repeats (N - 1) + 1)
+    evaluations.
 
-    Args:
-        z: Noise, (B, ...).
-        image: Data, (B, ...).
-        known: Mask of known pixels, bool or 0 and 1.
-        log_snrs: Rising, (N jump + 1,) for N steps.
-        noise: Called in each part of a step for the known pixels and for the ancestral step, and once per
-            forward step.
-
-    Returns:
-        The state after each step, including repetitions; the last is the completed image.
+    Yields the state after each step, including repetitions; the last is the completed image. `noise` is called in each
+    part of a step for the known pixels and for the ancestral step, and once per forward step.
     """
     j = count(1)
     for first in range(0, len(log_snrs) - 1, jump):

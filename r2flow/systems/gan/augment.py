@@ -177,12 +177,9 @@ def transformed(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
 
 @torch.no_grad()
 def resampling(size: int, scale: Tensor, shift: Tensor, edge: str) -> Tensor:
-    """Matrix that resamples a line at scale n + shift, (B, size, size).
+    """Matrix that resamples a line of `size` pixels at scale n + shift, n from its centre, (B, size, size).
 
-    Args:
-        size: Pixels of the line; n counts from its centre.
-        scale, shift: (B,), float64.
-        edge: Padding: "circular" or "reflect".
+    Scale and shift are (B,), float64; `edge` pads "circular" or "reflect".
     """
     device = scale.device
     taps = torch.tensor(SYM6, device=device)

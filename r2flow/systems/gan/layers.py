@@ -65,11 +65,9 @@ class Pad(nn.Module):
 
 
 class Filter(ExactBuffers):
-    """A separable filter with circular padding in azimuth and replicated edge rows; it keeps the size.
+    """A separable filter with circular padding in azimuth ("w") and replicated edge rows ("h"); it keeps the size.
 
-    Args:
-        window: Filter taps, normalised to sum 1; an even number reaches one pixel further left and up.
-        axes: "h" (elevation), "w" (azimuth) or "hw".
+    Taps are normalised to sum 1; an even number reaches one pixel further left and up.
     """
 
     kernel: Tensor
@@ -138,22 +136,16 @@ class LatentGenerator(nn.Module):
     Parameter names are those of the published weights.
 
     Args:
-        latent: Width of z.
-        code: Width of w.
         mapping: Maps z (B, latent) to w (B, code).
-        synthesis: Maps w, optionally with angles and their rotation, to `image` and optionally `raydrop_logit`,
-            (B, ., H, W) float32.
+        synthesis: Maps w, optionally with angles and their rotation, to `image` and optionally `raydrop_logit`, (B, .,
+            H, W) float32.
         measurement: Samples the mask; None: no mask.
-        tanh: Whether tanh is applied to the image.
         num_styles: Number of layers that take w.
-
-    Attributes:
-        temperature: Temperature of the relaxed mask.
     """
 
     w_avg: Tensor
     decay = 0.995  # of the average w_avg
-    temperature = 1.0
+    temperature = 1.0  # of the relaxed mask
 
     def __init__(
         self,
@@ -179,18 +171,15 @@ class LatentGenerator(nn.Module):
         uniform: Tensor | None = None,
         shift: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Generate images; in training mode, also update the average code w_avg.
+        """Generate `image` (B, C, H, W) and `w` (B, layers, code) from normal z; in training mode, also update w_avg.
+
+        With a mask, there are also `image_orig`, `raydrop_logit` and `raydrop_mask`.
 
         Args:
-            z: (B, latent), standard normal.
             angle: Elevation and azimuth of every pixel, (1 or B, 2, H, W), for a synthesis that uses them.
             truncation: psi of w <- w_avg + psi (w - w_avg), outside training (Karras et al. 2019, section B).
             uniform: u in [0, 1) for the noise of the mask, (B, 1, H, W).
             shift: Azimuth rotation of each scan in full turns, (B,), for a synthesis with angles.
-
-        Returns:
-            `image` (B, C, H, W) and `w` (B, layers, code); with a mask also `image_orig`, `raydrop_logit` and
-            `raydrop_mask`.
         """
         w: Tensor = self.mapping_network(z)
         if self.training:

@@ -22,12 +22,7 @@ def discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
 
 
 def r1(scores: Tensor, x: Tensor) -> Tensor:
-    """mean over images of |dD/dx|^2 (Mescheder et al. 2018, eq. 9, without its weight gamma / 2).
-
-    Args:
-        scores: D(x), any shape with B elements, with its graph.
-        x: Real images, (B, C, H, W), that require a gradient.
-    """
+    """mean over images x of |dD/dx|^2, from scores D(x) (Mescheder et al. 2018, eq. 9, without its gamma / 2)."""
     (gradient,) = torch.autograd.grad(scores.sum(), x, create_graph=True)
     return gradient.square().flatten(1).sum(1).mean()
 
@@ -73,8 +68,7 @@ class Warmup:
     def __call__(self, x: Tensor, images: int, uniform: Tensor | None) -> Tensor:
         """Degrade x (B, C, H, W) in model space, after a number of images of the run.
 
-        Args:
-            uniform: For each value of x, in [0, 1); None is enough once the warm-up is over.
+        `uniform` has each value's draw in [0, 1); None is enough once the warm-up is over.
         """
         left = self.left(images)
         x = blurred(x, self.blur * left)

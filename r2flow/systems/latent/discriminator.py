@@ -14,14 +14,11 @@ class PatchDiscriminator(nn.Module):
     Args:
         width: Width of the first convolution; each further one doubles it, up to a factor of 8.
         layers: Number of strided convolutions.
-
-    Attributes:
-        smallest: Minimum rows and columns of an image.
     """
 
     def __init__(self, channels: Count = 1, width: Count = 64, layers: Count = 3) -> None:
         super().__init__()
-        self.smallest = 3 * 2**layers  # after `layers` halvings, two 4 x 4 convolutions without stride
+        self.smallest = 3 * 2**layers  # rows, columns: after `layers` halvings, two 4 x 4 convolutions without stride
         parts: list[nn.Module] = [nn.Conv2d(channels, width, 4, 2, 1), nn.LeakyReLU(0.2)]
         narrow = width
         for layer in range(1, layers + 1):
@@ -49,11 +46,7 @@ def hinge_loss(real: Tensor, fake: Tensor) -> Tensor:
 
 def adaptive_weight(reconstruction: Tensor, adversarial: Tensor, last: Tensor, weight: float) -> Tensor:
     """weight |grad R| / (|grad A| + 1e-4), at most 1e4 weight: balances the adversarial loss A with the reconstruction
-    loss R at the decoder's last weights (eq. 7).
-
-    Args:
-        last: The decoder's last weights; their gradients are averaged over all processes.
-    """
+    loss R at the decoder's last weights, with gradients averaged over all processes (eq. 7)."""
     grad_r, grad_a = (
         averaged(torch.autograd.grad(loss, last, retain_graph=True)[0]).norm() for loss in (reconstruction, adversarial)
     )
@@ -63,10 +56,7 @@ def adaptive_weight(reconstruction: Tensor, adversarial: Tensor, last: Tensor, w
 def reconstruction_loss(x: Tensor, made: Tensor, mask: Tensor | None = None, mask_factor: float = 0.0) -> Tensor:
     """mean |x - made|; with a mask, (mean |x - made| + mask_factor mean |mask - predicted mask|) / 2.
 
-    Args:
-        x: Images, (B, C, H, W).
-        made: Reconstructions, (B, C, H, W), optionally with the predicted mask as last channel.
-        mask: (B, 1, H, W), 1: return, -1: dropped ray.
+    The last channel of `made` is then the predicted mask; 1 is a return, -1 a dropped ray.
     """
     error = (x - made[:, : x.shape[1]]).abs().mean()
     if mask is None or not mask_factor:

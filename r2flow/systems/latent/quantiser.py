@@ -21,13 +21,8 @@ class Quantiser(nn.Module):
 
         |q - sg z|^2 + beta |sg q - z|^2
 
-    with sg the stop-gradient (2017, eq. 3). The first term moves codes, the second (commitment) vectors.
-
-    Args:
-        codes: Size of the codebook.
-        channels: Channels of a code.
-        beta: Weight of the commitment.
-        legacy: Apply beta to the first term instead, as in the published code of LiDM.
+    with sg the stop-gradient (2017, eq. 3). The first term moves codes, the second (commitment) vectors. `legacy`
+    applies beta to the first term instead, as in the published code of LiDM.
     """
 
     def __init__(self, codes: int, channels: int, beta: float = 0.25, legacy: bool = False) -> None:

@@ -56,15 +56,11 @@ def annealed_langevin(
     """Yield the states of annealed Langevin dynamics (2019, algorithm 1) after each evaluation of the score.
 
     `steps` times at each level i, from the first to the last: x <- x + e_i s(x, i) + sqrt(2 e_i) z with e_i of
-    `step_sizes`. A last step removes the remaining noise (2020, section 3.3):
-    x <- x + sigma_{L-1}^2 s(x, L-1).
+    `step_sizes` and z = noise(k), k = 1, 2, ... counted over all levels. A last step removes the remaining noise (2020,
+    section 3.3): x <- x + sigma_{L-1}^2 s(x, L-1).
 
-    Args:
-        x: Initial state, (B, C, H, W).
-        sigmas: Noise levels, (L,).
-        noise: z of step k = 1, 2, ..., counted over all levels, of x's shape.
-        pull: Likelihood gradient as a function of the state before a step, added in every step. As in LiDARGen, the
-            last denoising adds the previous pull again, and the final state is pulled once more.
+    `pull`, the likelihood gradient as a function of the state before a step, is added in every step. As in LiDARGen,
+    the last denoising adds the previous pull again, and the final state is pulled once more.
     """
     number = 0
     for level, size in enumerate(step_sizes(sigmas, rate).tolist()):
