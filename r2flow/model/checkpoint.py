@@ -238,6 +238,7 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     """Load a generator from a checkpoint file (of r2flow or published), a run folder, or by a model's name.
 
     The averaged weights are the default for evaluation; `averaged=False` loads the raw weights of an r2flow run.
+    Raises `InputError` without a usable checkpoint, or if the weights do not fit the config.
     """
     path = find_checkpoint(path)
     with telling(path):
