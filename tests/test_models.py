@@ -169,5 +169,7 @@ def test_pairs_of_a_model_lie_outside_the_package():
 
 
 def test_torch_hub_gives_the_model_of_the_package():
+    before = torch.get_rng_state()
     flow = torch.hub.load(str(ROOT), "street", source="local")
+    assert torch.equal(torch.get_rng_state(), before)  # the caller's random numbers stay
     assert torch.equal(flow.sample(1, steps=1), r2flow.load("street").sample(1, steps=1))

@@ -307,6 +307,8 @@ def test_the_network_is_computed_in_the_precision_that_is_asked_for():
     exact, coarse = (next(sample(one, 2, steps=3, precision=name)).images for name in ("32-true", "bf16-mixed"))
     assert seen == [torch.float32] * 3 + [torch.bfloat16] * 3
     assert 0 < (exact - coarse).norm() < 2**-4 * exact.norm()  # bfloat16 has 8 bits, of which some products take a few
+    with torch.autocast("cpu", torch.bfloat16):  # of the caller
+        assert torch.equal(next(sample(one, 2, steps=3)).images, exact)
     assert sampled_set(one, "", 2).about != sampled_set(network(), "", 2).about
 
 

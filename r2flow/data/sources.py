@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import os
+import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -136,7 +137,7 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
     if hopeless and reading.within_limits:
         raise InputError(f"{root}: {seen}.")
     edges = sensor.row_edges
-    advice = f"give the right one, or estimate it: r2flow sensor {root} --out mine.yaml"
+    advice = f"give the right one, or estimate it: r2flow sensor {shlex.quote(str(root))} --out mine.yaml"
     if name is not None and name != sensor.name:
         advice = f"they fit '{name}': sensor={name} in training, --sensor {name} in verbs that have it"
     log.warning(

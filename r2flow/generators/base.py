@@ -1,7 +1,7 @@
 """Base class of generators: noise in, scan out."""
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Literal, get_args
 
 import torch
@@ -31,9 +31,9 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[Any]:
-    """Context in which networks run with `precision`."""
+    """Context in which networks run with `precision`, whatever surrounds it."""
     check(precision in get_args(Precision), f"a network's precision is 32-true or bf16-mixed, found {precision!r}.")
-    return nullcontext() if precision == "32-true" else torch.autocast(device.type, torch.bfloat16)
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision != "32-true")
 
 
 class Generator(nn.Module):

@@ -272,7 +272,8 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
             f"{path} is a torch file but is not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor a published layout ({systems}); found {found}."
         )
-    with made_with(config, str(path)):
+    # First weights are drawn and replaced: neither the caller's random numbers nor the default device matter.
+    with made_with(config, str(path)), torch.random.fork_rng(devices=[]), torch.device("cpu"):
         generator = build_generator(config)
         check_weights(generator, weights)
         generator.load_state_dict(weights)
