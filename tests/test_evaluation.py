@@ -27,7 +27,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.jsd_mmd import JSD, MMD
 from r2flow.metrics.panel import PANEL, REFLECTANCE
 from r2flow.noise import standard_normal
-from r2flow.reports.evaluation import Comparison, _figure, verdict
+from r2flow.reports.evaluation import Comparison, verdict
 from r2flow.samplers import build_sampler
 from tests.conftest import folder, images
 from tests.test_sampling import flow
@@ -286,11 +286,3 @@ def test_panels_are_means_of_the_same_lines():
     sets = [Comparison(str(i), [], [], [MetricResult("panel", one, {})], 0.0) for i, one in enumerate(panels)]
     assert [c.measured[0].figures["panel"] for c in with_equal_panels(sets)] == pytest.approx([0.2, 0.2])
     assert with_equal_panels(sets[1:]) == sets[1:]
-
-
-@pytest.mark.parametrize(
-    ("values", "scale"), [((1, 20), "log"), ((2, 15), "linear"), ((-1, 20), "linear"), ((0, 20), "linear")]
-)
-def test_positive_figures_that_span_a_decade_are_drawn_on_a_log_axis(values, scale):
-    sets = [Comparison(str(v), (), (), [MetricResult("kid_x", {"kid_x": v}, {})], 0.0) for v in (*values, math.nan)]
-    assert _figure(sets).axes[0].get_xscale() == scale

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r2flow.data.sets import ScanSet
-from r2flow.errors import printable
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
@@ -165,7 +164,7 @@ def evaluation_page(
                      "generated scans")),
     ]  # fmt: skip
     more = {"comparisons": [_plain_comparison(c) for c in comparisons]}
-    figures = {"evaluation": _figure(comparisons)}
+    figures = {}
     sampled = points(more["comparisons"])
     if len(sampled) > len({row["flow"] for row in sampled}):
         names = [name for name in dict.fromkeys(key for row in sampled for key in row) if "/" in name]
@@ -246,45 +245,6 @@ def _plain_comparison(comparison: Comparison) -> dict[str, Any]:
             for result in comparison.measured
         ],
     }
-
-
-def _figure(comparisons: Sequence[Comparison]) -> Figure:
-    """Plot each metric's first value, one mark per comparison."""
-    measured = [m for c in comparisons for m in c.measured if m.figures and m.metric != "speed"]
-    first = {m.metric: next(iter(m.figures)) for m in measured}
-    columns = max(min(len(first), 4), 1)
-    titles = [printable(c.title).replace("$", r"\$") for c in comparisons]  # tick labels are set anew when drawn
-    lines = max(math.ceil(len(first) / columns), 1)
-    title = "Each metric's first figure, generated scans and real ones"
-    figure = blank_figure(2.9 * columns + 1.0, (0.5 * len(comparisons) + 1.2) * lines, title)
-    for place, (metric, name) in enumerate(first.items()):
-        axes = figure.add_subplot(lines, columns, place + 1)
-        label, factor = heading(metric, name)
-        for row, comparison in enumerate(comparisons):
-            result = next((m for m in comparison.measured if m.metric == metric), None)
-            value = math.nan if result is None else result.figures.get(name, math.nan) * factor
-            style = STYLES[row % len(STYLES)]
-            if result is not None and name in result.intervals:
-                low, high = result.intervals[name]
-                axes.hlines(row, low * factor, high * factor, color=style["color"], lw=1.5)
-            axes.plot([value], [row], marker=style["marker"], color=style["color"], ms=7, ls="")
-            if math.isnan(value):
-                axes.text(0.02, row, "none", transform=axes.get_yaxis_transform(), fontsize=8, va="center")
-        axes.set_yticks(range(len(comparisons)), titles if place % columns == 0 else [])
-        axes.set(xlabel=label, ylim=(len(comparisons) - 0.5, -0.5))
-        same = [m for m in measured if m.metric == metric and math.isfinite(m.figures.get(name, math.nan))]
-        drawn = [value for m in same for value in (m.figures[name], *m.intervals.get(name, ()))] or [0.0]
-        if max(drawn) > 10 * min(drawn) > 0:
-            axes.set_xscale("log")
-            few_log_ticks(axes.xaxis)
-            if max(drawn) > 100 * min(drawn):
-                axes.xaxis.set_minor_formatter("")
-        else:
-            axes.set_xlim(min(0.0, axes.get_xlim()[0]), axes.get_xlim()[1] * 1.05)
-            axes.locator_params(axis="x", nbins=4)
-        axes.grid(True, axis="x", color="0.88", lw=0.6)
-        axes.tick_params(labelsize=8, which="both")
-    return figure
 
 
 def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
