@@ -23,4 +23,4 @@ class ReflowPairs(L.Callback):
             return
         store, device, flow = data.pair_store, trainer.strategy.root_device, load_checkpoint(self.of)
         # File locks, not a barrier: collective calls time out after half an hour, and a slow rank may take longer.
-        make_and_tell(store, flow, trainer.global_rank, trainer.world_size, device)
+        make_and_tell(store, flow, device)

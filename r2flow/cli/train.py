@@ -1,5 +1,6 @@
 """`r2flow train` and `r2flow pairs`."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +9,6 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import DeviceOption, PrecisionOption, SamplerOptions, choose_device, grouped
-from r2flow.errors import check
 from r2flow.registry import check_options
 
 
@@ -49,15 +49,14 @@ def pairs(
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import PairStore, default_folder
     from r2flow.model.checkpoint import load_checkpoint, weights_hash
-    from r2flow.reports.pairs import make_and_tell, place
+    from r2flow.reports.pairs import make_and_tell
     from r2flow.runs.lineage import check_finished, pairs_of
 
-    rank, ranks, local = place()
-    check(0 <= rank < ranks, f"process {rank} of {ranks}: a SLURM array must have no gaps.")
     where = choose_device(device)
-    if where == "cuda" and ranks > 1:
+    if where == "cuda":
         import torch
 
+        local = int(os.environ.get("LOCAL_RANK") or os.environ.get("SLURM_LOCALID", "0"))
         where = f"cuda:{local % torch.cuda.device_count()}"  # SLURM may expose one GPU per task
     flow = load_checkpoint(model)
     check_finished(Path(model), flow)
@@ -70,7 +69,7 @@ def pairs(
         flow.encoding.shape, flow.generator.noise_shape
     )
     store = PairStore(out or default_folder(flow.path), recipe, num)
-    make_and_tell(store, flow, rank, ranks, where, wait=False)
+    make_and_tell(store, flow, where, wait=False)
     if missing := store.missing_pairs():
         print(f"{store.folder}: other processes are still generating about {missing} of {num} pairs")
     else:

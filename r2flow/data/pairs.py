@@ -1,6 +1,7 @@
 """Reflow pairs (x_0, x_1): noise and the sample that a flow maps it to."""
 
 import copy
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -20,6 +21,7 @@ from r2flow.flow.solvers import Solution
 from r2flow.generators import Generated, Generator, as_flow
 from r2flow.generators.base import Precision, autocast
 from r2flow.models import name_of
+from r2flow.processes import place
 from r2flow.samplers import build_sampler
 from r2flow.store import Damaged, Store
 
@@ -90,8 +92,6 @@ class Made:
 def make_pairs(
     store: PairStore,
     generator: Generator,
-    rank: int = 0,
-    ranks: int = 1,
     progress: Callable[[Made], None] = lambda made: None,
     wait: bool = True,
 ) -> Made:
@@ -100,7 +100,7 @@ def make_pairs(
     x_1 is the generator's sample for x_0 = `pair_noise`, neither clamped nor snapped, in half precision. With `chord`
     or `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function
     of (seed, index, step). Batches do not depend on the process: shards are byte-identical for any number of processes.
-    Rank r of R starts with shards r, r + R, ... `progress` is called after each batch.
+    `progress` is called after each batch.
     """
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")
@@ -130,9 +130,11 @@ def make_pairs(
         store.write(shard, tensors, {"usable": usable})
 
     store.begin()
+    rank, ranks = place()  # of a run, whose processes verify a part each
     store.mend(store.shards[rank::ranks])
-    in_turn = sorted(store.missing(store.shards), key=lambda shard: ((shard - rank) % ranks, shard))
-    store.make(in_turn, make_shard, wait=wait)
+    missing = store.missing(store.shards)
+    apart = os.getpid() % max(len(missing), 1)  # processes start apart, also where locks do not reach other machines
+    store.make([*missing[apart:], *missing[:apart]], make_shard, wait=wait)
     return made
 
 

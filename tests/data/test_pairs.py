@@ -20,13 +20,12 @@ from r2flow.data.pairs import PairDataset, PairSource, PairStore, default_folder
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.noise import standard_normal
-from r2flow.reports.pairs import place
 from r2flow.runs.lineage import pairs_of
 from r2flow.samplers import build_sampler
 from r2flow.store import Store
 from tests.conftest import files
 from tests.fields import Field
-from tests.killing import in_child
+from tests.killing import in_child, wait_until
 
 SHAPE = (2, 4, 8)
 OPTIONS = {
@@ -63,19 +62,18 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
 def test_more_pairs_later_by_another_process_are_those_of_one_command(tmp_path: Path):
     make_pairs(store_in(tmp_path / "one"), grow)
     for num, made in ((3, 4), (20, 20), (20, 0), (50, (13 - 3) * 4)):  # in batches of 4, and shards of 12
-        assert make_pairs(store_in(tmp_path / "grown", num=num), grow, rank=1, ranks=3).pairs == made
+        assert make_pairs(store_in(tmp_path / "grown", num=num), grow).pairs == made
         assert len(PairSource(store_in(tmp_path / "grown", num=num))) == num
     assert files(tmp_path / "one") == files(tmp_path / "grown")
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, ranks: int, caplog):
+def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, caplog):
     make_pairs(store_in(tmp_path), grow)
     before = files(tmp_path)
     content = bytearray(before["pairs-000001.safetensors"])
     content[-1] ^= 1  # which the checksum alone tells
     (tmp_path / "pairs-000001.safetensors").write_bytes(content)
-    assert sum(make_pairs(store_in(tmp_path), grow, rank, ranks).pairs for rank in range(ranks)) == 12
+    assert make_pairs(store_in(tmp_path), grow).pairs == 12
     assert files(tmp_path) == before
     assert "pairs-000001.safetensors is damaged" in caplog.text
 
@@ -243,7 +241,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
 
 
 @pytest.mark.slow
-def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(saved, tmp_path: Path):
+def test_three_processes_make_the_shards_of_one_even_if_one_is_killed(saved, tmp_path: Path):
     path, _ = saved
 
     def make(out: Path, **environment: str) -> subprocess.Popen:
@@ -251,45 +249,15 @@ def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(sa
         full = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
         return subprocess.Popen([str(one) for one in command], env=full, stdout=subprocess.PIPE, text=True)
 
-    jobs = [make(tmp_path / "one")]
-    jobs += [make(tmp_path / "torchrun", RANK=str(i), WORLD_SIZE="3", LOCAL_RANK=str(i)) for i in (2, 0, 1)]
-    array = {"SLURM_ARRAY_TASK_COUNT": "2", "SLURM_ARRAY_TASK_MIN": "5"}
-    jobs += [make(tmp_path / "array", SLURM_ARRAY_TASK_ID=str(i), **array) for i in (5, 6)]
-    for job in jobs:
-        said, _ = job.communicate(timeout=200)
-        assert job.returncode == 0, said
+    three = [make(tmp_path / "three", WORLD_SIZE="3", LOCAL_RANK=str(i)) for i in range(3)]
+    wait_until(lambda: any((tmp_path / "three").glob(".*.lock")))
+    three[0].kill()
+    assert [job.wait(timeout=200) for job in three] == [-signal.SIGKILL, 0, 0]
+    for folder in ("one", "three"):  # what the killed process was making is left
+        assert make(tmp_path / folder).wait(timeout=200) == 0
     found = files(tmp_path / "one")
     assert len(found) >= 3
-    assert found == files(tmp_path / "torchrun") == files(tmp_path / "array")
-
-
-@pytest.mark.parametrize(
-    ("environment", "expected"),
-    [
-        ({}, (0, 1, 0)),
-        ({"RANK": "5", "WORLD_SIZE": "16", "LOCAL_RANK": "1"}, (5, 16, 1)),
-        ({"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "8", "SLURM_ARRAY_TASK_MIN": "1"}, (2, 8, 0)),
-        ({"SLURM_PROCID": "3", "SLURM_STEP_NUM_TASKS": "8", "SLURM_LOCALID": "3"}, (3, 8, 3)),
-        # A batch script asked for 8 tasks, but this process was not started by srun: it is alone.
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_STEP_NUM_TASKS": "1"}, (0, 1, 0)),
-        # An array of 4 jobs of 2 processes each.
-        (
-            {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "4", "SLURM_ARRAY_TASK_MIN": "0",
-             "SLURM_PROCID": "1", "SLURM_STEP_NUM_TASKS": "2", "SLURM_LOCALID": "1"},
-            (5, 8, 1),
-        ),
-        # torchrun with 2 processes in each job of an array of 3.
-        (
-            {"SLURM_ARRAY_TASK_ID": "1", "SLURM_ARRAY_TASK_COUNT": "3", "SLURM_ARRAY_TASK_MIN": "0",
-             "RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"},
-            (3, 6, 1),
-        ),
-        # --array=0-6:2
-        ({"SLURM_ARRAY_TASK_ID": "4", "SLURM_ARRAY_TASK_COUNT": "4", "SLURM_ARRAY_TASK_STEP": "2"}, (2, 4, 0)),
-    ],
-)  # fmt: skip
-def test_where_a_process_stands(environment: dict[str, str], expected: tuple[int, int, int]):
-    assert place(environment) == expected
+    assert found == files(tmp_path / "three")
 
 
 @pytest.mark.parametrize("option", ["num", "batch_size", "shard_mib", "seed", "precision"])
