@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Positive, Registry
 
@@ -18,9 +17,7 @@ LIMIT_TOLERANCE = 1e-5
 
 
 class RangeFormat:
-    """Maps ranges r in metres, (..., 1, H, W), to values y in [0, 1], (..., channels, H, W), and back: r / r_max."""
-
-    channels = 1
+    """Maps ranges r in metres, (..., 1, H, W), to values y in [0, 1] and back: r / r_max."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.min_range, self.max_range = sensor.min_range, sensor.max_range
@@ -84,22 +81,6 @@ class InverseDepth(Inverse):
         return torch.where(inside, super().inverse(y), 0.0)
 
 
-class Cartesian(RangeFormat):
-    """(x, y, z) / r_max, mapped from [-1, 1] to [0, 1]; a ray without return is at the origin."""
-
-    channels = 3
-
-    def __init__(self, sensor: Sensor) -> None:
-        super().__init__(sensor)
-        self.rays = sensor.rays()
-
-    def forward(self, r: Tensor) -> Tensor:
-        return (unproject(r, self.rays) / self.max_range + 1) / 2
-
-    def inverse(self, y: Tensor) -> Tensor:
-        return torch.linalg.vector_norm(2 * y - 1, dim=-3, keepdim=True) * self.max_range
-
-
 FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
     "range format",
     logscale=LogScale,
@@ -107,7 +88,6 @@ FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
     inverse=Inverse,
     inverse_depth=InverseDepth,
     metric=RangeFormat,
-    cartesian=Cartesian,
 )
 
 
@@ -117,7 +97,7 @@ class Encoding:
     Args:
         sensor: Sensor of the images; ranges within its limits are returns.
         format: `logscale` (the paper's), `shifted_log` (LiDARGen's and LiDM's), `inverse`, `inverse_depth` (DUSty's),
-            `metric`, or `cartesian` (three channels).
+            or `metric`.
         reflectance: Whether reflectance is a channel, in addition to range.
         limits: `closed`: ranges equal to the sensor's limits are returns. `open`, as in R2DM: they are not, and ranges
             outside the limits are encoded as dropped rays.
@@ -146,7 +126,7 @@ class Encoding:
 
     @property
     def channels(self) -> int:
-        return self.format.channels + int(self.reflectance)
+        return 1 + int(self.reflectance)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -156,7 +136,7 @@ class Encoding:
     def encode(self, image: Tensor) -> Tensor:
         """Map range in metres and reflectance in [0, 1], (..., 2 or 1, H, W), to (..., channels, H, W).
 
-        A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`; nearly -1 under `shifted_log`).
+        A dropped ray, range 0, becomes exactly -1, or nearly under `shifted_log`.
         """
         r = image[..., :1, :, :]
         if self.limits == "open":
@@ -176,9 +156,8 @@ class Encoding:
         Ranges outside the limits are dropped rays, 0 in both; reflectance is clamped to [0, 1] and rounded to `levels`.
         """
         y = (x + 1) / 2
-        ranges = self.format.channels
         near, far = self.sensor.min_range, self.sensor.max_range
-        r = self.format.inverse(y[..., :ranges, :, :])
+        r = self.format.inverse(y[..., :1, :, :])
         if self.limits == "open":
             returned = self._between(r)
         else:
@@ -186,7 +165,7 @@ class Encoding:
         zero = torch.zeros_like(r)
         image = torch.where(returned, r.clamp(near, far), zero)
         if self.reflectance:
-            reflectance = y[..., ranges:, :, :].clamp(0, 1)
+            reflectance = y[..., 1:, :, :].clamp(0, 1)
             if self.levels is not None:
                 reflectance = (reflectance * self.levels).round() / self.levels
             image = torch.cat([image, torch.where(returned, reflectance, zero)], dim=-3)
