@@ -2,10 +2,11 @@
 
 import dataclasses
 import difflib
-import importlib
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pkgutil import resolve_name
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
@@ -45,13 +46,13 @@ class UnknownName(InputError):
 
 
 class _Lazy(NamedTuple):
-    module: str
-    name: str
+    place: str
+    given: tuple[Any, ...]
 
 
-def lazy(place: str) -> Any:
-    """A registry entry `module:name` that is imported at its first use."""
-    return _Lazy(*place.split(":"))
+def lazy(place: str, *given: Any) -> Any:
+    """A registry entry `module:name` that is imported at its first use; with arguments to begin with, if given."""
+    return _Lazy(place, given)
 
 
 class Registry(Generic[T]):
@@ -78,7 +79,9 @@ class Registry(Generic[T]):
             raise UnknownName(f"no {self.kind} named {name!r}; known: {names}.{hint}")
         entry = self._entries[name]
         if isinstance(entry, _Lazy):
-            entry = self._entries[name] = getattr(importlib.import_module(entry.module), entry.name)
+            found: Any = resolve_name(entry.place)
+            found = partial(found, *entry.given) if entry.given else found
+            entry = self._entries[name] = found
         return entry
 
     def __iter__(self) -> Iterator[str]:

@@ -8,12 +8,11 @@ UltraLiDAR's, which compare voxel centres of real scans with points of generated
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.registry import Registry
+from r2flow.registry import Registry, lazy
 
 if TYPE_CHECKING:
     from r2flow.metrics.base import ScanMetric
@@ -21,36 +20,25 @@ if TYPE_CHECKING:
 # Published names of Frechet distances by network; other networks have `frechet_NETWORK`.
 FIELD_NAMES = {"rangenet53": "frd", "rangenet21": "frid", "pointnet": "fpd", "spvcnn": "fpvd", "minkowskinet": "fsvd"}
 
-
-def _lazily(where: str, *given: Any) -> Callable[..., ScanMetric]:
-    """Constructor `module:Class` of this package, imported on the first call."""
-    module, name = where.split(":")
-
-    def build(**options: Any) -> ScanMetric:
-        return getattr(importlib.import_module(f"{__name__}.{module}"), name)(*given, **options)
-
-    return build
-
-
 METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
-    jsd=_lazily("jsd_mmd:JSD"),
-    mmd=_lazily("jsd_mmd:MMD"),
-    mmd_unbiased=_lazily("jsd_mmd:MMDUnbiased"),
-    jsd_lidm=_lazily("lidm:JSDLiDM"),
-    mmd_lidm=_lazily("lidm:MMDLiDM"),
-    panel=_lazily("panel:Panel"),
-    things=_lazily("things:Things"),
-    auc=_lazily("two_sample:TwoSample", "handcrafted"),
-    auc_range=_lazily("two_sample:TwoSample", "handcrafted_range"),
+    jsd=lazy(f"{__name__}.jsd_mmd:JSD"),
+    mmd=lazy(f"{__name__}.jsd_mmd:MMD"),
+    mmd_unbiased=lazy(f"{__name__}.jsd_mmd:MMDUnbiased"),
+    jsd_lidm=lazy(f"{__name__}.lidm:JSDLiDM"),
+    mmd_lidm=lazy(f"{__name__}.lidm:MMDLiDM"),
+    panel=lazy(f"{__name__}.panel:Panel"),
+    things=lazy(f"{__name__}.things:Things"),
+    auc=lazy(f"{__name__}.two_sample:TwoSample", "handcrafted"),
+    auc_range=lazy(f"{__name__}.two_sample:TwoSample", "handcrafted_range"),
 )
 
 
 def add_network(name: str) -> None:
     """Register a network's metrics: Frechet distance, kernel distance, precision and recall."""
-    METRICS.add(FIELD_NAMES.get(name, f"frechet_{name}"), _lazily("frechet:FrechetDistance", name))
-    METRICS.add(f"kid_{name}", _lazily("kid:KernelDistance", name))
-    METRICS.add(f"manifold_{name}", _lazily("manifold:Manifold", name))
+    METRICS.add(FIELD_NAMES.get(name, f"frechet_{name}"), lazy(f"{__name__}.frechet:FrechetDistance", name))
+    METRICS.add(f"kid_{name}", lazy(f"{__name__}.kid:KernelDistance", name))
+    METRICS.add(f"manifold_{name}", lazy(f"{__name__}.manifold:Manifold", name))
 
 
 for _network in EXTRACTORS:
