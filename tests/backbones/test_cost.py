@@ -80,6 +80,27 @@ def test_a_transposed_convolution_by_hand():
     assert count_macs(model) - (before - 9 * last.weight[0, :, 0, 0].numel() * 8 * 16 * 3) == 8 * 8 * 16 * 2 * 2 * 3
 
 
+class Other(nn.Module):
+    """What no shipped backbone has."""
+
+    def __init__(self):
+        super().__init__()
+        self.convolution, self.recurrent = nn.Conv1d(3, 3, 5, padding=2), nn.GRU(3, 3, batch_first=True)
+
+    def forward(self, x):  # (B, 3, 8, 16)
+        tokens = self.recurrent(self.convolution(x.flatten(2)).mT)[0]
+        attended = torch.einsum("bqc,bkc->bqk", tokens, tokens).softmax(-1) @ tokens
+        return attended.mT.unflatten(2, (8, 16))
+
+
+def test_other_layers_by_hand():
+    """128 tokens of 3 channels: 5 taps, two products for each of three gates, and two products of all pairs."""
+    model = Plain(torch.zeros(2, 8, 16), in_channels=2, out_channels=3)
+    before = count_macs(model)
+    model.last = nn.Sequential(model.last, Other())
+    assert count_macs(model) - before == 128 * 5 * 3 * 3 + 128 * 3 * 2 * 3 * 3 + 2 * 128 * 128 * 3
+
+
 def test_a_size_that_one_cannot_take_is_said_in_its_row():
     (row,) = backbone_costs(SENSORS["hdl64e"].resized(64, 1000), ["hdit"], repeats=0)
     assert row["latency_ms"] is None
