@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from statistics import median
 from typing import Any, TypeVar
@@ -48,7 +49,9 @@ def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> di
 
 
 def _cost_of(model: Backbone, repeats: int, device: str) -> dict[str, Any]:
-    row = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9, "latency_ms": None}
+    row: dict[str, Any] = {"parameters": count_parameters(model), "gmac": None, "latency_ms": None}
+    with suppress(RuntimeError, TypeError, ValueError):  # of a network that cannot run on the meta device
+        row["gmac"] = count_macs(model) / 1e9
     if repeats:
         shape = 1, model.in_channels, *model.coords.shape[2:]
         model, x, t = model.to(device), torch.randn(shape, device=device), torch.full((1,), 0.5, device=device)

@@ -10,9 +10,11 @@ from torch import nn
 from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.backbones.efficient_unet import EfficientUNet
+from r2flow.backbones.hdit import HDiT
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
-from r2flow.reports.backbones import backbone_costs
+from r2flow.reports.backbones import backbone_costs, cost
+from r2flow.runs.composing import compose
 
 TABLE_2 = {
     "hdit": (80_908_420, 77.79),
@@ -81,8 +83,6 @@ def test_a_transposed_convolution_by_hand():
 
 
 class Other(nn.Module):
-    """What no shipped backbone has."""
-
     def __init__(self):
         super().__init__()
         self.convolution, self.recurrent = nn.Conv1d(3, 3, 5, padding=2), nn.GRU(3, 3, batch_first=True)
@@ -109,6 +109,13 @@ def test_a_size_that_one_cannot_take_is_said_in_its_row():
     assert row["latency_ms"] > 0
     with pytest.raises(InputError, match="Did you mean 'hdit_tiny'"):
         list(backbone_costs(SENSORS["hdl64e"], ["hdit_tny"]))
+
+
+def test_a_network_that_cannot_run_on_the_meta_device_has_no_gmac(monkeypatch):
+    config = compose(["encoding.reflectance=true", "backbone.attention=flex"])  # for CUDA only
+    assert cost(config)["gmac"] is None
+    monkeypatch.setattr(HDiT, "velocity", lambda self, t, x: x * torch.ones(1))
+    assert cost(compose(["encoding.reflectance=true"]))["gmac"] is None
 
 
 def test_the_verb_measures_what_it_is_asked_for(r2flow):
