@@ -120,7 +120,12 @@ def group_runs(runs: Sequence[ComparedRun]) -> Groups:
     groups: dict[str, list[ComparedRun]] = {}
     for run in runs:
         groups.setdefault(configuration(run.config), []).append(run)
-    return {_common_label(group): group for group in groups.values()}
+    labelled = [(_common_label(group), text.split("\n"), group) for text, group in groups.items()]
+    named: dict[str, list[ComparedRun]] = {}
+    for label, settings, group in labelled:  # equal labels are told apart by the settings that differ
+        shared = set.intersection(*(set(others) for other, others, _ in labelled if other == label))
+        named[", ".join([label, *(one for one in settings if one not in shared)])] = group
+    return named
 
 
 def configuration(config: Mapping[str, Any]) -> str:
@@ -137,7 +142,7 @@ def configuration(config: Mapping[str, Any]) -> str:
     ]
     if parent := config.get("parent"):
         before = read_config(Path(parent["path"]).parent.parent)
-        keys.append(configuration(before) if before else parent["weights"])
+        keys += [f"parent.{line}" for line in (configuration(before) if before else parent["weights"]).split("\n")]
     return "\n".join(keys)
 
 

@@ -134,6 +134,15 @@ def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
     assert rows[0]["n"] == 3
 
 
+def test_two_sweeps_of_one_label_are_told_apart_by_what_was_swept(tmp_path):
+    for loss, seed in (("mse", 1), ("mse", 2), ("absolute", 1), ("absolute", 2)):
+        make_run(tmp_path / f"seed={seed}_stage.loss={loss}-ab{seed}", {"seed": seed, "stage.loss": loss})
+    groups = group_runs(read_runs([tmp_path]))
+    assert {label: [run.config["stage"]["loss"] for run in runs] for label, runs in groups.items()} == {
+        f"rectify, hdit, stage.loss={loss}": [loss, loss] for loss in ("absolute", "mse")
+    }
+
+
 def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_another(tmp_path):
     def child(parent: Path, weights: str, **change: Any) -> dict[str, Any]:
         config = copy.deepcopy(CONFIG)
