@@ -31,8 +31,9 @@ MEASURED = {
     "straightness": "bend",
 }  # fmt: skip
 
-# Keys that are equal for all seeds, though a run may resume with another value.
-TELLING = {"trainer.precision", "data.root", "parent.step"}
+# Keys that are equal for all seeds, though a run may resume with another value: they change a column.
+TELLING = {"trainer.precision", "trainer.val_check_interval", "data.root", "parent.step",
+           "callbacks.curvature.num", "callbacks.curvature.steps"}  # fmt: skip
 
 
 class ComparedRun(NamedTuple):

@@ -159,7 +159,9 @@ def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_an
     assert len({configuration(one) for one in (first, *others)}) == 5
 
 
-@pytest.mark.parametrize("key", ["trainer.precision", "data.root", "parent.step"])
+@pytest.mark.parametrize(
+    "key", ["trainer.precision", "trainer.val_check_interval", "data.root", "parent.step", "callbacks.curvature.steps"]
+)
 def test_what_is_free_on_resumption_still_tells_configurations_apart(tmp_path, key):
     parent = {"path": str(make_run(tmp_path / "a") / "checkpoints" / "step-00000040.ckpt"), "weights": "aaa"}
     make_run(tmp_path / "b", {"parent": parent, key: 20})
