@@ -233,7 +233,7 @@ def paper(
     where = choose_device(device)
     rows, runs = read_results(results or []), []
     for text in models:
-        role, _, model = text.rpartition("=")
+        role, _, model = text.partition("=") if "=" in text and not Path(text).exists() else ("", "", text)
         checkpoint = load_checkpoint(model, where)
         check(checkpoint.generator.draws, f"{model} does not generate scans from noise.")
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))

@@ -21,7 +21,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("runs")
     stages = {"1-RF": {"name": "rectify"}, "2-RF": {"name": "reflow"}, "4-TD": {"name": "distill", "steps": 4}}
     return {
-        role: write_run(root / role, network(), stage, 0.2 + 0.05 * i) for i, (role, stage) in enumerate(stages.items())
+        role: write_run(root / f"role={role}_seed={i}", network(), stage, 0.2 + 0.05 * i)  # as folders of a sweep
+        for i, (role, stage) in enumerate(stages.items())
     }
 
 
