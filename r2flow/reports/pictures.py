@@ -1,5 +1,6 @@
 """Scans as pictures in the width of a paper's page: range, reflectance, bird's-eye view, 3-D perspective."""
 
+import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -238,6 +239,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 300, title: str = "
     path = Path(path)
     notes = {"Subject": about, "CreationDate": None} if path.suffix == ".pdf" else {"Description": about}
     take_names_as_they_are(figure)
+    logging.getLogger("fontTools").setLevel(logging.WARNING)  # else 100 lines for a PDF where INFO is shown
     with atomic_write(path) as file, rc_context({"pdf.fonttype": 42}):  # TrueType: publishers refuse Type 3
         figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata={"Title": title, **notes})
     return path

@@ -51,11 +51,13 @@ def test_the_error_of_an_answer_is_in_metres_where_hidden_rays_return_in_both():
     assert [text.get_text() for text in bar.get_yticklabels()] == ["0", "1", "2"]
 
 
-def test_a_picture_is_as_wide_as_a_page_and_white(tmp_path):
+def test_a_picture_is_as_wide_as_a_page_and_white(tmp_path, caplog):
     figure = scan_figure(image(np.full_like(E, 10.0)), SENSOR.rays())
     assert figure.get_figwidth() == pytest.approx(7.16)
     assert (figure_pixels(figure)[[0, -1]] == 255).all()
+    caplog.set_level("INFO")  # as under Hydra
     pdf = save_figure(figure, tmp_path / "scan.pdf").read_bytes()
+    assert not caplog.records
     assert pdf.startswith(b"%PDF")
     assert b"/Type3" not in pdf
 
