@@ -158,13 +158,17 @@ class Stage(L.LightningModule):
 class SingleLoss(Stage):
     """A stage with one loss per batch. A subclass defines `regression_loss`."""
 
+    _sum: Tensor  # of the losses of the step's accumulated batches
+
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """Mean loss at the times that the stage computes from uniform draws u in [0, 1), (B,)."""
         raise NotImplementedError
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss = self.regression_loss(batch, batch["u"])
-        self.log("train/loss", loss, prog_bar=True, sync_dist=True)
+        part = batch_idx % (self._trainer.accumulate_grad_batches if self._trainer else 1)
+        self._sum = loss.detach() + (self._sum if part else 0.0)
+        self.log("train/loss", self._sum / (part + 1), prog_bar=True, sync_dist=True)
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:

@@ -10,6 +10,7 @@ from torch.utils.data import DataLoader
 
 from r2flow.generators import Generated, Generator
 from r2flow.stages import Stage
+from r2flow.stages.base import SingleLoss
 from r2flow.stages.muon import Muon, is_hidden_matrix, orthogonalised
 from tests.conftest import quiet_trainer
 
@@ -74,6 +75,17 @@ def test_steps_of_its_own_are_clipped_scheduled_and_counted_as_lightning_s(tmp_p
     assert manual.rates == automatic.rates
     assert automatic.rates[:2] == pytest.approx([0.05, 0.1])  # a warm-up of 16 images is one of two steps
     assert not torch.equal(manual.other.weight, Manual().other.weight)
+
+
+class Given(SingleLoss):
+    def regression_loss(self, batch, u):
+        return u.mean() + 0 * self.generator.layer.bias.sum()
+
+
+def test_the_logged_loss_is_the_mean_over_the_parts_of_a_step(tmp_path):
+    trainer = quiet_trainer(tmp_path, max_steps=2, accumulate_grad_batches=2)
+    trainer.fit(Given(Linear()), DataLoader([{"u": loss} for loss in (1.0, 2.0, 4.0, 8.0)]))
+    assert trainer.callback_metrics["train/loss"] == (4 + 8) / 2
 
 
 class Slope(Stage):
