@@ -147,6 +147,8 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
     check_keys(config)
     if config.get("chain"):
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
+    if config.get("preview"):
+        raise InputError("preview is of a chain of runs, such as experiment=demo: leave it out, or give preview=null.")
     with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
         parent, checkpoint = find_parent(config["stage"].get("init")) or (None, None)
         config = _checked(config, asked, parent)

@@ -70,7 +70,8 @@ def entries(config) -> list[Entry]:
     found.append(("data", DataOptions, data, set()))
     found.append(("data.augment", Augmentation, data["augment"], set()))
     found.append(("data.pairs", PairOptions, data["pairs"], {"parent"}))
-    found.append(("trainer", L.Trainer, config["trainer"], {"callbacks", "logger", "plugins"}))
+    idle = {"limit_test_batches", "limit_predict_batches", "model_registry"}  # no run tests or predicts
+    found.append(("trainer", L.Trainer, config["trainer"], {"callbacks", "logger", "plugins"} | idle))
     return found
 
 

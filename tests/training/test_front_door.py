@@ -68,6 +68,8 @@ REFUSED = {
     "data.root=typo": "simulated scans are not files (data=folder for yours): leave data.root out",
     "data.pairs.num=5": "data.pairs.num are of data=pairs, found data=simulated",
     "stage=reflow & data=pairs & stage.init=street & data.drives=[1]": "pairs are drawn, not read: leave data.drives",
+    "preview=street": "preview is of a chain of runs",
+    "trainer.limit_test_batches=3": "no key 'trainer.limit_test_batches'",
     "+stage.batch_size=9": "stage.batch_size is the run's: leave it out, and give data.batch_size",
     # What a name, a size or a number does not fit; several words apart.
     "bakcbone.base_channels=8": "no key 'bakcbone.base_channels' | Did you mean 'backbone.base_channels'?",
