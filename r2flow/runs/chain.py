@@ -46,7 +46,11 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
             raise InputError(f"chain.{name}: a link has a folder's name and groups of keys; found {difference!r}.")
         settings = dict(difference)
         parent = settings.pop("init", None)
-        overrides = [override(key, value) for key, value in flatten(settings) if (key, value) != ("experiment", None)]
+        overrides = [
+            override("stage" if key == "stage.name" else key, value)  # a choice, with its own options
+            for key, value in flatten(settings)
+            if (key, value) != ("experiment", None)
+        ]
         if any(key_of(text) == "plugins" for text in overrides):
             raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")
         if parent is not None:

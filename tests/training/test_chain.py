@@ -244,6 +244,11 @@ def test_what_is_given_to_one_link_wins_over_what_is_given_to_all():
     assert second.overrides[-2:] == ("seed=2", "run_dir='runs/rf2'")
 
 
+def test_a_link_s_stage_has_its_own_options():
+    (link,) = links_of({"td4": {"stage": {"name": "distill", "steps": 4, "init": "runs/old"}}}, "runs/x", [])
+    assert compose(link.overrides)["stage"]["steps"] == 4
+
+
 def test_a_chain_can_begin_at_a_flow_that_is_there():
     chain = {"rf2": {"experiment": "reflow", "stage": {"init": "runs/old"}}}
     (link,) = links_of(chain, "runs/x", ["data.pairs.num=5", "data.root=scans"])
