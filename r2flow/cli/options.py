@@ -112,7 +112,8 @@ class ReadingOptions:
         Literal["spherical", "unfolding"] | None, typer.Option(help="Projection. Default: spherical.")
     ] = None
     convention: Annotated[
-        Literal["centre", "reference"] | None, typer.Option(help="reference: as in published models. Default: centre.")
+        Literal["centre", "reference", "lidm"] | None,
+        typer.Option(help="reference, lidm: as in published models. Default: centre."),
     ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None

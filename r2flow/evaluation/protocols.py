@@ -12,10 +12,10 @@ from typing import Any, Literal
 from r2flow.data.opening import SOURCES
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
-from r2flow.lidar.sensors import Convention
+from r2flow.lidar.sensors import Convention, Rays
 from r2flow.registry import Registry
 
-Points = Literal["measured"] | Convention
+Points = Literal["measured"] | Rays
 
 WORDS = {"measured": "as measured", "centre": "on rays through bin centres", "reference": "on rays through bin corners"}
 
@@ -33,7 +33,7 @@ class Rules:
 
     name: str
     real: Points
-    generated: Convention
+    generated: Rays
     convention: Convention | None
     choose: Callable[[ScanSet, int], Sequence[int]]
     chosen: str
@@ -42,7 +42,7 @@ class Rules:
         """Entries for the protocol of a result."""
         return {"name": self.name, "points": {"real": WORDS[self.real], "generated": WORDS[self.generated]}}
 
-    def rays(self, real: bool) -> Convention:
+    def rays(self, real: bool) -> Rays:
         """Rays of points that are not measured."""
         return self.real if real and self.real != "measured" else self.generated
 

@@ -36,7 +36,8 @@ def project(
 
     `centre` keeps returns with min_range <= r <= max_range in the field of view. `reference` is the convention of the
     published R2Flow: elevations outside the view are clamped to the edge rows, and the range limits are applied after
-    the nearest return is chosen, so that a return nearer than min_range empties its pixel.
+    the nearest return is chosen, so that a return nearer than min_range empties its pixel; `lidm`, that of
+    the published LiDM, applies them first.
 
     Args:
         xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. Points that are not finite are rays without
@@ -89,8 +90,8 @@ def project_indices(
     pixel = row * columns
     pixel += _columns(points, columns)
     within = finite & (r >= sensor.min_range) & (r <= sensor.max_range)
-    if convention == "reference":
-        pixel[~finite] = rows * columns
+    if convention != "centre":
+        pixel[~(within if convention == "lidm" else finite)] = rows * columns
         hit, chosen = _nearest_by_sorting(pixel, r)
         hit, chosen = hit[within[chosen]], chosen[within[chosen]]
     else:
@@ -117,7 +118,7 @@ def _rows(
         row = np.floor(place, out=place).astype(np.int64)
     else:
         row = np.searchsorted(-edges, -elevation, side="right") - 1
-    return np.clip(row, 0, rows - 1) if convention == "reference" else row
+    return row if convention == "centre" else np.clip(row, 0, rows - 1)
 
 
 def _columns(xyz: np.ndarray, columns: int) -> np.ndarray:

@@ -13,7 +13,8 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.registry import Registry
 
-Convention = Literal["centre", "reference"]
+Rays = Literal["centre", "reference"]
+Convention = Literal[Rays, "lidm"]
 
 MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, but within memory
 
@@ -74,7 +75,7 @@ class Sensor:
         inner = (e[:-1] + e[1:]) / 2
         return np.concatenate([[2 * e[0] - inner[0]], inner, [2 * e[-1] - inner[-1]]])
 
-    def rays(self, convention: Convention = "centre") -> Tensor:
+    def rays(self, convention: Rays = "centre") -> Tensor:
         """Elevation e and azimuth a of every pixel in radians, (2, H, W), float32.
 
         `centre` is the centre of each bin: e is the beam's elevation, a = pi - 2 pi (w + 1/2) / W. `reference` is the

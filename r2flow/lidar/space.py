@@ -11,7 +11,7 @@ from torch import Tensor
 from r2flow.errors import InputError, check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.sensors import Convention, Sensor, build_sensor
+from r2flow.lidar.sensors import Rays, Sensor, build_sensor
 from r2flow.registry import check_options, construct
 
 
@@ -62,7 +62,7 @@ def build_space(config: Mapping[str, Any]) -> ModelSpace:
     """The model space of a config with the keys `sensor` and `encoding`."""
     check({"sensor", "encoding"} <= config.keys(), "the config of a model needs 'sensor' and 'encoding'.")
     options = dict(config["sensor"])
-    convention: Convention = options.pop("rays", "centre")
+    convention: Rays = options.pop("rays", "centre")
     sensor = construct("sensor", build_sensor, options)
     check_options("sensor.rays", sensor.rays, {"convention": convention})
     check_options("encoding", Encoding, config["encoding"], given=1)

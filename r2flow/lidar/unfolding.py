@@ -14,7 +14,7 @@ def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring:
 
     Lasers are found by the first of three ways that works: ring numbers; whole firings of H points each, including rays
     without return, in a fixed order of lasers; or ring after ring (`rings_from_order`), aligned at the bottom because
-    rings that see only sky are missing at the top. `reference` uses the last way only.
+    rings that see only sky are missing at the top. `reference` and `lidm` use the last way only.
     """
     rows = sensor.shape[0]
     if ring is not None:
@@ -23,7 +23,7 @@ def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring:
         return row
     order = rings_from_order(xyz)
     row = order - (order.max(initial=0) + 1) + rows
-    if convention == "reference":
+    if convention != "centre":
         return np.maximum(row, 0)
     rings = int(order.max(initial=-1)) + 1
     if not rows / 2 <= rings <= rows + 1:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.lidar.projection import unproject
-from r2flow.lidar.sensors import Convention, Sensor
+from r2flow.lidar.sensors import Rays, Sensor
 from r2flow.metrics.birds_eye import BINS, birds_eye_histogram
 
 FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
@@ -35,7 +35,7 @@ class Scans:
         self,
         images: Tensor,
         sensor: Sensor,
-        rays: Convention = "centre",
+        rays: Rays = "centre",
         xyz: Tensor | None = None,
         names: Sequence[object] | None = None,
     ) -> None:

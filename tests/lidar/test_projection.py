@@ -72,10 +72,11 @@ def test_a_return_too_near_does_not_hide_what_is_behind_it():
     assert project(points, np.ones(2), HDL64E)[0].max() == pytest.approx(30, rel=1e-6)
     # The reference chooses the nearest first and masks it afterwards: a hole.
     assert project(points, np.ones(2), HDL64E, convention="reference")[0].max() == 0
+    assert project(points, np.ones(2), HDL64E, convention="lidm")[0].max() == pytest.approx(30, rel=1e-6)
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("convention", ["centre", "reference"])
+@pytest.mark.parametrize("convention", ["centre", "reference", "lidm"])
 @pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
 def test_points_that_are_not_finite_are_no_returns(convention, lost):
     """Neither in their own pixel nor in one that another point falls into, as the one at azimuth and elevation 0."""

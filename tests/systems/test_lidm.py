@@ -13,6 +13,7 @@ import torch.nn.functional as F
 import yaml
 from torch import Tensor
 
+from r2flow.data.opening import reading_for
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
@@ -21,6 +22,7 @@ from r2flow.lidar.sensors import build_sensor
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.registry import options_of
+from r2flow.runs.composing import CONF
 from r2flow.runs.lineage import Parent
 from r2flow.samplers import Noise, build_sampler
 from r2flow.systems.diffusion.log_snr import square_root_linear
@@ -284,17 +286,6 @@ def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
     assert_near(points, case["sample_points"], 1e-6)
 
 
-def test_points_fall_into_the_published_pixels(shared: Path):
-    case = load_case(shared, "lidm_data.pt")
-    nearest, farthest = case["depth_range"]
-    sensor = build_sensor("hdl64e", 16, 64, nearest, farthest)
-    points = case["points"].numpy()
-    # The published projection leaves out what is beyond the limits first: no such point hides another one.
-    kept = [nearest < (point**2).sum() ** 0.5 < farthest for point in points]
-    image = torch.from_numpy(project(points[kept], None, sensor, convention="reference"))[0]
-    assert_near(torch.where(image > 0, image, -1.0), case["proj_range"], 1e-6)
-
-
 @pytest.fixture
 def published(shared: Path, tmp_path: Path) -> tuple[Path, dict[str, Any]]:
     """The published diffusion's file beside its config, as it is distributed."""
@@ -330,6 +321,17 @@ def test_a_published_diffusion_without_its_config_has_the_published_size(shared:
     assert loaded.config["generator"]["unet"]["head_channels"] == 32
     assert loaded.config["generator"]["unet"]["multipliers"] == [1, 1]
     assert loaded.config["generator"]["beta_last"] == 0.0195
+
+
+def test_points_fall_into_the_published_pixels(published: tuple[Path, dict[str, Any]], shared: Path):
+    case = load_case(shared, "lidm_data.pt")
+    nearest, farthest = case["depth_range"]
+    sensor = build_sensor("hdl64e", 16, 64, nearest, farthest)
+    chosen = yaml.safe_load((CONF / "data" / "kitti_360_lidm.yaml").read_text())
+    readings = chosen["reading"], chosen["validation"]["data"]["reading"]
+    for how in (reading_for([], load_checkpoint(published[0])).convention, *(r["convention"] for r in readings)):
+        image = torch.from_numpy(project(case["points"].numpy(), None, sensor, convention=how))[0]
+        assert_near(torch.where(image > 0, image, -1.0), case["proj_range"], 1e-6)
 
 
 def test_callback_states_keyed_by_their_class_are_read(shared: Path, tmp_path: Path, monkeypatch: Any):

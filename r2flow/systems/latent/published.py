@@ -151,7 +151,7 @@ def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> 
         "encoding": {"format": "shifted_log" if logarithmic else "metric", "reflectance": False, "limits": "open"},
         "backbone": {"name": "latent_unet"},
         "generator": generator,
-        "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "reference"}},
+        "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "lidm"}},
         "published": {"system": "LiDM"},
     }
 
