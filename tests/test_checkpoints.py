@@ -12,7 +12,9 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
+from r2flow.lidar.space import build_space
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from r2flow.model.published import published_config
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.conftest import CONFIG, Trap, small_disk
 
@@ -182,6 +184,16 @@ def test_an_unfolding_checkpoint_brings_its_ring_angles(shared, tmp_path: Path):
     loaded = load_checkpoint(tmp_path / "unfolding.pth")
     torch.testing.assert_close(loaded.sensor.rays()[0, :, 0], rings, rtol=0, atol=1e-6)
     torch.testing.assert_close(loaded.generator.backbone.coords[0, 0, :, 0], rings, rtol=0, atol=0)
+
+
+def test_published_rows_of_any_number_divide_the_view_evenly(shared):
+    cfg = torch.load(shared / "oracle" / "published_format.pth", weights_only=True)["cfg"]
+    for rows in (16, 64, 100, 128):
+        cfg["data"]["resolution"] = (rows, 64)
+        space = build_space(published_config(cfg))
+        edges = 3 - 28 * torch.arange(rows + 1, dtype=torch.float64) / rows  # of the network, and of the projection
+        torch.testing.assert_close(space.rays[0, :, 0].rad2deg().double(), edges[:-1], rtol=0, atol=1e-5)
+        torch.testing.assert_close(torch.from_numpy(space.sensor.row_edges), edges, rtol=0, atol=1e-12)
 
 
 def test_loading_and_sampling_import_nothing_that_they_do_not_need(saved):

@@ -22,7 +22,6 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
     if not isinstance(options, dict) or not all(isinstance(key, str) for key in options):
         raise InputError(f"{path} is no sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
-    options.pop("rays", None)  # the ray convention of a model, an option of training
     sized = {"rows": rows, "columns": columns}
     options.update({key: value for key, value in sized.items() if value is not None})
     check_options(str(path), build_sensor, options)

@@ -90,11 +90,11 @@ class Sensor:
         grid = np.stack(np.meshgrid(np.deg2rad(elevation), azimuth, indexing="ij"))
         return torch.from_numpy(grid.astype(np.float32))
 
-    def resized(self, rows: int | None = None, columns: int | None = None) -> "Sensor":
+    def resized(self, rows: int | None = None, columns: int | None = None, rays: Rays = "centre") -> "Sensor":
         """The sensor with the same field of view and another number of rows and columns.
 
-        More rows: each beam is the centre of a row, with the others evenly spread between beams. Fewer: row edges are
-        interpolated, so that each new row covers an equal share of the old rows.
+        More rows: each beam is the centre of a row, with the others evenly spread between beams. Fewer, or `reference`:
+        row edges are interpolated, so that each new row covers an equal share of the old rows.
         """
         sensor = self if columns is None else replace(self, columns=columns)
         old = len(self.elevations)
@@ -104,7 +104,7 @@ class Sensor:
             raise InputError(
                 f"sensor {self.name!r}: rows must be 2 or more, at most {MOST_PIXELS:,} pixels; found {rows}."
             )
-        if rows > old:
+        if rows > old and rays == "centre":
             e, beam = self.elevations, np.arange(-1, old + 1)  # with a step beyond the first and the last beam
             beams = [min(2 * e[0] - e[1], e[0] / 2 + 45), *e, max(2 * e[-1] - e[-2], e[-1] / 2 - 45)]
             middle = np.interp(np.arange(rows), (2 * beam + 1) * rows // (2 * old), beams)
@@ -194,8 +194,12 @@ def build_sensor(
     elevations: Sequence[float] | None = None,
     firing: Sequence[int] | None = None,
     reflectance_scale: float | None = None,
+    rays: Rays = "centre",
 ) -> Sensor:
-    """A built-in sensor by name, or a custom sensor by `elevations`, with the given size and limits."""
+    """A built-in sensor by name, or a custom sensor by `elevations`, with the given size and limits.
+
+    `rays` are the model's (`Sensor.rays`); with `reference`, more rows than beams divide the view evenly.
+    """
     if elevations is not None and name in SENSORS:
         raise InputError(f"{name!r} is the name of a built-in sensor; give your own sensor another one.")
     limits = {"min_range": min_range, "max_range": max_range, "height": height, "reflectance_scale": reflectance_scale}
@@ -205,4 +209,4 @@ def build_sensor(
         sensor = sensor if firing is None else replace(sensor, firing=tuple(firing))
     except (OverflowError, TypeError) as error:  # YAML integers can have any number of digits, lists any values
         raise InputError(f"sensor {name!r}: elevations, firing and limits must be numbers; {error}.") from None
-    return replace(sensor.resized(rows, columns), **given)  # type: ignore[arg-type]
+    return replace(sensor.resized(rows, columns, rays), **given)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from torch import Tensor
 from r2flow.errors import InputError, check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.sensors import Rays, Sensor, build_sensor
+from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import check_options, construct
 
 
@@ -61,9 +61,7 @@ class ModelSpace:
 def build_space(config: Mapping[str, Any]) -> ModelSpace:
     """The model space of a config with the keys `sensor` and `encoding`."""
     check({"sensor", "encoding"} <= config.keys(), "the config of a model needs 'sensor' and 'encoding'.")
-    options = dict(config["sensor"])
-    convention: Rays = options.pop("rays", "centre")
-    sensor = construct("sensor", build_sensor, options)
-    check_options("sensor.rays", sensor.rays, {"convention": convention})
+    sensor = construct("sensor", build_sensor, config["sensor"])
     check_options("encoding", Encoding, config["encoding"], given=1)
-    return ModelSpace(sensor, Encoding(sensor, **config["encoding"]), sensor.rays(convention))
+    rays = sensor.rays(config["sensor"].get("rays", "centre"))
+    return ModelSpace(sensor, Encoding(sensor, **config["encoding"]), rays)

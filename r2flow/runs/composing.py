@@ -127,7 +127,7 @@ def add_choices(group: str) -> None:
         if group == "data":
             node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
         elif group == "sensor":
-            node = {**options_of(import_module(module).build_sensor), "name": name, "rays": "centre"}
+            node = {**options_of(import_module(module).build_sensor), "name": name}
         else:
             node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
             if group == "stage":
