@@ -59,7 +59,8 @@ def common_mae(truth: np.ndarray, answers: Sequence[np.ndarray], hidden: np.ndar
 def spread_errors(truth: np.ndarray, answers: np.ndarray, hidden: np.ndarray) -> dict[str, float]:
     """Calibration of the spread of several answers, (A, 2 or 1, H, W): errors of range, 0 m without a return.
 
-    - `coverage`: share of hidden rays whose range lies between the smallest and largest answer. If truth and answers
+    - `coverage`: share of hidden rays whose range lies between the smallest and largest answer. A range equal to E
+      answers, as dropped rays are, counts by the share of its E + 1 possible ranks among them. If truth and answers
       have the same distribution, it is (A - 1) / (A + 1) on average, `nominal`: 90 % for 19 answers, 78 % for 8;
     - `crps_m`: mean |x - r| - mean |x - x'| / 2 over answers x and pairs of different answers (Gneiting and Raftery
       2007; the fair estimate of Ferro 2014): the absolute error for one answer;
@@ -69,8 +70,10 @@ def spread_errors(truth: np.ndarray, answers: np.ndarray, hidden: np.ndarray) ->
     count = len(x)
     weights = 2 * np.arange(count) - count + 1  # sum over pairs of |x - x'| of sorted values
     spread = (weights[:, None] * x).sum(0) / max(count * (count - 1) / 2, 1)
+    below, equal = (x < r).sum(0), (x == r).sum(0)
+    inside = np.minimum(below + equal, count - 1) - np.maximum(below, 1) + 1  # ranks of 1 to A - 1
     return {
-        "coverage": _mean((x[0] <= r) & (r <= x[-1])),
+        "coverage": _mean(inside / (equal + 1)),
         "nominal": (count - 1) / (count + 1),
         "crps_m": _mean(np.abs(x - r).mean(0) - spread / 2),
         "mae_of_median_m": _mean(np.abs(np.median(x, axis=0) - r)),

@@ -51,15 +51,17 @@ def test_an_empty_scan_has_no_figures_that_do_not_exist():
     assert math.isnan(found["iou"])
 
 
-def test_coverage_is_nominal_where_the_truth_is_one_more_answer():
+@pytest.mark.parametrize("dropped", [0, 0.24, 1])
+def test_coverage_is_nominal_where_the_truth_is_one_more_answer(dropped):
     random = np.random.default_rng(0)
     draws = random.normal(20, 3, (9, 1, 200, 200)).astype(np.float32)
+    draws[random.random(draws.shape) < dropped] = 0
     hidden = np.ones((200, 200), dtype=bool)
     found = spread_errors(draws[0], draws[1:], hidden)
     assert found["nominal"] == 7 / 9
     assert found["coverage"] == pytest.approx(7 / 9, abs=4 * math.sqrt(7 / 9 * 2 / 9 / 40000))
-    # CRPS of N(m, s) against a draw of the same: s / sqrt(pi)
-    assert found["crps_m"] == pytest.approx(3 / math.sqrt(math.pi), rel=0.02)
+    if not dropped:  # CRPS of N(m, s) against a draw of the same: s / sqrt(pi)
+        assert found["crps_m"] == pytest.approx(3 / math.sqrt(math.pi), rel=0.02)
 
 
 def test_answers_without_spread_have_the_crps_of_their_error():
