@@ -139,12 +139,12 @@ def mapping_network(channels: int, linear: type[nn.Linear] = ExactLinear, dropou
 
 
 def wrapped(x: Tensor, left: int, right: int) -> Tensor:
-    """Pad an image, (B, C, H, W), circularly by `left` and `right` columns.
+    """Pad an image, (B, C, H, W), circularly by `left` and `right` columns, more than a full turn if they are.
 
-    Equal to F.pad(mode="circular"), whose backward takes at least five times as long.
+    F.pad(mode="circular") pads by one turn at most, and its backward takes at least five times as long.
     """
     if x.shape[3] < left + right:
-        return F.pad(x, (left, right, 0, 0), mode="circular")
+        return x[..., torch.arange(-left, x.shape[3] + right, device=x.device) % x.shape[3]]
     first, middle, last = x.split((right, x.shape[3] - left - right, left), dim=3)
     return torch.cat([last, first, middle, last, first], dim=3)
 

@@ -44,7 +44,7 @@ class Local(Backbone):
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         columns = x.shape[3]
-        margin = min(self.margin, columns) if self.ring else 0
+        margin = self.margin if self.ring else 0
         x = x.contiguous(memory_format=torch.channels_last)  # up to twice as fast on a CPU
         h = uncast(self.image, wrapped(x, margin, margin) if margin else x)
         h = h + self.time(t)[:, :, None, None].to(h.dtype)

@@ -182,6 +182,14 @@ def test_a_turned_image_gives_a_turned_answer():
     assert torch.allclose(model(0.4, x.roll(16, -1)), model(0.4, x).roll(16, -1), atol=1e-5)  # rays are float32
 
 
+@pytest.mark.parametrize("turns", [1, 2, 16])
+def test_a_narrow_ring_computes_what_a_ring_of_many_turns_does(turns):
+    model, x = tiny("local").double(), image()[..., :4].double()
+    many = model.velocity(torch.tensor([0.4]), x.repeat(1, 1, 1, 32))
+    found = model.velocity(torch.tensor([0.4]), x.repeat(1, 1, 1, turns))
+    torch.testing.assert_close(found, many[..., : 4 * turns])
+
+
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_an_untrained_model_is_the_zero_field(name):
     assert not untrained(name)(0.5, image(1)).any()
