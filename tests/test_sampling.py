@@ -280,6 +280,10 @@ def test_numeric_times_decide_the_number_of_steps():
     assert own.changed(steps=4) == build_sampler("euler", steps=4)
     with pytest.raises(InputError, match="2 steps"):
         build_sampler("euler", steps=3, grid=(0.0, 0.3, 1.0))
+    with pytest.raises(InputError, match="its own last step: give finish=0"):
+        build_sampler("sde", grid=(0.0, 0.3, 1.0))
+    (drawn,) = sample(flow(), 1, sampler=build_sampler("sde", grid=(0.0, 0.3, 1.0), finish=0.0))
+    assert drawn.evaluations == 2
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.solvers.solution import Solution, finite, wide
 from r2flow.registry import Bound, check_options, options_of
@@ -159,6 +159,7 @@ class OnGrid(Sampler):
             object.__setattr__(self, "grid", tuple(float(t) for t in self.grid))
             if len(self.grid) != self.steps + 1:
                 raise InputError(f"the time grid has {len(self.grid) - 1} steps, found steps={self.steps}.")
+            check(not getattr(self, "finish", 0), "a grid of times has its own last step: give finish=0.")
         self.times()
 
     def times(self, t_0: float = 0.0, t_1: float = 1.0, fewer: int = 0) -> Tensor:
