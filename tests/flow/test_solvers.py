@@ -11,6 +11,7 @@ from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, 
 from r2flow.flow.solvers.fixed import weights
 from r2flow.samplers import build_sampler
 from tests.fields import Field
+from tests.reference import assert_near, backbone_of, load_case
 
 
 def logistic(t, x):
@@ -72,6 +73,22 @@ def test_halving_the_steps_shrinks_the_error_by_the_order(method, grid):
     steps = asymptotic(method) if grid == "uniform" else 2 * asymptotic(method)
     within = 0.25 if grid == "uniform" else 0.3
     assert math.log2(error(steps) / error(2 * steps)) == pytest.approx(SOLVERS[method].order, abs=within)
+
+
+@pytest.mark.parametrize("by", ["", "torchdiffeq:"])
+def test_solutions_of_a_network_are_the_published_ones(shared, by):
+    case = load_case(shared, "solvers.pt")
+    model = backbone_of("hdit", case).eval()
+    for name, published in case["results"].items():
+        method, number = name.removeprefix("inversion_").split("-", 1)
+        if by or method in SOLVERS:
+            fixed, back = float(number) >= 1, "x0" in published
+            x, end = (published["x1"], published["x0"]) if back else (case["x0"], published["x1"])
+            how = {"steps": int(number)} if fixed else {"tolerance": float(number)}
+            with torch.no_grad():
+                found = solve(model, x, float(back), float(not back), by + method, **how)
+            assert_near(found.x, end, 1e-4 if fixed else 2e-2)
+            assert not fixed or back or found.evaluations.tolist() == [published["nfe"]] * len(x)
 
 
 def test_a_power_grid_is_denser_towards_one_end_and_the_same_backward():
