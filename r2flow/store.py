@@ -286,6 +286,14 @@ def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
     return content
 
 
+def manifest_of(folder: str | Path) -> dict[str, Any]:
+    """The manifest of a folder; empty if the folder has none."""
+    try:
+        return read_manifest(Path(folder).expanduser())
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+
+
 def checksum(content: Any) -> str:
     """SHA-256 of a JSON-serialisable value."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

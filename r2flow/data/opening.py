@@ -30,7 +30,7 @@ from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.models import MODELS
 from r2flow.registry import Registry, did_you_mean
-from r2flow.store import MANIFEST, read_manifest
+from r2flow.store import MANIFEST, manifest_of
 
 log = logging.getLogger(__name__)
 
@@ -157,7 +157,7 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
         raise InputError(
             f"{path} {problem}. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run.{hint}"
         )
-    if _manifest(path).get("format") == "r2flow scans":
+    if manifest_of(path).get("format") == "r2flow scans":
         return SourceOptions(PREPARED, str(path)), None
     return SourceOptions(FOLDER, str(samples_of(path) or path)), None
 
@@ -264,10 +264,8 @@ def own_reading(spec: str | Path) -> Reading | None:
     options, _ = parse(str(spec))
     if options.name not in (PREPARED, FOLDER):
         return None
-    described = _manifest(Path(options.folder).expanduser()).get("recipe", {}).get("reading")
-    if described is None or options.name == FOLDER:
-        return described and Reading.of(described)
-    return replace(Reading.of(described), reflectance=AUTO, within_limits=False)
+    stored = Reading.stored(options.folder)
+    return replace(stored, reflectance=AUTO, within_limits=False) if stored and options.name == PREPARED else stored
 
 
 def scale_of(options: SourceOptions, of_sensor: float | None) -> float:
@@ -277,19 +275,11 @@ def scale_of(options: SourceOptions, of_sensor: float | None) -> float:
     return SOURCES[options.name].reflectance_scale
 
 
-def _manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a folder; empty if the folder has none."""
-    try:
-        return read_manifest(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        return {}
-
-
 def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
     """Refuse a folder of samples or completed scans of another sensor or size."""
-    manifest, stored = _manifest(folder), sensor
-    if manifest.get("format") in ("r2flow samples", "r2flow answers"):
-        stored = Reading.of(manifest["recipe"]["reading"]).sensor
+    stored, reading = sensor, Reading.stored(folder)
+    if reading and manifest_of(folder)["format"] in ("r2flow samples", "r2flow answers"):
+        stored = reading.sensor
     theirs, ours = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (stored, sensor))
     check(
         stored.same_image(sensor),
@@ -301,7 +291,7 @@ def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
 def refuse_parts(spec: str | Path) -> None:
     """Refuse samples of a region of the image: metrics would treat the rest of the image as missing returns."""
     options, _ = parse(str(spec))
-    if options.name == FOLDER and _manifest(Path(options.folder)).get("recipe", {}).get("region"):
+    if options.name == FOLDER and manifest_of(options.folder).get("recipe", {}).get("region"):
         raise InputError(
             f"{spec} holds a part of each scan alone (see its {MANIFEST}) and cannot be compared with whole scans: "
             "sample without --sector and --rows."

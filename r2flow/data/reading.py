@@ -16,6 +16,7 @@ from r2flow.lidar.projection import Convention, Projection, project_indices, sca
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
+from r2flow.store import manifest_of
 
 AUTO = "auto"
 FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
@@ -60,6 +61,12 @@ class Reading:
         plain: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in described["sensor"].items()}
         columns = described.get("columns")
         return cls(**{**described, "sensor": Sensor(**plain), "columns": columns and tuple(columns)})
+
+    @classmethod
+    def stored(cls, folder: str | Path) -> "Reading | None":
+        """The reading in the manifest of scans that r2flow wrote; None for other scans."""
+        described = manifest_of(folder).get("recipe", {}).get("reading")
+        return described and cls.of(described)
 
 
 class Projected(NamedTuple):

@@ -23,7 +23,7 @@ from r2flow.data.reading import Reading, leaving_out, read_image, read_points_im
 from r2flow.errors import InputError, warn_odd
 from r2flow.lidar.beams import Doubt, is_tilted, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, read_range_image, scan_ending
-from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST
 
 log = logging.getLogger(__name__)
@@ -108,11 +108,18 @@ def made_here(root: str | Path) -> bool:
 def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> Doubt | None:
     """The mismatch of a few scan files and a sensor (`other_sensor`); warns instead of one due to a tilt.
 
-    Only for plain scan files: files that r2flow wrote store their sensor, and range images have no beams. Unreadable
-    files are reported when they are read as scans.
+    Files that r2flow wrote store their sensor; other range images have no beams. Unreadable files are reported when
+    they are read as scans.
     """
+    if made_here(root):
+        stored, ours = map(Reading.stored, sorted(set(map(os.path.dirname, paths)))), reading.sensor
+        theirs = next((r.sensor for r in stored if r and not r.sensor.resized(*ours.shape).same_image(ours)), None)
+        if theirs is None:
+            return None
+        seen, known = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}", theirs.name in SENSORS
+        return Doubt(seen, theirs.name if known else None, sure=known)
     scans = []
-    for number in spread(len(paths), LOOKED_AT if not made_here(root) else 0):
+    for number in spread(len(paths), LOOKED_AT):
         with suppress(InputError):
             scans.append(read_points(paths[number], reading.columns))
     mismatch = other_sensor(scans, reading.sensor) if scans else None

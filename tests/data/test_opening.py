@@ -137,6 +137,16 @@ class TestWhatR2FlowWrote:
         np.testing.assert_allclose(scan.numpy(), image, atol=1e-5)
         assert not caplog.text
 
+    @pytest.mark.parametrize("below", [".", "drive"])
+    def test_another_sensor_than_their_own_is_warned_of(self, tmp_path: Path, caplog, below: str):
+        folder = SimulatedFolder(tmp_path / below, SENSORS["os1_64"].resized(32, 64), 3, ("bin",))
+        folder.begin()
+        folder.simulate(5)
+        for name in ("os1_64", "hdl64e"):
+            assert not caplog.text
+            open_scans(tmp_path, Reading(SENSORS[name].resized(16, 64)))  # fewer rows are no other sensor
+        assert "manifest.json names os1_64 32x64; they fit 'os1_64'" in caplog.text
+
     def test_a_file_is_read_through_any_sensor(self, tmp_path: Path):
         write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32))  # without reflectance
         for sensor in ("vlp16", SENSORS["vlp16"]):
