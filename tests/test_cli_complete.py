@@ -286,7 +286,7 @@ def test_an_unusual_scale_that_is_estimated_is_told(complete, tmp_path):
     xyz = sparse_scan(tmp_path / "one.ply")
     write_points(tmp_path / "one.ply", xyz, np.linspace(0, 0.01, len(xyz), dtype=np.float32))
     asked = tmp_path / "one.ply", "--from", "vlp16"
-    assert "reflectance is divided by 0.01, its largest" in complete(*asked)[2]
+    assert "reflectance is divided by 0.01, by its values" in complete(*asked)[2]
     assert complete(*asked, "--reflectance-scale", "0.01", out=tmp_path / "b")[2] == ""
     # So is that of a scan of the model's sensor: unscaled values would stand next to answers in [0, 1].
     full_scan(tmp_path / "two.bin")
@@ -294,6 +294,19 @@ def test_an_unusual_scale_that_is_estimated_is_told(complete, tmp_path):
     write_points(tmp_path / "two.bin", points.xyz, points.reflectance / points.reflectance.max() * np.float32(0.01))
     assert "divided by 0.01" in complete(tmp_path / "two.bin", "--mask", "rows:2", out=tmp_path / "c")[2]
     assert read_points(tmp_path / "c" / "two.bin").reflectance.max() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("size", ["32x128", "16x128"])
+def test_reflectance_beyond_the_sensor_s_scale_is_neither_clipped_nor_silent(complete, tmp_path, size):
+    xyz = sparse_scan(tmp_path / "room.pcd")
+    counts = np.resize(np.arange(0, 65536, 257, dtype=np.float32), len(xyz))  # 0 to 255, in two bytes
+    write_points(tmp_path / "room.pcd", xyz, counts)
+    write_sensor(replace(VLP16, name="mine", reflectance_scale=255.0), tmp_path / "mine.yaml", "")
+    given = "--from", tmp_path / "mine.yaml", "--to", tmp_path / "mine.yaml", "--size", size, "--fill-gaps"
+    code, _, error = complete(tmp_path / "room.pcd", *given, model=None)
+    assert (code, error.count("divided by 65535")) == (0, 1)
+    answer = read_points(tmp_path / "out" / "room.pcd").reflectance
+    np.testing.assert_allclose(answer[: len(xyz)], counts / 65535, atol=1e-6)
 
 
 def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):

@@ -114,28 +114,26 @@ def _files(
         same = doubt is None
         if source:
             same = source.shape[0] >= target.shape[0] and source.resized(*target.shape).same_image(target)
+        known = source or (target if same else None)
         try:
-            fired = sensor_of(scans, source or (target if same else None))
+            fired = sensor_of(scans, known)
         except InputError as error:
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
         if not stored and not warn_of_tilt(points[0], scans) and source and doubt and not doubt.finer:
             fits = f"; they fit --from {doubt.name}" if doubt.name else ""
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         estimated = full_reflectance(scans) or 0.0
-        if same and fired.columns >= FEWER * target.columns:
-            of_sensor, options = (source or target).reflectance_scale, parse(spec)[0]
-            usual = scale_of(options, of_sensor) if options.name != FOLDER or of_sensor else 0.0
-            full = scale or (1.0 if stored else max(usual, estimated)) or 1.0
-            strict = scale is not None or full in FULL_REFLECTANCE
-            by_points = partial(_read_points, reading=reading, fired=None, scale=full, strict=strict)
-        else:
-            full = scale or (1.0 if stored else source and source.reflectance_scale) or estimated or 1.0
-            by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
+        of_sensor, options = known.reflectance_scale if known else None, parse(spec)[0]
+        usual = scale_of(options, of_sensor) if options.name != FOLDER or of_sensor else 0.0
+        full = scale or (1.0 if stored else max(usual, estimated)) or 1.0
+        strict = scale is not None or full in FULL_REFLECTANCE
+        as_own = same and fired.columns >= FEWER * target.columns
+        by_points = partial(_read_points, reading=reading, fired=None if as_own else fired, scale=full, strict=strict)
+        if not as_own:
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
-        given = scale or (source and source.reflectance_scale)
-        if given is None and full == estimated and full not in FULL_REFLECTANCE:
-            log.warning("%s: reflectance is divided by %g, its largest; --reflectance-scale names another", spec, full)
+        if scale is None and full == estimated and (full > of_sensor if of_sensor else full not in FULL_REFLECTANCE):
+            log.warning("%s: reflectance is divided by %g, by its values; --reflectance-scale names another", spec, full)
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
 
