@@ -351,6 +351,9 @@ def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_p
     write_sensor(replace(VLP16, name="mine"), tmp_path / "mine.yaml", "")
     asked = tmp_path / "room.pcd", "--to", tmp_path / "mine.yaml", "--size", "32x128"
     assert "16 of the 32 rows of mine are measured" in success(complete(*asked, model=None))
+    said = success(complete(*asked[:1], "--from", tmp_path / "mine.yaml", out=tmp_path / "other"))
+    assert "6 of its 16 beams look past" in said
+    assert "--to FILE (r2flow sensor) --size 64x900 uses them" in said
 
 
 def test_points_in_memory_are_named_in_a_refusal(run):

@@ -180,9 +180,8 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
     lines = [f"{spec}: {beams}; {measured}{turn}"]
     if lost := int((rows < 0).sum()):
         lines.append(f"{spec}: {lost} of its {len(e)} beams look past the view of {target.name} and are not used")
-        if source.name in SENSORS:
-            size = f"{max(64, len(e))}x{SENSORS[source.name].columns}"
-            lines[-1] += f": --to {source.name} --size {size} uses them"
+        to = SENSORS[source.name] if source.name in SENSORS else replace(source, name="FILE (r2flow sensor)")
+        lines[-1] += f": --to {to.name} --size {max(64, len(e))}x{to.columns} uses them"
     return lines
 
 
