@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -178,10 +178,9 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         raise InputError(f"{len(xyz)} returns are too few for an estimate: give scans with at least {FEWEST_RETURNS}.")
     beams = find_beams(scans)
     steps = steps_of_a_turn(scans, beams.of_point)
-    elevations = beams.elevations.round(3).tolist()
-    for row, (above, below) in enumerate(pairwise(elevations)):  # equal after rounding
-        if below >= above:
-            elevations[row + 1] = round(above - 1e-3, 3)
+    elevations = beams.elevations.astype(float).round(3).tolist()
+    for row in range(1, len(elevations)):  # equal after rounding
+        elevations[row] = min(elevations[row], round(elevations[row - 1] - 1e-3, 3))
     near, middle, far = np.quantile(np.linalg.norm(xyz, axis=1), [1e-4, 0.5, 1 - 1e-4])
     check(middle <= FARTHEST_RAY, f"half the returns are {middle:,.0f} or more away: are the points in metres?")
     nearest, ground = nearest_sensor(beams.elevations)[0], _height(xyz)

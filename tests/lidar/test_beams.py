@@ -350,6 +350,13 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
         assert other_sensor([scan], SENSORS[name]).hopeless
 
 
+def test_rings_of_one_elevation_have_a_row_each():
+    points = scan(SENSORS["vlp16"].resized(columns=192), RINGS)
+    thrice = [Points(points.xyz, None, np.where(points.ring == 7, 16 + k, points.ring)) for k in range(3)]
+    assert len(found := estimate_sensor(thrice).sensor.elevations) == 18
+    np.testing.assert_allclose(found[6:11], [3, 1, 0.999, 0.998, -1], atol=1e-4)
+
+
 def test_the_beams_of_shuffled_scans_are_there(shared: Path):
     for pattern, (count, _) in REAL.items():
         for points in real(shared, pattern, most=count):
