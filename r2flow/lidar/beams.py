@@ -21,6 +21,7 @@ BIN = 0.005  # degrees
 FAINT = 0.02  # share of the median peak's height below which a peak is not a beam
 SAME = 0.02  # degrees: neighbouring lasers that are nearer are two returns of one
 STABLE = 1.5  # range of bandwidths, as a factor, over which the number of peaks must be constant
+RINGLESS = 0.95  # variance within rings over that of all, above which rings are no beams; 15 degrees of tilt have 0.81
 SCATTERED = 0.3  # median gap between elevations over their mean gap, above which a scan has no beams: `_is_scattered`
 CROWDED = 20  # minimum mean number of points per sector for a comparison of gaps
 COLUMNS = 64  # image widths are multiples of it, so that every backbone can halve them
@@ -51,6 +52,11 @@ class Beams:
     of_point: list[np.ndarray]  # row of each point of each scan; -1 for a ray without return
     order: str = UNORDERED  # storage order of the scans: `RINGS`, `FIRINGS`, ...
     firing: tuple[int, ...] | None = None  # row of laser 0, 1, ...; None if lasers are numbered by elevation
+
+    def off(self, elevations: Sequence[np.ndarray]) -> np.ndarray:
+        """Distance of each return from its beam in degrees, (N,), from the elevations of the points of each scan."""
+        pairs = zip(elevations, self.of_point, strict=True)
+        return np.concatenate([np.abs(e - self.elevations[row])[row >= 0] for e, row in pairs])
 
 
 class Estimate(NamedTuple):
@@ -195,9 +201,8 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         beams.firing,
         full_reflectance(scans),
     )
-    off = np.concatenate([np.abs(elevations_of(s.xyz) - beams.elevations[row])[row >= 0]
-                          for s, row in zip(scans, beams.of_point, strict=True)])  # fmt: skip
-    return Estimate(sensor, beams, steps, float(np.median(off)), ground is not None)
+    off = float(np.median(beams.off([elevations_of(scan.xyz) for scan in scans])))
+    return Estimate(sensor, beams, steps, off, ground is not None)
 
 
 def _height(xyz: np.ndarray) -> float | None:
@@ -261,7 +266,9 @@ def _beams(scans: Sequence[Points]) -> Beams:
     """`find_beams` for all rows of the files, with lost rays at the origin."""
     elevations = [elevations_of(scan.xyz) for scan in scans]
     if all(scan.ring is not None for scan in scans):
-        return _by_laser(elevations, [np.asarray(scan.ring, dtype=np.int64) for scan in scans], RINGS)
+        by_ring = _by_laser(elevations, [np.asarray(scan.ring, dtype=np.int64) for scan in scans], RINGS)
+        if np.mean(by_ring.off(elevations) ** 2) < RINGLESS * np.nanvar(np.concatenate(elevations)):
+            return by_ring
     if count := _lasers_of_firings(elevations):
         middle = median_of_seen(np.concatenate([e.reshape(-1, count) for e in elevations]))
         twice = count % 2 == 0 and np.nanmax(np.abs(middle[::2] - middle[1::2])) < SAME
@@ -279,7 +286,7 @@ def _beams(scans: Sequence[Points]) -> Beams:
         )
     if peaks is None:
         raise InputError(
-            "the beams cannot be told apart: the files have no ring numbers, the points are in no known order, and "
+            "the beams cannot be told apart: ring numbers do not tell them, the points are in no known order, and "
             "their elevations form no peaks. Are they scans of one sensor, in its own frame? If so, use a built-in one."
         )
     return peaks

@@ -348,6 +348,8 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
         warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["hdl64e"], within_limits=True), tmp_path)
     for name in SENSORS:
         assert other_sensor([scan], SENSORS[name]).hopeless
+    with pytest.raises(InputError, match="lie on no beams"):  # the number of one of its lasers is no ring
+        find_beams([Points(scan.xyz, ring=np.arange(len(scan.xyz)) % 6)])
 
 
 def test_rings_of_one_elevation_have_a_row_each():
