@@ -25,8 +25,6 @@ from r2flow.errors import InputError, check
 
 log = logging.getLogger(__name__)
 
-MOST_OFF = 0.4  # degrees between points and their beams; real scans have 0.25 at most
-
 
 @app.command(epilog="Example: r2flow simulate --num 1000 --sensor os1_64 --seed 1 --out scans --labels")
 def simulate(
@@ -109,8 +107,8 @@ def sensor(
 
     Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py (sensor=mine).
     """
-    from r2flow.data.sources import spread
-    from r2flow.lidar.beams import estimate_sensor, is_tilted, nearest_sensor
+    from r2flow.data.sources import spread, warn_of_frame
+    from r2flow.lidar.beams import estimate_sensor, nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
     from r2flow.lidar.sensor_files import ENDINGS, write_sensor
     from r2flow.lidar.sensors import SENSORS
@@ -141,8 +139,7 @@ def sensor(
         ("reflectance", "none: encoding.reflectance=false" if scale is None else f"reflectance_scale={scale:g}"),
     ]
     print_table(rows, ("", ""))
-    if off > MOST_OFF or is_tilted(points):
-        log.warning("the beams are not clear: are the points in one sensor's frame, not the vehicle's?")
+    warn_of_frame(paths[0], points)
     if out is not None:
         write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
         print(out)

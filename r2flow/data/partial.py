@@ -17,7 +17,7 @@ import numpy as np
 from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, scale_of
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
-from r2flow.data.sources import LOOKED_AT, spread, warn_of_tilt
+from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.errors import InputError, naming
 from r2flow.lidar.beams import FULL_REFLECTANCE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
@@ -119,7 +119,7 @@ def _files(
             fired = sensor_of(scans, known)
         except InputError as error:
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
-        if not stored and not warn_of_tilt(points[0], scans) and source and doubt and not doubt.finer:
+        if not stored and not warn_of_frame(points[0], scans) and source and doubt and not doubt.finer:
             fits = f"; they fit --from {doubt.name}" if doubt.name else ""
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         estimated = full_reflectance(scans) or 0.0
@@ -133,7 +133,9 @@ def _files(
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
         if scale is None and full == estimated and (full > of_sensor if of_sensor else full not in FULL_REFLECTANCE):
-            log.warning("%s: reflectance is divided by %g, by its values; --reflectance-scale names another", spec, full)
+            log.warning(
+                "%s: reflectance is divided by %g, by its values; --reflectance-scale names another", spec, full
+            )
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
 

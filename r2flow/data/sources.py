@@ -21,7 +21,7 @@ from torch import Tensor
 
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.errors import InputError, warn_odd
-from r2flow.lidar.beams import Doubt, is_tilted, other_sensor
+from r2flow.lidar.beams import Doubt, is_unclear, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST
@@ -106,7 +106,7 @@ def made_here(root: str | Path) -> bool:
 
 
 def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> Doubt | None:
-    """The mismatch of a few scan files and a sensor (`other_sensor`); warns instead of one due to a tilt.
+    """The mismatch of a few scan files and a sensor (`other_sensor`); warns instead of one due to their frame.
 
     Files that r2flow wrote store their sensor; other range images have no beams. Unreadable files are reported when
     they are read as scans.
@@ -125,14 +125,14 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path)
     mismatch = other_sensor(scans, reading.sensor) if scans else None
     if not scans or (mismatch and mismatch.hopeless):
         return mismatch
-    return None if warn_of_tilt(paths[0], scans) and not (mismatch and mismatch.sure) else mismatch
+    return None if warn_of_frame(paths[0], scans) and not (mismatch and mismatch.sure) else mismatch
 
 
-def warn_of_tilt(path: str | Path, scans: Sequence[Points]) -> bool:
-    """Warn, once per folder, of scans that are not in their sensor's own frame; whether they are not."""
-    if tilted := is_tilted(scans):
-        warn_odd(Path(path), "its beams are clearer if it is tilted: are the points in the sensor's own frame?")
-    return tilted
+def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
+    """Warn, once per folder, of scans that are not in one sensor's own frame; whether they are not."""
+    if unclear := is_unclear(scans):
+        warn_odd(Path(path), "its beams are not clear: are the points in one sensor's own frame, not the vehicle's?")
+    return unclear
 
 
 def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:

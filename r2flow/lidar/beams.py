@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -29,6 +30,7 @@ FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full 
 IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
 OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
 MOST_VOID = 0.1  # share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16
+MOST_OFF = 0.35  # degrees, by the median, between points and beams; real scans have 0.26 at most, two in one 0.39
 BEATEN = 0.5  # degrees: beyond it, a sensor does not match if another sensor is twice as near
 TILTS = np.arange(-10, 10.5, 0.5)  # degrees
 LEVEL = 1.0  # degrees: a smaller tilt is not another frame; KITTI's odometry scans have half a degree
@@ -86,8 +88,9 @@ class Doubt(NamedTuple):
 def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     """The mismatch of some scans and a sensor; None if they match, or if there are too few returns.
 
-    The beams of the scans are compared with the sensor's. Without beams, or if a custom sensor has fewer rows than the
-    scans have beams (which may be intended), the share of returns in the sensor's view decides.
+    The beams of the scans are compared with the sensor's. Without beams, the share of returns in the sensor's view and
+    their distance from its beams decide; if a custom sensor has fewer rows than the scans have beams (which may be
+    intended), the share does.
     """
     elevation = np.concatenate([elevations_of(scan.xyz) for scan in scans])
     elevation = elevation[np.isfinite(elevation)]
@@ -103,7 +106,10 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     share = float(((elevation <= edges[0]) & (elevation >= edges[-1])).mean())
     seen = f"{share:.0%} of the returns lie in its view"
     if beams is None:
-        return None if share >= IN_VIEW else Doubt(seen, None)
+        whole = SENSORS[sensor.name] if sensor.name in SENSORS else sensor  # noqa: SIM401
+        own = np.asarray(whole.elevations)
+        off = float(np.median(np.abs(elevation - own[np.searchsorted(-(own[:-1] + own[1:]) / 2, -elevation)])))
+        return None if share >= IN_VIEW and off < MOST_OFF else Doubt(f"{seen}, {off:.1f} degrees off its beams", None)
     name, near = nearest_sensor(beams)
     distance, every = 0.0, 1
     if sensor.name in SENSORS or len(beams) <= len(sensor.elevations):
@@ -144,6 +150,14 @@ def is_tilted(scans: Sequence[Points]) -> bool:
         count = np.bincount(((elevation - tilt @ ahead) / 0.05).astype(np.int64))
         clear[tilt] = float((np.convolve(count, np.ones(5)) ** 2).sum())
     return max(clear.values()) > CLEARER * max(clear[tilt] for tilt in clear if max(map(abs, tilt)) <= LEVEL)
+
+
+def is_unclear(scans: Sequence[Points]) -> bool:
+    """Whether points lie far from their beams, as of two sensors in one file, or `is_tilted`."""
+    with suppress(InputError):
+        if np.median(find_beams(scans).off([elevations_of(scan.xyz) for scan in scans])) > MOST_OFF:
+            return True
+    return is_tilted(scans)
 
 
 def nearest_sensor(elevations: np.ndarray) -> tuple[str | None, float]:

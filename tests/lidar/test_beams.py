@@ -264,6 +264,16 @@ def pitched(points: Points, degrees: float) -> Points:
     return Points((points.xyz @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T).astype(np.float32), None, points.ring)
 
 
+@pytest.mark.parametrize("ringed", [True, False])
+def test_two_sensors_in_one_file_are_warned_of(tmp_path: Path, caplog, ringed: bool):
+    one, other = (scan(SENSORS["vlp16"].resized(columns=192), RINGS, seed) for seed in range(2))
+    xyz = [one.xyz + np.float32([1, 0, 0]), other.xyz * np.float32([-1, -1, 1]) + np.float32([-2, 0, 0.3])]
+    rings = np.concatenate([one.ring, other.ring]) if ringed else None
+    write_points(tmp_path / "0.ply", np.concatenate(xyz), ring=rings)
+    warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["vlp16"]), tmp_path)
+    assert ("are the points in one sensor's own frame" if ringed else "degrees off its beams") in caplog.text
+
+
 @pytest.mark.parametrize("name", SENSORS)
 def test_points_in_the_frame_of_a_pitched_vehicle_are_told(name: str):
     level = scan(SENSORS[name].resized(columns=384), UNORDERED)
@@ -355,7 +365,8 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
 def test_rings_of_one_elevation_have_a_row_each():
     points = scan(SENSORS["vlp16"].resized(columns=192), RINGS)
     thrice = [Points(points.xyz, None, np.where(points.ring == 7, 16 + k, points.ring)) for k in range(3)]
-    assert len(found := estimate_sensor(thrice).sensor.elevations) == 18
+    found = estimate_sensor(thrice).sensor.elevations
+    assert len(found) == 18
     np.testing.assert_allclose(found[6:11], [3, 1, 0.999, 0.998, -1], atol=1e-4)
 
 
