@@ -97,6 +97,7 @@ def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, end
         assert known.sum() > 100
         both = {*map(tuple, given.xyz)} & {*map(tuple, answered.xyz)}
         assert both == {*map(tuple, given.xyz[known])}  # to the bit, and nothing hidden
+        assert both == {*map(tuple, answered.xyz[: known.sum()])}  # before the new points
     assert (tmp_path / "out" / "one.png").stat().st_size > 10_000
     assert "what is known" in (tmp_path / "out" / "one.html").read_text()
 

@@ -194,18 +194,17 @@ def _write(
         deviation, returned = completed.spread.numpy()
         with atomic_write(out / f"{scan.name}.spread.npz") as file:
             np.savez_compressed(file, deviation=deviation, returned=returned)
-    measured = None if given.xyz is None else given.xyz * (given.state == Ray.RETURN)
+    known, rays = given.state == Ray.RETURN, checkpoint.sensor.rays()
     for path, image in zip(files, completed.images.numpy(), strict=True):
         if scan.image:
             save_array(path, image)
         else:
-            xyz, reflectance = image_to_points(image, checkpoint.sensor.rays(), measured)
-            if given.points is not None:  # in the order of the file, before the new points
-                own, strength = given.points.xyz, given.points.reflectance
-                if strength is None:
-                    strength = reflectance[cKDTree(xyz).query(own)[1]]
-                new, estimated = image_to_points(image * (given.state != Ray.RETURN), checkpoint.sensor.rays())
-                xyz, reflectance = np.concatenate([own, new]), np.concatenate([strength, estimated])
+            own, strength = image_to_points(image * known, rays, given.xyz)  # before the new points
+            new, estimated = image_to_points(image * ~known, rays)
+            if given.points is not None:  # in the order of the file
+                pixels, own, stored = own, given.points.xyz, given.points.reflectance
+                strength = strength[cKDTree(pixels).query(own)[1]] if stored is None else stored
+            xyz, reflectance = np.concatenate([own, new]), np.concatenate([strength, estimated])
             write_points(path, xyz, reflectance if len(image) > 1 else None)
 
 
