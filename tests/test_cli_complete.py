@@ -417,7 +417,9 @@ def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
 
 def test_points_outside_the_limits_and_sectors_never_scanned_are_told(complete, tmp_path: Path):
     xyz, asked = sparse_scan(tmp_path / "whole.ply"), ("--to", "vlp16", "--size", "32x360")
-    assert "invented" not in success(complete(tmp_path / "whole.ply", *asked))
+    assert "no ray is known" not in success(complete(tmp_path / "whole.ply", *asked))
+    hidden = complete(tmp_path / "whole.ply", *asked, "--mask", "sector:-30,30", out=tmp_path / "hidden")
+    assert "up to 60 degrees of a scan, and this model fills no whole sectors: --checkpoint street" in success(hidden)
     write_points(tmp_path / "front.ply", xyz[np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 3])
     assert re.search("no ray .* up to (239|240) degrees", success(complete(tmp_path / "front.ply", *asked)))
     xyz[:300] /= 100  # 0.1 m away

@@ -85,7 +85,7 @@ def write_completed(
             used += 0 if scan.image else int((given.state == Ray.RETURN).sum())
             if given.points is not None:
                 kept, outside = kept + len(given.points.xyz), outside + given.points.dropped
-            blind = max(blind, 360 * (whole.state == Ray.UNKNOWN).mean() * share_in_sectors(whole.state))
+            blind = max(blind, 360 * (given.state == Ray.UNKNOWN).mean() * share_in_sectors(given.state))
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (completed,) = complete(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,
@@ -102,7 +102,8 @@ def write_completed(
                 print(f"{scan.name}: everything is known, so nothing was completed; see --fill-gaps and --mask")
             bar.set(len(done) * job.num)
     if blind and isinstance(checkpoint.generator, TransferFlow):
-        print(f"no ray returned from up to {blind:.0f} degrees of a scan; what the answers hold there is invented")
+        print(f"no ray is known in up to {blind:.0f} degrees of a scan, and this model fills no whole sectors: "
+              f"--checkpoint {DEFAULT} does, without --to and --size")  # fmt: skip
     if used:
         sensor = checkpoint.sensor
         size = "x".join(map(str, sensor.shape))
