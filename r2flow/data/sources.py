@@ -219,8 +219,10 @@ class ScanFiles(ScanSource):
         return hashlib.sha256(json.dumps([stats, hashes]).encode()).hexdigest()
 
     def places(self) -> set[str]:
-        real = os.path.realpath(self.root)  # once for all files: slow on network disks
-        return {os.path.join(real, name) for name in self.names}
+        parts = [os.path.split(path) for path in self.paths]
+        real = {folder: os.path.realpath(folder) for folder in {folder for folder, _ in parts}}  # slow on network disks
+        files = (os.path.join(real[folder], name) for folder, name in parts)
+        return {os.path.realpath(file) if os.path.islink(file) else file for file in files}
 
     def __len__(self) -> int:
         return len(self.paths)

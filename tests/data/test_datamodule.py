@@ -164,6 +164,13 @@ def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_pat
     assert caplog.text == ""
     module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(numbered)}})
     assert "data.validation.data holds 12 scans that are trained on" in caplog.text
+    (tmp_path / "other" / "file.bin").symlink_to(numbered / "000002.bin")
+    (tmp_path / "other" / "folder").symlink_to(numbered)
+    module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(tmp_path / "other")}})
+    assert f"trained on, as {numbered / '000000.bin'}" in caplog.messages[-1]
+    (tmp_path / "other" / "folder").unlink()
+    module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(tmp_path / "other")}})
+    assert "holds 1 scans that are trained on" in caplog.messages[-1]
 
 
 def test_validation_is_never_augmented(numbered: Path):
