@@ -184,8 +184,9 @@ def folder(root: Path) -> list[Drive]:
             if any(drive.scans for drive in drives):
                 if len(places) < len(below):
                     warn_odd(min(made), "left out, since r2flow wrote it, as are other such folders below the scans")
-                others = [place for place in places if endings is FIRM_ENDINGS and not (place / MANIFEST).is_file()]
-                left = Counter(scan_ending(name) for place in others for name in _files(place, LOOSE_ENDINGS))
+                mixed = [place for place, drive in zip(places, drives, strict=True) if drive.scans]
+                mixed = [place for place in mixed if endings is FIRM_ENDINGS and not (place / MANIFEST).is_file()]
+                left = Counter(scan_ending(name) for place in mixed for name in _files(place, LOOSE_ENDINGS))
                 if left:
                     counts = ", ".join(f"{count} {ending}" for ending, count in left.items())
                     warn_odd(root, f"{counts} files left out: scan files of other formats are next to them")
