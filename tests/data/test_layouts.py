@@ -112,9 +112,11 @@ def test_notes_beside_scans_are_no_scans(tmp_path: Path, caplog):
     assert find_drives("folder", tmp_path)[0].scans == tuple(
         str(tmp_path / name) for name in ("notes.txt", "poses.csv", "statistics.npz")
     )
-    assert not caplog.text
     write_scan(tmp_path / "scans" / "0.bin", 1)
     assert [d.scans for d in find_drives("folder", tmp_path) if d.scans] == [(str(tmp_path / "scans" / "0.bin"),)]
+    assert not caplog.text  # they lie above the scans
+    write_scan(tmp_path / "0.bin", 1)
+    find_drives("folder", tmp_path)
     assert f"{tmp_path}: 1 .txt, 1 .csv, 1 .npz files left out" in caplog.text
 
 
