@@ -212,15 +212,6 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):
     assert (np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 4).all()
 
 
-def test_named_grids_are_sampled_on(r2flow, run, tmp_path):
-    images = {}
-    for grid in ("uniform", "power:2"):
-        out = tmp_path / grid.replace(":", "-")
-        assert r2flow("sample", run, "--num", 1, "--steps", 3, "--grid", grid, "-o", out)[0] == 0
-        images[grid] = np.load(out / "000000.npy").tobytes()
-    assert len(set(images.values())) == 2
-
-
 @pytest.mark.parametrize("method", ["jump", "chord"])
 def test_a_map_is_not_inverted_by_its_jumps(method):
     street = load_checkpoint("street")

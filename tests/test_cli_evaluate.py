@@ -6,7 +6,9 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,12 +21,13 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
 from r2flow.model.checkpoint import Checkpoint, save_checkpoint
 from r2flow.reports.paper import read_results
 from r2flow.samplers import build_sampler
 from tests.conftest import CONFIG, folder, images
+from tests.metrics.conftest import Summary
 from tests.test_evaluation import SENSOR
 
 QUICK = ("--metrics", "jsd,mmd", "--size", "8x64", "--workers", 0)
@@ -179,35 +182,20 @@ class MeanRange(SumMetric):
         return {"mine": abs(means[0] - means[1])}
 
 
-class MeanRanges(Extractor):
-    """A feature network of a user's, without weights: the mean range of each row."""
-
-    name = "means"
-    layer = "rows"
-    dim = 8
-    weights = "none"
-
-    @classmethod
-    def trained(cls):
-        return cls()
-
-    def features(self, scans):
-        return scans.images[:, 0].mean(2)
-
-
 @pytest.fixture
 def plugged_in(monkeypatch):
     for table in (METRICS, EXTRACTORS):
         monkeypatch.setattr(table, "_entries", dict(table._entries))
     METRICS.add("mine", MeanRange)
-    EXTRACTORS.add("means", MeanRanges)
+    EXTRACTORS.add("means", SimpleNamespace(trained=partial(Summary, "means")))
 
 
 def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, plugged_in):
     options = ("--metrics", "mine,frechet_means,kid_means", *QUICK[2:], "--bootstrap", 5, "--json", tmp_path / "e.json")
     said = r2flow.said("evaluate", real, generated, *options)
     ranges = [scans[:, 0][(scans[:, 0] > 0) & (scans[:, 0] < 63)].mean() for scans in (images(12, 1), images(10, 2))]
-    rows = [scans[:, 0].astype(np.float64).mean(2) for scans in (images(12, 1), images(10, 2))]
+    both = (Scans(torch.from_numpy(scans), SENSOR) for scans in (images(12, 1), images(10, 2)))
+    rows = [Summary().features(scans).double().numpy() for scans in both]
     (a, s), (b, t) = ((x.mean(0), np.cov(x.T)) for x in rows)
     frechet = ((a - b) ** 2).sum() + np.trace(s + t) - 2 * np.sqrt(np.linalg.eigvals(s @ t).clip(0)).real.sum()
     found = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"]

@@ -131,12 +131,6 @@ def test_without_states_a_ray_without_a_return_is_not_measured():
     assert torch.equal(network().complete(images), network().complete(images, state))
 
 
-def test_a_flow_that_was_not_trained_to_complete_takes_more_evaluations():
-    images = scans()
-    for found in complete(network("rectified_flow"), images, halved(images), num=2):
-        assert found.evaluations.tolist() == [30, 30]  # three in each of ten steps
-
-
 def test_spread_is_over_the_answers_with_a_return():
     images = torch.tensor([[3.0, 5.0, 0.0], [5.0, 0.0, 0.0], [7.0, 0.0, 0.0]]).view(3, 1, 1, 3)
     deviation, share = Completed(images, 0, torch.zeros(3), torch.ones(3) > 0, 0.0).spread

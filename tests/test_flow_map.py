@@ -12,7 +12,6 @@ from r2flow.data.pairs import PairDataset, PairSource, PairStore, make_pairs
 from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES
-from r2flow.flow.path import interpolate
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import FlowMap, RectifiedFlow, build_generator
 from r2flow.noise import Draws, standard_normal
@@ -196,14 +195,6 @@ def batch_of(**further) -> dict[str, torch.Tensor]:
     draws = torch.Generator().manual_seed(0)
     x_0, x_1 = torch.randn(2, 4, 2, 8, 32, generator=draws).unbind(0)
     return {"x_0": x_0, "x_1": x_1, "u": torch.rand(4, generator=draws), "k": torch.arange(4), **further}
-
-
-def test_on_pairs_alone_the_path_is_the_straight_line_between_them():
-    batch = batch_of()
-    t = torch.tensor([0.0, 0.25, 0.5, 1.0])
-    x_t, v = interpolate(batch["x_0"], batch["x_1"], t)
-    torch.testing.assert_close(paths_of(batch).at(t), x_t)
-    torch.testing.assert_close(paths_of(batch).velocity(t), v)
 
 
 def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_path: Path):

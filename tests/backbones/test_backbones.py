@@ -176,12 +176,6 @@ def test_a_rolled_ring_gives_a_rolled_velocity_without_position(name):
         assert not model.learns_directions
 
 
-def test_a_turned_image_gives_a_turned_answer():
-    options = {"detail": [2, 8], "position": "none", "window": [3, 5], "depths": [1, 1]}
-    model, x = tiny("hdit", **options).double(), image().double()
-    assert torch.allclose(model(0.4, x.roll(16, -1)), model(0.4, x).roll(16, -1), atol=1e-5)  # rays are float32
-
-
 @pytest.mark.parametrize("turns", [1, 2, 16])
 def test_a_narrow_ring_computes_what_a_ring_of_many_turns_does(turns):
     model, x = tiny("local").double(), image()[..., :4].double()

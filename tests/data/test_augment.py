@@ -31,12 +31,6 @@ def test_half_of_the_scans_are_mirrored():
     assert 70 < mirrored < 130  # 200 fair coins: 100 +- 7
 
 
-def test_a_mirrored_image_is_the_image_of_the_mirrored_scan():
-    xyz, reflectance = image_to_points(IMAGE, SENSOR.rays())
-    mirrored = project(xyz * np.float32([1, -1, 1]), reflectance, SENSOR)
-    np.testing.assert_allclose(mirrored, IMAGE[..., ::-1], rtol=1e-5)
-
-
 def test_a_rolled_image_is_the_image_of_the_turned_scan():
     xyz, reflectance = image_to_points(IMAGE, SENSOR.rays())
     roll = Augmentation(roll=True)

@@ -14,7 +14,7 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
-from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, GAN, loaded
+from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, loaded
 
 M, S = 0.1, 0.2  # x_1 ~ N(M, S^2) in every pixel
 
@@ -53,16 +53,6 @@ def test_ddpm_draws_from_the_data(gaussian_ddpm):
     assert x.mean().item() == pytest.approx(M, abs=0.01)  # of 16,384 draws: 6 standard errors
     assert x.std().item() == pytest.approx(S, rel=0.05)
     assert torch.corrcoef(torch.stack([x.flatten(), x_0.flatten()]))[0, 1].abs() < 0.1  # the start is forgotten
-
-
-def test_scan_i_is_a_function_of_noise_of_the_generator_s_own_shape():
-    with loaded(GAN):
-        gan = GENERATORS["toy_gan"](space(), {}, latent=5)
-        drawn = next(sample(gan, 2, seed=3, batch_size=2))
-    expected = gan.space.decode(gan.network(Draws(3, [0, 1]).start((5,))))
-    torch.testing.assert_close(drawn.images, expected.detach())
-    assert not drawn.images.requires_grad
-    assert drawn.evaluations.tolist() == [1, 1]
 
 
 def test_known_rays_are_given_back_and_the_others_depend_on_them(completion: Path):

@@ -14,7 +14,6 @@ from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkp
 from r2flow.model.export import tableau
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
-from r2flow.training import compose
 from tests.extension.conftest import (
     BACKBONE,
     COMPLETION,
@@ -153,13 +152,6 @@ def test_a_family_is_made_of_public_names(file: Path):
             names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
         private = [name for name in names if name.startswith("_") and name != "__init__"]
         assert not private
-
-
-def test_a_notebook_composes_what_plugins_add():
-    with loaded(GAN, BACKBONE):
-        config = compose(["stage=toy_gan", "backbone=toy_backbone", "stage.width=8", "backbone.base_channels=4"])
-    assert (config["stage"]["name"], config["stage"]["width"]) == ("toy_gan", 8)
-    assert (config["backbone"]["name"], config["backbone"]["base_channels"]) == ("toy_backbone", 4)
 
 
 SHRUNKEN = Family("sampler", "toy_sampler", ("sampler={name: shrunken, steps: 3, share: 0.25}",))

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, consistency, jump
+from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, consistency
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Straight
 
@@ -102,17 +102,6 @@ def test_jumps_fall_on_the_grid_that_they_are_drawn_with():
 def test_jump_times_that_cannot_be_are_refused(options):
     with pytest.raises(InputError, match="found"):
         JumpTimes(**options)
-
-
-@pytest.mark.parametrize("problem", [Gaussian(), Straight(), Gaussian(std=2.0)])
-def test_the_map_of_a_flow_has_no_residual(problem):
-    u = exact_map(problem)
-    torch.testing.assert_close(jump(u, T, X_0, S), problem.solution(starts(problem, T, X_0), S))
-    middle = (T + S) / 2
-    for begin, end in ((T, S), (S, T)):  # one jump is two half jumps
-        halves = jump(u, middle, jump(u, begin, X_0, middle), end)
-        assert float((jump(u, begin, X_0, end) - halves).abs().max()) < 1e-13
-    torch.testing.assert_close(jump(u, S, jump(u, T, X_0, S), T), X_0)  # there and back
 
 
 @pytest.mark.parametrize("name", list(OBJECTIVES))

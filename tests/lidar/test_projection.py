@@ -44,13 +44,6 @@ def test_points_to_image_to_points(sensor, projection):
     np.testing.assert_array_equal(project(xyz, reflectance, sensor.name, projection), again)
 
 
-def test_unproject_agrees_with_trigonometry():
-    rays = torch.tensor([[[0.0, math.pi / 6]], [[math.pi / 2, 0.0]]])
-    xyz = unproject(torch.full((1, 1, 1, 2), 2.0), rays)[0]
-    torch.testing.assert_close(xyz[:, 0, 0], torch.tensor([0.0, 2.0, 0.0]), rtol=0, atol=1e-6)
-    torch.testing.assert_close(xyz[:, 0, 1], torch.tensor([math.sqrt(3), 0.0, 1.0]), rtol=0, atol=1e-6)
-
-
 def test_azimuth_starts_behind_on_the_left_and_falls():
     points = np.array([point(10, -1, a) for a in (179.9, 90, 0, -90, -179.9)])
     image = project(points, np.arange(1, 6) / 10, HDL64E)
@@ -99,17 +92,6 @@ def test_points_out_of_view_are_dropped_not_clamped():
     assert project(points, np.ones(2), HDL64E)[0].max() == 0
     clamped = project(points, np.ones(2), HDL64E, convention="reference")
     assert clamped[0, [0, 63], 512] == pytest.approx([10, 10], rel=1e-6)
-
-
-def test_uneven_beams_get_the_row_of_the_nearest_edge_pair():
-    sensor = Sensor("uneven", (10.0, 4.0, 1.0, 0.0, -3.0, -20.0), columns=8)
-    image = random_image(sensor, filled=1.0)
-    xyz, reflectance = image_to_points(image, sensor.rays())
-    np.testing.assert_allclose(project(xyz, reflectance, sensor)[0], image[0], rtol=1e-6)
-    edges = sensor.row_edges
-    just_inside = np.array([point(10, edges[3] - 0.01, 1), point(20, edges[3] + 0.01, -1)])
-    rows = np.argwhere(project(just_inside, np.ones(2), sensor)[0] > 0)[:, 0]
-    assert sorted(rows) == [2, 3]
 
 
 def reference_rows_and_columns(points):

@@ -46,14 +46,6 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
         assert given(MMDUnbiased(), *sets)["mmd_unbiased"] == pytest.approx(unbiased, rel=1e-9)
 
 
-def test_disjoint_sets_have_the_largest_distance(scans_of):
-    near, far = scans_of(3, scale=0.0), scans_of(3)
-    far.images[:, 0] = torch.where(far.returned[:, 0], 45.0, 0.0)
-    near.images[:, 0] = torch.where(near.returned[:, 0], 4.0, 0.0)
-    assert measured(JSD(), near, far).compute()["jsd"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
-    assert measured(JSDLiDM(), near, far).compute()["jsd_lidm"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
-
-
 def cells(points, size, depth=(1.0, 56.0)):
     """Cells that hold a return, by another way: a set of pairs."""
     r = np.linalg.norm(points, axis=1)

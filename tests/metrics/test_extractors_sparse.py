@@ -1,4 +1,3 @@
-import pytest
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -31,35 +30,6 @@ def dense_kernel(kernel: torch.Tensor, size: int) -> torch.Tensor:
 def at(dense: torch.Tensor, coords: torch.Tensor) -> torch.Tensor:
     b, x, y, z = coords.T
     return dense[b, :, x, y, z]
-
-
-@pytest.mark.parametrize("size", [1, 3, 5])
-def test_stride_1_is_a_dense_convolution_at_the_voxels(size):
-    coords, mask = occupied(7, 0.3)
-    x = torch.randn(len(coords), 3).double()
-    convolution = SparseConv3d(3, 4, size).double()
-    y = convolution(Sparse(x, VoxelGrid(coords)))
-    weight = dense_kernel(convolution.kernel.view(size**3, 3, 4), size)
-    expected = F.conv3d(to_dense(x, coords, mask.shape), weight, padding=size // 2)
-    torch.testing.assert_close(y.features, at(expected, coords), rtol=0, atol=1e-12)
-
-
-def test_a_stride_and_its_undoing_are_dense_ones():
-    coords, mask = occupied(6, 0.1)
-    x = torch.randn(len(coords), 3).double()
-    down = SparseConv3d(3, 4, 2, 2).double()
-    up = SparseConv3d(4, 5, 2, 2, transposed=True).double()
-    below = down(Sparse(x, VoxelGrid(coords)))
-    dense = F.conv3d(to_dense(x, coords, mask.shape), dense_kernel(down.kernel, 2), stride=2)
-    torch.testing.assert_close(below.features, at(dense, below.grid.coords), rtol=0, atol=1e-12)
-    assert len(below.grid) == F.max_pool3d(mask, 2).sum()  # each larger voxel with one in it, and no other
-
-    above = up(below)
-    # conv_transpose3d has its weights as (C_in, C_out, ...). Every voxel of the larger ones would be filled; the
-    # stored ones alone are.
-    expected = F.conv_transpose3d(dense, dense_kernel(up.kernel, 2).transpose(0, 1), stride=2)
-    assert above.grid.coords is coords
-    torch.testing.assert_close(above.features, at(expected, coords), rtol=0, atol=1e-12)
 
 
 def test_the_order_of_the_weights_is_torchsparse_s():

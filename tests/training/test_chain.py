@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.config import override
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
 from r2flow.models import find_model
@@ -286,12 +285,3 @@ def test_a_link_that_lost_its_last_checkpoint_is_not_finished(chained: tuple[Pat
 def test_a_link_in_a_file_names_no_plugins(key: str):
     with pytest.raises(InputError, match="chain.rf1.plugins: .*--plugin"):
         links_of({"rf1": {key: ["theirs.py"]}}, "runs/x", [])
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(3, "k=3"), (1e-3, "k=0.001"), (None, "k=null"), (True, "k=true"), ("word", "k=word"), ([1, 2], "k=[1,2]"),
-     ("a b's", "k='a b\\'s'")],
-)  # fmt: skip
-def test_values_are_written_as_hydra_reads_them(value, text: str):
-    assert override("k", value) == text
