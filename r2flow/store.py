@@ -117,7 +117,10 @@ class Store:
         write_file(path, save(dict(tensors), metadata={"r2flow": json.dumps(note)}))
 
     def read(self, item: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Read tensors and notes of an item and verify its checksum: raises `FileNotFoundError` or `Damaged`."""
+        """Read tensors and notes of an item and verify its checksum.
+
+        Raises `FileNotFoundError`, `Damaged`, or `InputError` if the item has another recipe.
+        """
         with self._opened(item) as (file, note):
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  not a mapping
             if note["sha256"] != _digest(tensors, note["notes"]):

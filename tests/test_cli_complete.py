@@ -308,6 +308,13 @@ def test_reflectance_beyond_the_sensor_s_scale_is_neither_clipped_nor_silent(com
     assert (code, error.count("divided by 65535")) == (0, 1)
     answer = read_points(tmp_path / "out" / "room.pcd").reflectance
     np.testing.assert_allclose(answer[: len(xyz)], counts / 65535, atol=1e-6)
+    counts = np.minimum(counts, 200)
+    counts[0] = 210  # a single value beyond the named scale
+    write_points(tmp_path / "room.pcd", xyz, counts)
+    write_sensor(replace(VLP16, name="mine", reflectance_scale=200.0), tmp_path / "mine.yaml", "")
+    assert "divided by" not in complete(tmp_path / "room.pcd", *given, model=None, out=tmp_path / "named")[2]
+    answer = read_points(tmp_path / "named" / "room.pcd").reflectance
+    np.testing.assert_allclose(answer[1 : len(xyz)], counts[1:] / 200, atol=1e-6)
 
 
 def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):

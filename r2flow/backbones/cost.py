@@ -46,23 +46,26 @@ def count_macs(model: Backbone) -> int:
     """Multiply-accumulates of an evaluation for one image, by the rule above, counted on the meta device."""
     on_meta = {name: tensor.detach().to("meta") for name, tensor in (*model.named_parameters(), *model.named_buffers())}
     x = torch.empty(1, model.in_channels, *model.coords.shape[2:], device="meta")
-    stating = {
-        path: module for path, module in model.named_modules(prefix=type(model).__name__) if hasattr(module, "macs")
-    }
+    calls: list[list[int]] = []  # of the modules that are being called: operations before, and those of inner calls
     stated: list[int] = []
-    handles = [
-        module.register_forward_hook(lambda module, *call: stated.append(int(module.macs(*call))))
-        for module in stating.values()
-    ]
+
+    def enter(module: nn.Module, inputs: Any) -> None:
+        calls.append([counter.get_total_flops(), 0])
+
+    def leave(module: nn.Module, inputs: Any, output: Any) -> None:
+        before, inner = calls.pop()
+        operations = counter.get_total_flops() - before
+        if calls:
+            calls[-1][1] += operations
+        if hasattr(module, "macs"):
+            stated.append(int(module.macs(inputs, output)) - (operations - inner) // 2)  # type: ignore[operator]
+
+    handles = [module.register_forward_pre_hook(enter) for module in model.modules()]
+    handles += [module.register_forward_hook(leave) for module in model.modules()]
     try:
         with torch.inference_mode(), FlopCounterMode(display=False, custom_mapping=OPERATIONS) as counter:
-            torch.func.functional_call(model, on_meta, (torch.empty(1, device="meta"), x))
+            torch.func.functional_call(model, on_meta, (torch.empty(1, device="meta"), x), tie_weights=False)
     finally:
         for handle in handles:
             handle.remove()
-    counts = {path: sum(own.values()) for path, own in counter.get_flop_counts().items()}
-    replaced = sum(
-        counts.get(path, 0) - sum(counts.get(f"{path}.{child}", 0) for child, _ in module.named_children())
-        for path, module in stating.items()
-    )
-    return (counts.get("Global", 0) - replaced) // 2 + sum(stated)
+    return counter.get_total_flops() // 2 + sum(stated)

@@ -139,7 +139,7 @@ def mapping_network(channels: int, linear: type[nn.Linear] = ExactLinear, dropou
 
 
 def wrapped(x: Tensor, left: int, right: int) -> Tensor:
-    """Pad an image, (B, C, H, W), circularly by `left` and `right` columns, more than a full turn if they are.
+    """Pad an image, (B, C, H, W), circularly by `left` and `right` columns, also by more than a turn.
 
     F.pad(mode="circular") pads by one turn at most, and its backward takes at least five times as long.
     """

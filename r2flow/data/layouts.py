@@ -4,7 +4,6 @@ import logging
 import os
 import re
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -186,10 +185,9 @@ def folder(root: Path) -> list[Drive]:
                     warn_odd(min(made), "left out, since r2flow wrote it, as are other such folders below the scans")
                 mixed = [place for place, drive in zip(places, drives, strict=True) if drive.scans]
                 mixed = [place for place in mixed if endings is FIRM_ENDINGS and not (place / MANIFEST).is_file()]
-                left = Counter(scan_ending(name) for place in mixed for name in _files(place, LOOSE_ENDINGS))
+                left = sum(len(_files(place, (".csv",))) for place in mixed)
                 if left:
-                    counts = ", ".join(f"{count} {ending}" for ending, count in left.items())
-                    warn_odd(root, f"{counts} files left out: scan files of other formats are next to them")
+                    warn_odd(root, f"{left} .csv files left out: scan files of other formats are next to them")
                 return drives
     return []
 

@@ -1,7 +1,7 @@
 """Reflow pairs (x_0, x_1): noise and the sample that a flow maps it to."""
 
 import copy
-import os
+import random
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -133,8 +133,8 @@ def make_pairs(
     rank, ranks = place()  # of a run, whose processes verify a part each
     store.mend(store.shards[rank::ranks])
     missing = store.missing(store.shards)
-    apart = os.getpid() % max(len(missing), 1)  # processes start apart, also where locks do not reach other machines
-    store.make([*missing[apart:], *missing[:apart]], make_shard, wait=wait)
+    random.Random().shuffle(missing)  # processes rarely meet, also where locks do not reach other machines
+    store.make(missing, make_shard, wait=wait)
     return made
 
 

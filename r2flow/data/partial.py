@@ -122,10 +122,10 @@ def _files(
         if not stored and not warn_of_frame(points[0], scans) and source and doubt and not doubt.finer:
             fits = f"; they fit --from {doubt.name}" if doubt.name else ""
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
-        estimated = full_reflectance(scans) or 0.0
         of_sensor, options = known.reflectance_scale if known else None, parse(spec)[0]
         usual = scale_of(options, of_sensor) if options.name != FOLDER or of_sensor else 0.0
-        full = scale or (1.0 if stored else max(usual, estimated)) or 1.0
+        estimated = full_reflectance(scans, usual) or usual
+        full = scale or (1.0 if stored else estimated) or 1.0
         strict = scale is not None or full in FULL_REFLECTANCE
         as_own = same and fired.columns >= FEWER * target.columns
         by_points = partial(_read_points, reading=reading, fired=None if as_own else fired, scale=full, strict=strict)

@@ -114,7 +114,7 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path)
     if made_here(root):
         stored, ours = map(Reading.stored, sorted(set(map(os.path.dirname, paths)))), reading.sensor
         theirs = next((r.sensor for r in stored if r and not r.sensor.resized(*ours.shape).same_image(ours)), None)
-        if theirs is None:
+        if theirs is None or (theirs.name == ours.name in SENSORS and theirs.shape[0] >= ours.shape[0]):
             return None
         seen, known = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}", theirs.name in SENSORS
         return Doubt(seen, theirs.name if known else None, sure=known)

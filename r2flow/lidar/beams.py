@@ -30,7 +30,7 @@ FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full 
 IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
 OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
 MOST_VOID = 0.1  # share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16
-MOST_OFF = 0.35  # degrees, by the median, between points and beams; real scans have 0.26 at most, two in one 0.39
+MOST_OFF = 0.37  # degrees, by the median, between points and beams; real scans have 0.35 at most, two in one 0.39
 BEATEN = 0.5  # degrees: beyond it, a sensor does not match if another sensor is twice as near
 TILTS = np.arange(-10, 10.5, 0.5)  # degrees
 LEVEL = 1.0  # degrees: a smaller tilt is not another frame; KITTI's odometry scans have half a degree
@@ -255,17 +255,22 @@ def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> floa
     return 360 / step
 
 
-def full_reflectance(scans: Sequence[Points]) -> float | None:
-    """Estimate the value of full reflectance; None if a file has no reflectance, or only one value."""
+def full_reflectance(scans: Sequence[Points], usual: float | None = None) -> float | None:
+    """Estimate the value of full reflectance; None if a file has no reflectance, or only one value.
+
+    It is `usual`, if given, unless more than 1 % of the values exceed it.
+    """
     if any(scan.reflectance is None for scan in scans):
         return None
     values = np.concatenate([scan.reflectance for scan in scans])
     highest = float(values.max())
     if highest <= max(0.0, float(values.min())):
         return None
-    usual = next((full for full in FULL_REFLECTANCE if highest <= full * (1 + 1e-3)), math.inf)
-    if highest >= 0.1 * usual:  # else the values would fill less than a tenth of the scale
+    if usual and np.mean(values > usual) <= 0.01:
         return usual
+    common = next((full for full in FULL_REFLECTANCE if highest <= full * (1 + 1e-3)), math.inf)
+    if highest >= 0.1 * common:  # else the values would fill less than a tenth of the scale
+        return common
     return float(f"{highest:.1g}") if float(f"{highest:.1g}") >= highest else float(f"{highest * 1.05:.2g}")
 
 

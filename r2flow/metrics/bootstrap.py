@@ -33,8 +33,8 @@ def bootstrap(
 
     Weights act on the stored rows of all processes (`keep=True`), without copies or further network evaluations. Of the
     `draws` weighted sets, two are made per draw r of signs, which depends only on the seed and r; `advance` is called
-    with the number of finished ones. A value that cannot be resampled (`ScanMetric.resamples`, `resampled`, `fewest`)
-    has no interval.
+    with the number of finished ones. The result has (low, high) by name. A value that cannot be resampled
+    (`ScanMetric.resamples`, `resampled`, `fewest`) has no interval.
     """
     if not metric.resamples:
         return {}

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import re
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
@@ -125,7 +126,11 @@ def group_runs(runs: Sequence[ComparedRun]) -> Groups:
     named: dict[str, list[ComparedRun]] = {}
     for label, settings, group in labelled:  # equal labels are told apart by the settings that differ
         shared = set.intersection(*(set(others) for other, others, _ in labelled if other == label))
-        named[", ".join([label, *(one for one in settings if one not in shared)])] = group
+        differing = [one for one in settings if one not in shared]
+        if any(one.startswith("parent=") for one in differing):  # others have no parent, or one of another stage
+            differing = [one for one in differing if not one.startswith("parent.")]
+        name = ", ".join([label, *differing])
+        named[name if name not in named else f"{name} ({len(named)})"] = group
     return named
 
 
@@ -143,6 +148,7 @@ def configuration(config: Mapping[str, Any]) -> str:
     ]
     if parent := config.get("parent"):
         before = read_config(Path(parent["path"]).parent.parent)
+        keys.append(f"parent={parent.get('stage')}")
         keys += [f"parent.{line}" for line in (configuration(before) if before else parent["weights"]).split("\n")]
     return "\n".join(keys)
 
@@ -167,7 +173,8 @@ def rows_of(groups: Groups) -> list[dict[str, Any]]:
         for column in MEASURED:
             values = [run.values[column] for run in runs if run.values[column] is not None]
             row[column] = fmean(values) if values else None
-            row[f"{column}_spread"] = stdev(values) if len(values) > 1 else None
+            several = len(values) > 1 and all(map(math.isfinite, values))
+            row[f"{column}_spread"] = stdev(values) if several else None
         rows.append(row)
     return rows
 

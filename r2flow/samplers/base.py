@@ -159,7 +159,8 @@ class OnGrid(Sampler):
             object.__setattr__(self, "grid", tuple(float(t) for t in self.grid))
             if len(self.grid) != self.steps + 1:
                 raise InputError(f"the time grid has {len(self.grid) - 1} steps, found steps={self.steps}.")
-            check(not getattr(self, "finish", 0), "a grid of times has its own last step: give finish=0.")
+            finish = getattr(self, "finish", 0) and self.steps > 1
+            check(not finish, "a grid of times has its own last step: give finish=0.")
         self.times()
 
     def times(self, t_0: float = 0.0, t_1: float = 1.0, fewer: int = 0) -> Tensor:

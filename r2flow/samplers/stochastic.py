@@ -47,7 +47,7 @@ def sde_step(t: float, s: float, c: float, t_b: float | None = None) -> Step:
 
     with l = log o from l_t to l_s = l_t + h. The integral of a constant is 1 - e^(-ah), that of (t' - t) is, by parts,
     s - t - int_t^s (o' / o_s)^a dt'. A step from t = 0 adds no fresh noise; a step to s = 1 ends at x_1hat (Euler). c
-    is the churn; the first step has no t_b.
+    is the churn, t_b the time of the previous step; the first step has none.
     """
     if s >= 1:
         return Step(0.0, 1.0, 0.0, 0.0)

@@ -63,15 +63,17 @@ def test_a_backbone_that_states_nothing_is_the_sum_of_its_layers():
 def test_a_module_says_its_own_multiplications():
     class Twice(nn.Module):
         def forward(self, x):
-            return 2 * x
+            return x @ (2 * torch.eye(16, device=x.device))  # is not counted
 
         def macs(self, inputs, output):
             return output.numel()
 
     model = Plain(torch.zeros(2, 8, 16))
     before = count_macs(model)
-    model.last = nn.Sequential(model.last, Twice())
-    assert count_macs(model) - before == 2 * 8 * 16
+    twice = Twice()  # in two places, one of which passes over its parent
+    model.last = nn.Sequential(model.last, nn.Sequential(twice), twice)
+    assert count_macs(model) - before == 2 * 2 * 8 * 16
+    assert not any(parameter.is_meta for parameter in model.parameters())
 
 
 def test_a_transposed_convolution_by_hand():

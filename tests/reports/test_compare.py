@@ -132,6 +132,8 @@ def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
     assert cell(rows[0], "val_last") == "0.5 ± 0.361"
     assert cell(rows[1], "val_last") == "0.1"
     assert rows[0]["n"] == 3
+    make_run(tmp_path / "net-seed=3", {"seed": 3}, val=[math.inf], checkpoint=40)
+    assert cell(rows_of(group_runs(read_runs([tmp_path])))[0], "val_last") == "inf"
 
 
 def test_two_sweeps_of_one_label_are_told_apart_by_what_was_swept(tmp_path):
@@ -141,6 +143,10 @@ def test_two_sweeps_of_one_label_are_told_apart_by_what_was_swept(tmp_path):
     assert {label: [run.config["stage"]["loss"] for run in runs] for label, runs in groups.items()} == {
         f"rectify, hdit, stage.loss={loss}": [loss, loss] for loss in ("absolute", "mse")
     }
+    parent = {"path": str(make_run(tmp_path / "a") / "checkpoints" / "step-00000040.ckpt"), "stage": "rectify"}
+    given = [{"seed": seed, **more} for more in ({"parent": parent}, {}) for seed in (1, 2)]
+    runs = [make_run(tmp_path / f"seed={one['seed']}_init={n}", one) for n, one in enumerate(given)]
+    assert list(group_runs(read_runs(runs))) == ["rectify, hdit, parent=rectify", "rectify, hdit"]
 
 
 def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_another(tmp_path):

@@ -9,10 +9,10 @@ NEAR, FAR = 4.0, 56.0  # metres: evenly spaced edges of distance sectors, except
 
 
 def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Occupied voxels of 5 cm, and the first point of each, of one scan's points in metres, (N, 3), off the origin.
+    """Occupied voxels of 5 cm, and the first point of each, of one scan's points in metres, (N, 3) float32.
 
     Coordinates are round(p / 0.05) minus their minimum, (M, 3) int64, in the order of points. Features, (M, 4), are x,
-    y, z and -1, which replaces reflectance: the networks were trained without.
+    y, z and -1, which replaces reflectance: the networks were trained without. Points at the origin are ignored.
     """
     points = points[points.norm(dim=1) > 0]
     if not len(points):

@@ -69,7 +69,7 @@ def kept(name: str) -> str | None:
 def add(name: str, path: Path) -> str:
     """Copy weights from a file, or an archive or folder of several files, into the folder of weights.
 
-    The returned `weights_hash` is that of the parameters, independent of the file format.
+    Returns the first 12 digits of the SHA-256 of the parameters, independent of the file format.
     """
     SOURCES[name]
     tensors, config = read_published(path)

@@ -47,10 +47,10 @@ def forward_step(z: Tensor, log_snr: Tensor, next_log_snr: Tensor, noise: Tensor
 def walk(
     denoise: Denoise, z: Tensor, log_snrs: Tensor, eta: float, noise: Noise | None, times: Tensor | None = None
 ) -> Iterator[Tensor]:
-    """Yield the states from noise z, (B, ...), to data, after each step of N + 1 rising log-SNRs with `eta` of `step`.
+    """Yield the states from noise z, (B, ...), to data, after each of N steps between rising log-SNRs, (N + 1,).
 
-    `noise` is called with 1, 2, ..., also in the last step; None if eta = 0. `times` are those of `denoise`, (N,);
-    None: the log-SNRs.
+    `eta`: see `step`. `noise` is called with 1, 2, ..., also in the last step; None if eta = 0. `times` are those of
+    `denoise`, (N,); None: the log-SNRs.
     """
     times = log_snrs if times is None else times
     for j, (t, (start, end)) in enumerate(zip(times, pairwise(log_snrs), strict=False), start=1):
@@ -68,7 +68,7 @@ def repaint(
     repeats: int = 1,
     jump: int = 1,
 ) -> Iterator[Tensor]:
-    """Complete partially known images by RePaint: the known part is noised to each level, the rest sampled.
+    """Complete images, (B, ...), by RePaint: the part `known`, a mask, is noised to each level, the rest sampled.
 
     Each step denoises in `jump` parts with resampled known pixels, then returns by forward steps and denoises again,
     `repeats` times in total, to harmonise both parts (Lugmayr et al. 2022, algorithm 1, with resampling inside each

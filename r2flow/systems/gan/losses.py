@@ -22,7 +22,10 @@ def discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
 
 
 def r1(scores: Tensor, x: Tensor) -> Tensor:
-    """mean over images x of |dD/dx|^2, from scores D(x) (Mescheder et al. 2018, eq. 9, without its gamma / 2)."""
+    """mean over images x of |dD/dx|^2, from scores D(x) (Mescheder et al. 2018, eq. 9, without its gamma / 2).
+
+    x, (B, C, H, W), must require a gradient, and the scores have their graph.
+    """
     (gradient,) = torch.autograd.grad(scores.sum(), x, create_graph=True)
     return gradient.square().flatten(1).sum(1).mean()
 
