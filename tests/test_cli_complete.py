@@ -287,7 +287,7 @@ def test_an_unusual_scale_that_is_estimated_is_told(complete, tmp_path):
     xyz = sparse_scan(tmp_path / "one.ply")
     write_points(tmp_path / "one.ply", xyz, np.linspace(0, 0.01, len(xyz), dtype=np.float32))
     asked = tmp_path / "one.ply", "--from", "vlp16"
-    assert "reflectance is divided by 0.01, by its values" in complete(*asked)[2]
+    assert "reflectance is divided by 0.01; --reflectance-scale" in complete(*asked)[2]
     assert complete(*asked, "--reflectance-scale", "0.01", out=tmp_path / "b")[2] == ""
     # So is that of a scan of the model's sensor: unscaled values would stand next to answers in [0, 1].
     full_scan(tmp_path / "two.bin")

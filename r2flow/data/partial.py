@@ -132,10 +132,8 @@ def _files(
         if not as_own:
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
-        if scale is None and full == estimated and (full > of_sensor if of_sensor else full not in FULL_REFLECTANCE):
-            log.warning(
-                "%s: reflectance is divided by %g, by its values; --reflectance-scale names another", spec, full
-            )
+        if not (scale or stored) and full != usual and (of_sensor or full not in FULL_REFLECTANCE):
+            log.warning("%s: reflectance is divided by %g; --reflectance-scale names another value", spec, full)
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
 

@@ -112,9 +112,11 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path)
     they are read as scans.
     """
     if made_here(root):
-        stored, ours = map(Reading.stored, sorted(set(map(os.path.dirname, paths)))), reading.sensor
-        theirs = next((r.sensor for r in stored if r and not r.sensor.resized(*ours.shape).same_image(ours)), None)
-        if theirs is None or (theirs.name == ours.name in SENSORS and theirs.shape[0] >= ours.shape[0]):
+        readings, ours = map(Reading.stored, sorted(set(map(os.path.dirname, paths)))), reading.sensor
+        stored = [stored.sensor for stored in readings if stored]
+        others = [s for s in stored if s.name != ours.name or ours.name not in SENSORS or s.shape[0] < ours.shape[0]]
+        theirs = next((s for s in others if not s.resized(*ours.shape).same_image(ours)), None)
+        if theirs is None:
             return None
         seen, known = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}", theirs.name in SENSORS
         return Doubt(seen, theirs.name if known else None, sure=known)

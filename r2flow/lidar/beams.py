@@ -305,7 +305,7 @@ def _beams(scans: Sequence[Points]) -> Beams:
         )
     if peaks is None:
         raise InputError(
-            "the beams cannot be told apart: ring numbers do not tell them, the points are in no known order, and "
+            "the beams cannot be told apart: no ring numbers of beams, no known order of the points, and "
             "their elevations form no peaks. Are they scans of one sensor, in its own frame? If so, use a built-in one."
         )
     return peaks

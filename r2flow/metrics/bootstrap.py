@@ -28,8 +28,8 @@ def bootstrap(
 
     so that sigma^2 = Var l - Var q estimates its variance, L + Q (Efron and Stein 1981). Efron's bootstrap, which
     repeats scans, has variance L + 3 Q: for nearly equal sets, where L vanishes, its intervals are 1.7 times too wide.
-    The weights change little, because repeated or missing scans also bias the distance. t is Student's quantile. If t
-    sigma > d, the interval is d +- t sigma, for positive d cut off at 0.
+    The weights change little, because repeated or missing scans also bias the distance. t is Student's quantile. The
+    interval is d +- t sigma if t sigma > d, for positive d cut off at 0.
 
     Weights act on the stored rows of all processes (`keep=True`), without copies or further network evaluations. Of the
     `draws` weighted sets, two are made per draw r of signs, which depends only on the seed and r; `advance` is called

@@ -70,7 +70,7 @@ def test_a_module_says_its_own_multiplications():
 
     model = Plain(torch.zeros(2, 8, 16))
     before = count_macs(model)
-    twice = Twice()  # in two places, one of which passes over its parent
+    twice = Twice()  # in two places
     model.last = nn.Sequential(model.last, nn.Sequential(twice), twice)
     assert count_macs(model) - before == 2 * 2 * 8 * 16
     assert not any(parameter.is_meta for parameter in model.parameters())

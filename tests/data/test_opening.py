@@ -137,15 +137,17 @@ class TestWhatR2FlowWrote:
         np.testing.assert_allclose(scan.numpy(), image, atol=1e-5)
         assert not caplog.text
 
-    @pytest.mark.parametrize("below", [".", "drive"])
-    def test_another_sensor_than_their_own_is_warned_of(self, tmp_path: Path, caplog, below: str):
-        folder = SimulatedFolder(tmp_path / below, SENSORS["os1_64"].resized(32, 64), 3, ("bin",))
-        folder.begin()
-        folder.simulate(5)
-        for name in ("os1_64", "hdl64e"):
-            assert not caplog.text
-            open_scans(tmp_path, Reading(SENSORS[name].resized(16, 64)))  # fewer rows are no other sensor
-        assert "manifest.json names os1_64 32x64; they fit 'os1_64'" in caplog.text
+    def test_another_sensor_than_their_own_is_warned_of(self, tmp_path: Path, caplog):
+        for name in ("pandar64", "vlp16"):
+            folder = SimulatedFolder(tmp_path / name, SENSORS[name].resized(32, 64), 3, ("bin",))
+            folder.begin()
+            folder.simulate(5)
+            open_scans(folder.folder, Reading(SENSORS[name].resized(16, 64)))
+        assert not caplog.text  # fewer rows are of the same sensor
+        for root in (tmp_path / "vlp16", tmp_path):  # the second one also has a folder of the requested sensor
+            caplog.clear()
+            open_scans(root, Reading(SENSORS["pandar64"].resized(16, 64)))
+            assert "manifest.json names vlp16 32x64; they fit 'vlp16'" in caplog.text
 
     def test_a_file_is_read_through_any_sensor(self, tmp_path: Path):
         write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32))  # without reflectance
@@ -275,9 +277,6 @@ def test_scans_that_are_no_files_are_a_kind_of_their_own():
     (batch,) = data.val_dataloader()
     assert batch["x_1"].shape == (1, 1, 8, 32)
     assert data.names == [f"wall at {i} m" for i in range(2, 12)]
-
-
-# The noise of a run
 
 
 @pytest.mark.parametrize("shape", [None, (5,)])

@@ -275,7 +275,7 @@ def test_two_sensors_in_one_file_are_warned_of(tmp_path: Path, caplog, ringed: b
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_points_in_the_frame_of_a_pitched_vehicle_are_told(name: str):
+def test_points_in_the_frame_of_a_pitched_vehicle_are_found(name: str):
     level = scan(SENSORS[name].resized(columns=384), UNORDERED)
     for degrees, tilted in ((0, False), (0.5, False), (2, True), (-5, True)):
         assert is_tilted([pitched(level, degrees)]) == tilted, degrees

@@ -32,8 +32,7 @@ def offsets(size: int) -> list[tuple[int, int, int]]:
 
 
 class VoxelGrid:
-    """Voxels of one size at distinct integer coordinates, (N, 4) int64: scan, x, y, z, and their neighbours in a
-    kernel.
+    """Voxels of one size, at distinct scan, x, y, z, (N, 4) int64, and their neighbours within a kernel.
 
     `finer` is the grid of half the voxel size that `coarser` was called on; None for the finest.
     """

@@ -46,7 +46,8 @@ def hinge_loss(real: Tensor, fake: Tensor) -> Tensor:
 
 def adaptive_weight(reconstruction: Tensor, adversarial: Tensor, last: Tensor, weight: float) -> Tensor:
     """weight |grad R| / (|grad A| + 1e-4), at most 1e4 weight: balances the adversarial loss A with the reconstruction
-    loss R at the decoder's last weights, with gradients averaged over all processes (eq. 7)."""
+    loss R at the decoder's last weights, with gradients averaged over all processes (eq. 7).
+    """
     grad_r, grad_a = (
         averaged(torch.autograd.grad(loss, last, retain_graph=True)[0]).norm() for loss in (reconstruction, adversarial)
     )
