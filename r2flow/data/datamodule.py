@@ -13,7 +13,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow.data.augment import Augmentation
-from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
+from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler
 from r2flow.data.mixture import MixedOrder, Mixture
 from r2flow.data.opening import open_source
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
@@ -185,8 +185,8 @@ class ScanDataModule(L.LightningDataModule):
         accumulated = self.trainer.accumulate_grad_batches
         self.check_run(ranks, accumulated)
         check(self.trainer.max_steps >= 1, "trainer.max_steps must be at least 1: it is the length of a run.")
-        order, batches = self._order(self.training_source), self.trainer.max_steps * accumulated
-        sampler = RunSampler(order, self.batch_size // accumulated, batches, rank, ranks)
+        images = self.trainer.max_steps * self.batch_size
+        sampler = RunSampler(self._order(self.training_source), self.batch_size // accumulated, images, rank, ranks)
         sampler.first_batch = self.trainer.global_step * accumulated
         dataset = self._dataset(self.training_source, "training")
         return RunLoader(dataset, batch_sampler=sampler, **self._loader_options())
@@ -222,7 +222,7 @@ class ScanDataModule(L.LightningDataModule):
         # every rank takes all scans; otherwise the remainder is left out.
         if scans < ranks:
             rank, ranks = 0, 1
-        batches = fixed_batches(scans - scans % ranks, batch_size, rank, ranks)
+        batches = RunSampler(range(scans), batch_size * ranks, scans - scans % ranks, rank, ranks)
         dataset = self._dataset(self.validation_source, "validation")
         return DataLoader(dataset, batch_sampler=batches, **self._loader_options())
 

@@ -95,24 +95,24 @@ class Permutations:
 
 
 class RunSampler(Sampler[list[tuple[int, int]]]):
-    """The batches of one rank over a whole run as lists of (k, scan), starting at batch `first_batch`.
+    """The batches of one rank over a whole run, or a validation, as lists of (k, scan), from `first_batch` on.
 
     Global batch m holds images [m B, (m + 1) B); rank r of R takes images r, r + R, ... of it. The length is that of
     the whole run, even if it starts at a later batch: Lightning adds a resumed run's finished batches to its count.
     """
 
-    def __init__(self, order: Order, batch_size: int, batches: int, rank: int = 0, ranks: int = 1) -> None:
-        self.order, self.batch_size, self.batches = order, batch_size, batches
+    def __init__(self, order: Order, batch_size: int, images: int, rank: int = 0, ranks: int = 1) -> None:
+        self.order, self.batch_size, self.images = order, batch_size, images
         self.rank, self.ranks = rank, ranks
         self.first_batch = 0
 
     def __len__(self) -> int:
-        return self.batches
+        return -(-self.images // self.batch_size)
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        for batch in range(self.first_batch, self.batches):
-            start = batch * self.batch_size
-            yield [(k, self.order[k]) for k in range(start + self.rank, start + self.batch_size, self.ranks)]
+        for start in range(self.first_batch * self.batch_size, self.images, self.batch_size):
+            end = min(start + self.batch_size, self.images)
+            yield [(k, self.order[k]) for k in range(start + self.rank, end, self.ranks)]
 
 
 class RunLoader(DataLoader[Item]):
@@ -125,9 +125,3 @@ class RunLoader(DataLoader[Item]):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         pass
-
-
-def fixed_batches(scans: int, batch_size: int, rank: int = 0, ranks: int = 1) -> list[list[tuple[int, int]]]:
-    """Batches of (scan, scan) for every `ranks`-th scan from `rank` on: every validation has the same items."""
-    keys = [(scan, scan) for scan in range(rank, scans, ranks)]
-    return [keys[i : i + batch_size] for i in range(0, len(keys), batch_size)]

@@ -111,7 +111,7 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "step-00000001.ckpt").touch()
     order = [int(s) for epoch in range(2) for s in noise.generator(0, "shuffle", epoch).permutation(6)]
-    loader = RunLoader(Numbered({order[5]} - set(order[:4])), batch_sampler=RunSampler(Permutations(6, 0), 2, 20))
+    loader = RunLoader(Numbered({order[5]} - set(order[:4])), batch_sampler=RunSampler(Permutations(6, 0), 2, 40))
     with pytest.raises(InputError) as caught:
         fit(Line(), loader, tmp_path, Guard(tmp_path, skips=1), accumulate_grad_batches=2)
     said = str(caught.value)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.loader import FlowDataset, Permutations, RunLoader, RunSampler, fixed_batches
+from r2flow.data.loader import FlowDataset, Permutations, RunLoader, RunSampler
 from r2flow.data.mixture import MixedOrder, Mixture
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
@@ -24,7 +24,7 @@ SCANS = numbers(*range(2, 12), size=SENSOR.shape)
 
 
 def keys(**options) -> list[list[tuple[int, int]]]:
-    return list(RunSampler(Permutations(10, 3), **{"batch_size": 4, "batches": 10, **options}))
+    return list(RunSampler(Permutations(10, 3), **{"batch_size": 4, "images": 40, **options}))
 
 
 def test_every_scan_is_seen_once_an_epoch_in_another_order():
@@ -34,7 +34,7 @@ def test_every_scan_is_seen_once_an_epoch_in_another_order():
 
 
 def test_a_late_start_continues_the_same_order():
-    sampler = RunSampler(Permutations(10, 3), 4, 10)
+    sampler = RunSampler(Permutations(10, 3), 4, 40)
     sampler.first_batch = 7
     assert list(sampler) == keys()[7:]
     assert len(sampler) == 10  # the length of the run, not of what is left
@@ -61,15 +61,16 @@ def test_an_item_depends_on_its_number_alone():
 def test_workers_change_nothing():
     def batches(workers):
         dataset = FlowDataset(SCANS, Encoding(SENSOR), 0, "training")
-        return list(RunLoader(dataset, batch_sampler=RunSampler(Permutations(10, 3), 4, 5), num_workers=workers))
+        return list(RunLoader(dataset, batch_sampler=RunSampler(Permutations(10, 3), 4, 20), num_workers=workers))
 
     for a, b in zip(batches(0), batches(2), strict=True):
         assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_validation_covers_every_scan_once_over_the_ranks():
-    seen = [key for rank in range(3) for batch in fixed_batches(10, 4, rank, 3) for key in batch]
-    assert sorted(seen) == [(i, i) for i in range(10)]
+    parts = [list(RunSampler(range(10), 6, 10, rank, 3)) for rank in range(3)]
+    assert sorted(key for batches in parts for batch in batches for key in batch) == [(i, i) for i in range(10)]
+    assert parts[0] == [[(0, 0), (3, 3)], [(6, 6), (9, 9)]]
 
 
 SIZES, WEIGHTS = [5, 40, 3], [3.0, 1.0, 4.0]
