@@ -3,8 +3,9 @@
 import logging
 import os
 import platform
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
 def read_config(run: str | Path) -> dict[str, Any] | None:
     """The config of a run folder, or None. If the file is missing, the config of the newest checkpoint."""
     path = Path(run, CONFIG)
-    stored = (content.get("config") for _, content in _whole(run))
+    stored = (content.get("config") for _, content in _readable(run))
     config = _read_yaml(path) if path.is_file() else next((kept for kept in stored if isinstance(kept, dict)), None)
     return config or None
 
@@ -85,14 +86,12 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
     if old is None:
         write_config(run, config)
         return None
-    differing, resumable = contradictions(old, config), _resumable(run)
-    newest = next(resumable, None)
-    if differing and newest is not None:
-        raise InputError(_another_config(run, differing))
-    if newest is None:  # not trained yet
-        last = None
-    else:
-        last = _fitting(run, [newest, *resumable] if state else [newest], state)
+    differing, resumable = contradictions(old, config), _readable(run, RESUMED)
+    newest, last = next(resumable, None), None
+    if newest is not None:
+        if differing:
+            raise InputError(_another_config(run, differing))
+        last = _fitting(run, chain([newest], resumable), state)
         samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]
         if samplers and step_of(last) >= config["trainer"]["max_steps"]:
             raise InputError(
@@ -128,34 +127,28 @@ def _another_config(run: str | Path, differing: list[str]) -> str:
 RESUMED = ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step")
 
 
-def _whole(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The readable checkpoints, newest first."""
+def _readable(run: str | Path, needed: Sequence[str] = ()) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The readable checkpoints that have the needed keys, newest first."""
     for path in checkpoints_of(run):
         try:
             content = read_checkpoint(path)
             check(isinstance(content, dict), f"{path} is not a checkpoint of a run.")
-            yield path, content
+            lacking = next((key for key in needed if key not in content), None)
+            check(lacking is None, f"{path} cannot be resumed: it has no {lacking}.")
         except InputError as error:
             log.warning("%s Passing it over.", error)
-
-
-def _resumable(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The checkpoints that a run can resume from: those with more than weights."""
-    for path, content in _whole(run):
-        lacking = [key for key in RESUMED if key not in content]
-        if not lacking:
-            yield path, content
         else:
-            log.warning("%s cannot be resumed: it has no %s. Passing it over.", path, lacking[0])
+            yield path, content
 
 
 def _fitting(run: str | Path, saved: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None) -> Path:
     """The first checkpoint whose weights have the names and shapes of `state`."""
     for path, content in saved:
-        if state is None:
-            return path
-        shapes = {name: getattr(value, "shape", None) for name, value in content["state_dict"].items()}
-        if shapes == {name: value.shape for name, value in state.items()}:
+        if state is None or _shapes(content["state_dict"]) == _shapes(state):
             return path
         log.warning("%s does not have the weights of this run's config. Passing it over.", path)
     raise InputError(f"no checkpoint in {run} has the weights of its config; give name=OTHER for a new run.")
+
+
+def _shapes(state: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: getattr(value, "shape", None) for name, value in state.items()}
