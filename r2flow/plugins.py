@@ -7,6 +7,7 @@ Installed packages in the entry-point group `r2flow.plugins` are imported when a
 checkpoints list their plug-ins for information only: r2flow never imports a module because a file names it.
 """
 
+import argparse
 import importlib
 import importlib.util
 import sys
@@ -26,18 +27,14 @@ _loaded: dict[str, str] = {}  # names and files of loaded modules, and the names
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Split a command line into (other arguments, names of plug-ins), for any number of `--plugin NAME`."""
-    others: list[str] = []
-    names: list[str] = []
-    rest = iter(arguments)
-    for argument in rest:
-        option, equals, value = argument.partition("=")
-        if option != "--plugin":
-            others.append(argument)
-            continue
-        name = value if equals else next(rest, "")
-        check(name, "--plugin needs the name of a module, or a path ending in .py.")
-        names.append(name)
-    return others, names
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--plugin", action="append", default=[])
+    try:
+        given, others = parser.parse_known_args(arguments)
+    except argparse.ArgumentError:
+        given = argparse.Namespace(plugin=[""])
+    check(all(given.plugin), "--plugin needs the name of a module, or a path ending in .py.")
+    return others, given.plugin
 
 
 def load_plugins(names: Sequence[str]) -> None:
