@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from operator import length_hint
-from typing import Self, TypeVar
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
@@ -15,7 +15,7 @@ T = TypeVar("T")
 EVERY = 30  # seconds between lines without a terminal, as in a cluster's log
 
 
-class Bar:
+class Bar(Progress):
     """A progress bar with rate and time left, on standard error.
 
     Args:
@@ -25,40 +25,32 @@ class Bar:
 
     def __init__(self, doing: str, total: int, unit: str = "", shown: bool | None = None, lines: bool = False) -> None:
         drawn = not lines and (sys.stderr is not None and sys.stderr.isatty() if shown is None else shown)
-        self._progress = Progress(
+        super().__init__(
             TextColumn(doing), BarColumn(), MofNCompleteColumn(), TextColumn(unit), _Rate(), TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),
             console=Console(stderr=True), transient=True, disable=not drawn,
         )  # fmt: skip
-        self._task = self._progress.add_task(unit, total=total, note="")
+        self._task = self.add_task(unit, total=total, note="")
         self._doing, self._unit = doing, unit
         self._lines = lines or (shown is None and not drawn)
         self._printed = time.monotonic()
         self._first: tuple[float, float] | None = None  # units done at the first call, above 0 after resuming; its time
 
-    def __enter__(self) -> Self:
-        self._printed = time.monotonic()
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
     def __call__(self, units: float = 1) -> None:
         """Advance by a number of units."""
-        self._progress.advance(self._task, units)
+        self.advance(self._task, units)
         self._print()
 
     def set(self, done: float | None = None, note: str | None = None) -> None:
         """Set the number of finished units, and the note after the bar."""
         if done is not None:
-            self._progress.update(self._task, completed=done)
+            self.update(self._task, completed=done)
             self._print()
         if note is not None:
-            self._progress.update(self._task, note=note)
+            self.update(self._task, note=note)
 
     def _print(self) -> None:
-        now, task = time.monotonic(), self._progress.tasks[0]
+        now, task = time.monotonic(), self.tasks[0]
         before, began = self._first = self._first or (task.completed, now)
         done = task.completed - before
         if self._lines and done > 0 and now - self._printed >= EVERY:
