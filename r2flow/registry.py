@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pkgutil import resolve_name
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 from r2flow.errors import InputError
 
@@ -55,7 +55,7 @@ def lazy(place: str, *given: Any) -> Any:
     return _Lazy(place, given)
 
 
-class Registry(Generic[T]):
+class Registry(Mapping[str, T]):
     """Named values of one kind.
 
     BACKBONES = Registry("backbone", hdit=HDiT, adm_unet=ADMUNet)
@@ -75,8 +75,8 @@ class Registry(Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         if name not in self:
-            names, hint = ", ".join(sorted(self)), did_you_mean(str(name), list(self))
-            raise UnknownName(f"no {self.kind} named {name!r}; known: {names}.{hint}")
+            hint = did_you_mean(str(name), self)
+            raise UnknownName(f"no {self.kind} named {name!r}; known: {', '.join(sorted(self))}.{hint}")
         entry = self._entries[name]
         if isinstance(entry, _Lazy):
             found: Any = resolve_name(entry.place)
@@ -98,11 +98,7 @@ class Registry(Generic[T]):
     def __repr__(self) -> str:
         return f"Registry({self.kind}: {', '.join(self)})"
 
-    def items(self) -> Iterator[tuple[str, T]]:
-        return ((name, self[name]) for name in self._entries)
-
     def add(self, name: str, entry: T) -> None:
-        """Add an entry."""
         if name in self._entries:
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
         self._entries[name] = entry
@@ -110,8 +106,8 @@ class Registry(Generic[T]):
     def build(self, options: Mapping[str, Any], *args: Any) -> Any:
         """Call the entry `options["name"]` with `args` and the remaining options as keywords."""
         if not isinstance(options, Mapping) or not isinstance(options.get("name"), str):
-            names = ", ".join(sorted(self._entries))
-            raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {names}.")
+            known = ", ".join(sorted(self))
+            raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {known}.")
         chosen = dict(options)
         name = chosen.pop("name")
         constructor: Any = self[name]

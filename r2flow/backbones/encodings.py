@@ -131,5 +131,5 @@ PUBLISHED_NAMES = {"learnable_embedding": "learnable", "polar_coordinates": "pol
 def position_name(position: str | None, *special: str) -> str:
     """The name of a position option; accepts the names of published configs, too."""
     name = PUBLISHED_NAMES.get(str(position), str(position).lower())
-    Registry("position", **dict.fromkeys(special), **dict(ENCODINGS.items()))[name]
+    Registry("position", **dict.fromkeys(special), **ENCODINGS)[name]
     return name

@@ -255,7 +255,7 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
 
 def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     """Build the generator of a file's content, on the CPU; see `load_checkpoint`."""
-    published = next((known for _, known in FORMATS.items() if known.holds(content)), None)
+    published = next((known for known in FORMATS.values() if known.holds(content)), None)
     if published is not None:
         converted = published.read(content, path, averaged)
         config, weights, step, kind = converted.config, converted.weights, converted.step, "published"
@@ -266,7 +266,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         drawing = content
     else:
-        systems = ", ".join(known.system for _, known in FORMATS.items())
+        systems = ", ".join(known.system for known in FORMATS.values())
         found = ", ".join(map(repr, list(content)[:6])) if isinstance(content, dict) else type(content).__name__
         raise InputError(
             f"{path} is a torch file but is not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
