@@ -150,7 +150,7 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
     if config.get("preview"):
         raise InputError("preview is of a chain of runs, such as experiment=demo: leave it out, or give preview=null.")
     with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
-        parent, checkpoint = find_parent(config["stage"].get("init")) or (None, None)
+        parent = find_parent(config["stage"].get("init"))
         config = _checked(config, asked, parent)
         config["plugins"] = config.get("plugins") or loaded_plugins()
         encoding = config["encoding"]
@@ -160,8 +160,8 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
             encoding["levels"] = levels
         seed_torch(config["seed"], "weights")
         generator = build_generator(config)
-        if checkpoint is not None:
-            generator.start_from(checkpoint.generator)
+        if parent and parent.checkpoint:
+            generator.start_from(parent.checkpoint.generator)
         return _assembled(config, generator, asked)
 
 
@@ -171,9 +171,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
     The result is completed with values of its parent; `parent` is one that has not been trained yet.
     """
     check_keys(config)
-    if parent is None:
-        parent, _ = find_parent(config["stage"].get("init")) or (None, None)
-    config = _checked(config, asked, parent)
+    config = _checked(config, asked, parent or find_parent(config["stage"].get("init")))
     if config["encoding"].get("reflectance", AUTO) == AUTO:
         config["encoding"]["reflectance"] = True  # decided when the scans are read
     with torch.device("meta"):

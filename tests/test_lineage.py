@@ -28,9 +28,7 @@ def child(parent: Path, reflectance) -> dict:
 
 
 def completed(config: dict, asked: list[str]) -> dict:
-    found = find_parent(config["stage"]["init"])
-    assert found is not None
-    return inherit(config, asked, found[0])
+    return inherit(config, asked, find_parent(config["stage"]["init"]))
 
 
 @pytest.mark.parametrize("asked", [[], ["encoding"], ["encoding.reflectance"]])

@@ -292,12 +292,6 @@ def weights_hash(checkpoint: Checkpoint) -> str:
     return state_hash(state, json.dumps(meaning, sort_keys=True).encode())[:16]
 
 
-def as_parent(config: Mapping[str, Any], path: Path, step: int, weights: str | None) -> dict[str, Any]:
-    """Entry `parent` in a child's config: the checkpoint that it starts from."""
-    stage = (config.get("stage") or {}).get("name", "rectify")
-    return {"path": str(path), "weights": weights, "step": step, "stage": stage}
-
-
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the tensors and the metadata of a `.safetensors`."""
     from safetensors import safe_open

@@ -12,7 +12,7 @@ from r2flow.data.reading import AUTO
 from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.generators import GENERATORS
-from r2flow.model.checkpoint import Checkpoint, as_parent, load_checkpoint, weights_hash
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint, weights_hash
 from r2flow.models import name_of
 from r2flow.registry import check_options, options_of
 from r2flow.stages import STAGES
@@ -26,9 +26,10 @@ class Parent:
     path: Path  # its checkpoint, or its folder if it has none yet
     step: int = 0
     weights: str | None = None  # `weights_hash` of the averaged weights; None if it is not trained yet
+    checkpoint: Checkpoint | None = None
 
 
-def find_parent(init: str | Path | None) -> tuple[Parent, Checkpoint] | None:
+def find_parent(init: str | Path | None) -> Parent | None:
     """The parent that a config's `stage.init` names, if any."""
     if init is None:
         return None
@@ -39,7 +40,7 @@ def find_parent(init: str | Path | None) -> tuple[Parent, Checkpoint] | None:
             f"{init} was trained on unfolded scans, whose rings a new run's sensor does not have; "
             "start from a flow trained on spherical images."
         )
-    return Parent(checkpoint.config, checkpoint.path, checkpoint.step, weights_hash(checkpoint)), checkpoint
+    return Parent(checkpoint.config, checkpoint.path, checkpoint.step, weights_hash(checkpoint), checkpoint)
 
 
 def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
@@ -50,37 +51,31 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     (`data.pairs.of`), with its sensor.
     """
     config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
+    config["generator"], data, reading = generator_of(config, parent), config["data"], None
     if parent is None:
         stage = config["stage"]["name"]
         needs = STAGES[stage].needs_parent or STAGES[stage].needs_pairs
-        if needs or config["data"]["name"] == "pairs":
+        if needs or data["name"] == "pairs":
             what = f"stage={stage} starts from" if needs else "data=pairs are drawn by"
             raise InputError(f"{what} a trained run: give stage.init=RUN.")
-        config["generator"] = generator_of(config, parent)
-        return _with_data(config)
-    keys = [key_of(text) for text in asked]
-    for group in (*groups_of(inherited="always"), *groups_of(inherited="with_pairs")):
-        config[group] = _chosen(group, parent.config.get(group), config.get(group), keys, config, parent)
-    config["generator"] = generator_of(config, parent)
-    config["parent"] = as_parent(parent.config, parent.path, parent.step, parent.weights)
-    data = config["data"]
-    if data["name"] == "pairs":
+    else:
+        keys = [key_of(text) for text in asked]
+        for group in (*groups_of(inherited="always"), *groups_of(inherited="with_pairs")):
+            config[group] = _chosen(group, parent.config.get(group), config.get(group), keys, config, parent)
+        stage = (parent.config.get("stage") or {}).get("name", "rectify")
+        config["parent"] = {"path": str(parent.path), "weights": parent.weights, "step": parent.step, "stage": stage}
+    if parent and data["name"] == "pairs":
         drawer = _drawer(config, parent)
         data["root"] = data["root"] or str(default_folder(drawer.path))
         data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
-        reading = drawer.config.get("data", {}).get("reading") or {}
+        theirs = drawer.config.get("data", {}).get("reading") or {}
         for key, value in (data.get("reading") or {}).items():
-            if value not in (None, reading.get(key)) and f"data.reading.{key}" in keys:
+            if value not in (None, theirs.get(key)) and f"data.reading.{key}" in keys:
                 raise InputError(f"data.reading.{key} is that of the flow that draws the pairs: leave it out.")
-        data["reading"] = reading
-    elif data["name"] != MIXED:
-        return _with_data(config, parent.config.get("data", {}).get("reading"))
-    return _with_data(config)
-
-
-def _with_data(config: Mapping[str, Any], reading: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Resolve `data` in a config; `reading` is the parent's."""
-    return {**config, "data": resolve(config["data"], config["sensor"].get("reflectance_scale"), reading)}
+        data["reading"] = theirs
+    elif parent and data["name"] != MIXED:
+        reading = parent.config.get("data", {}).get("reading")
+    return {**config, "data": resolve(data, config["sensor"].get("reflectance_scale"), reading)}
 
 
 ABSENT = object()
@@ -119,12 +114,12 @@ def _drawer(config: Mapping[str, Any], parent: Parent) -> Parent:
     if drawer is None:
         return parent
     for group in ("sensor", "encoding"):
-        if drawer[0].config.get(group) != config[group]:
+        if drawer.config.get(group) != config[group]:
             raise InputError(
                 f"data.pairs.of={of} has another {group} than {parent.path}, which this run starts from. Leave it out, "
                 f"or start from a flow with the same {group}."
             )
-    return drawer[0]
+    return drawer
 
 
 def inherited(key: str, config: Mapping[str, Any]) -> str:
