@@ -49,6 +49,7 @@ class ScanDataModule(L.LightningDataModule):
         self.batch_size = self.options.batch_size
         self.parts = self.options.sets
         self.sensors = [sensor if part.sensor is None else build_sensor(**part.sensor) for part in self.parts]
+        self.held_out_sensors = self.sensors if self.options.held_out is None else [sensor]
         self.augment = construct("data.augment", Augmentation, self.options.augment)
         self.validation = self.options.validation_options
         self.further: Further | None = None
@@ -133,21 +134,12 @@ class ScanDataModule(L.LightningDataModule):
 
     def fingerprint(self) -> str:
         """Identity of the data, independent of its path: a run resumes only with the same scans and order."""
-        if self.pairs is not None:
-            pairs = f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"
-            return f"{pairs}; {self._named()}" if self.scans is not None else pairs
-        return self._named()
-
-    def _named(self) -> str:
-        """The number of the run's scans that are trained on, and a hash of all names and contents."""
-        known = [*self.names, *(source.contents for source in self.opened)]
-        digest = hashlib.sha256(os.fsencode("\n".join(known))).hexdigest()[:12]
-        return f"{len(self.opened[0])} of {len(self.names)} scans, {digest}"
-
-    @property
-    def held_out_sensors(self) -> list[Sensor]:
-        """Sensor of each part of the validation scans."""
-        return self.sensors if self.options.held_out is None else [self.sensor]
+        texts = [] if self.pairs is None else [f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"]
+        if self.opened:
+            known = [*self.names, *(source.contents for source in self.opened)]
+            digest = hashlib.sha256(os.fsencode("\n".join(known))).hexdigest()[:12]
+            texts.append(f"{len(self.opened[0])} of {len(self.names)} scans, {digest}")
+        return "; ".join(texts)
 
     def _kept(self, source: ScanSource, what: str, sensors: Sequence[Sensor]) -> ScanSource:
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
@@ -165,9 +157,6 @@ class ScanDataModule(L.LightningDataModule):
                 parts[i] = InMemory(images, part.names)
         return _joined(parts)
 
-    def _ranks(self) -> tuple[int, int]:
-        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-
     def check_run(self, ranks: int, accumulated: int) -> None:
         """Refuse a run whose global batch cannot be divided among devices."""
         check(
@@ -180,14 +169,12 @@ class ScanDataModule(L.LightningDataModule):
         """Batches from the trainer's current step to max_steps."""
         self._ready()
         assert self.training_source is not None
-        assert self.trainer is not None
-        rank, ranks = self._ranks()
-        accumulated = self.trainer.accumulate_grad_batches
-        self.check_run(ranks, accumulated)
-        check(self.trainer.max_steps >= 1, "trainer.max_steps must be at least 1: it is the length of a run.")
-        images = self.trainer.max_steps * self.batch_size
+        trainer = self.trainer
+        assert trainer is not None
+        rank, ranks, accumulated = trainer.global_rank, trainer.world_size, trainer.accumulate_grad_batches
+        images = trainer.max_steps * self.batch_size
         sampler = RunSampler(self._order(self.training_source), self.batch_size // accumulated, images, rank, ranks)
-        sampler.first_batch = self.trainer.global_step * accumulated
+        sampler.first_batch = trainer.global_step * accumulated
         dataset = self._dataset(self.training_source, "training")
         return RunLoader(dataset, batch_sampler=sampler, **self._loader_options())
 
@@ -205,7 +192,7 @@ class ScanDataModule(L.LightningDataModule):
             if self.scans is None or purpose != "training":
                 return PairDataset(source, self.seed, purpose)
             scans = FlowDataset(self.scans, self.encoding, self.seed, "beside", None, self.noise_shape)
-            return PairDataset(source, self.seed, purpose, scans, Permutations(len(self.scans), self.seed))
+            return PairDataset(source, self.seed, purpose, scans)
         augment = self.augment if purpose == "training" else None
         sensors = self.sensors if purpose == "training" else self.held_out_sensors
         return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further, sensors)
@@ -216,7 +203,7 @@ class ScanDataModule(L.LightningDataModule):
         assert self.validation_source is not None
         if len(self.validation_source) == 0:
             return []
-        rank, ranks = self._ranks()
+        rank, ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         scans, batch_size = len(self.validation_source), max(self.batch_size // ranks, 1)
         # All ranks need the same number of batches, or they would wait for each other: with fewer scans than ranks,
         # every rank takes all scans; otherwise the remainder is left out.

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from r2flow import noise
-from r2flow.data.loader import Item, Order
+from r2flow.data.loader import FlowDataset, Item, Permutations
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
 from r2flow.generators import Generated, Generator, as_flow
@@ -210,16 +210,9 @@ class PairDataset(Dataset[Item]):
     independent of the scan.
     """
 
-    def __init__(
-        self,
-        source: PairSource,
-        seed: int,
-        purpose: str,
-        scans: Dataset[Item] | None = None,
-        order: Order | None = None,
-    ) -> None:
-        self.source, self.seed, self.purpose = source, seed, purpose
-        self.scans, self.order = scans, order
+    def __init__(self, source: PairSource, seed: int, purpose: str, scans: FlowDataset | None = None) -> None:
+        self.source, self.seed, self.purpose, self.scans = source, seed, purpose, scans
+        self.order = None if scans is None else Permutations(len(scans), seed)
         recipe = source.store.recipe
         self.times = build_sampler(recipe.sampler).knot_times(recipe.knots).float() if recipe.knots else None
 
