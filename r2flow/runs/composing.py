@@ -47,13 +47,11 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
     Raises:
         InputError: an unknown key or choice.
     """
-    overrides = as_hydra_takes(overrides)
-    search = (
-        [f"hydra.searchpath=[{','.join(f'file://{Path(folder).resolve()}' for folder in folders)}]"] if folders else []
-    )
+    search = ",".join(f"file://{Path(folder).resolve()}" for folder in folders)
+    overrides = [*as_hydra_takes(overrides), f"hydra.searchpath=[{search}]"]
     try:
         with _hydra():
-            config = with_choices(partial(hydra.compose, "train", [*overrides, *search], return_hydra_config=True))
+            config = with_choices(partial(hydra.compose, "train", overrides, return_hydra_config=True))
             HydraConfig.instance().set_config(config)
             return plain(config)
     except (HydraException, OmegaConfBaseException) as error:

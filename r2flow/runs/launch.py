@@ -277,24 +277,18 @@ def _preview(model: str, out: Path) -> None:
 
 def _check_links(links: Sequence[Any]) -> None:
     """Compose and build every link before the first one runs, so that errors are reported early."""
-    folders = _config_folders()
-    configs = {}
-    for link in links:
-        try:
-            configs[link.name] = compose(link.overrides, folders)
-        except InputError as error:
-            raise InputError(f"chain.{link.name}: {error}") from None
     from r2flow.model.checkpoint import FOLDER
     from r2flow.runs.lineage import Parent
     from r2flow.training import check
 
+    folders, configs = _config_folders(), dict[str, Any]()
     for link in links:
-        parent = None
-        if link.parent is not None:
-            before = configs[link.parent]
-            steps = before["trainer"]["max_steps"]
-            parent = Parent(before, Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt"), steps)
         try:
-            configs[link.name] = check(configs[link.name], link.overrides, parent)
+            config, parent = compose(link.overrides, folders), None
+            if link.parent is not None:
+                before = configs[link.parent]
+                steps = before["trainer"]["max_steps"]
+                parent = Parent(before, Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt"), steps)
+            configs[link.name] = check(config, link.overrides, parent)
         except InputError as error:
             raise InputError(f"chain.{link.name}: {error} For another link alone: +chain.LINK.KEY=VALUE.") from None

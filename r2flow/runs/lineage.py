@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2flow.config import groups_of, key_of, rule
+from r2flow.config import RULES, key_of, rule
 from r2flow.data.options import MIXED, PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
@@ -60,7 +60,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
             raise InputError(f"{what} a trained run: give stage.init=RUN.")
     else:
         keys = [key_of(text) for text in asked]
-        for group in (*groups_of(inherited="always"), *groups_of(inherited="with_pairs")):
+        for group in [key for key in RULES if "." not in key and rule(key).inherited in ("always", "with_pairs")]:
             config[group] = _chosen(group, parent.config.get(group), config.get(group), keys, config, parent)
         stage = (parent.config.get("stage") or {}).get("name", "rectify")
         config["parent"] = {"path": str(parent.path), "weights": parent.weights, "step": parent.step, "stage": stage}
