@@ -98,11 +98,6 @@ def rule(key: str) -> Key:
     return next((RULES[group] for group in groups if group in RULES), Key())
 
 
-def groups_of(**wanted: str) -> list[str]:
-    """Top-level groups with these values in their rule, such as `inherited="always"`."""
-    return [key for key, r in RULES.items() if "." not in key and all(getattr(r, k) == v for k, v in wanted.items())]
-
-
 def key_of(override: str) -> str:
     """Key of a Hydra override such as `+data.root=x`, without a group's package."""
     return override.lstrip("+~").partition("=")[0].partition("@")[0].replace("/", ".")

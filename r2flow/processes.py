@@ -36,9 +36,8 @@ def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
 
 
 def averaged(x: Tensor) -> Tensor:
-    """Mean over all processes, which share a batch equally; x itself for a single process."""
-    ranks = place()[1]
-    return summed(x) / ranks if ranks > 1 else x
+    """Mean over all processes, which share a batch equally."""
+    return summed(x) / place()[1]
 
 
 @contextmanager

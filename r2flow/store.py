@@ -166,9 +166,6 @@ class Store:
                 path.unlink(missing_ok=True)
             advance(item)
 
-    def _lock(self, item: int) -> Path:
-        return self.folder / f".{self.kind}-{item:06d}.lock"
-
     def make(
         self,
         items: Iterable[int],
@@ -227,7 +224,8 @@ class Store:
         The lock ends with its process. It only saves work, since two processes write the same bytes for an item.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(self._lock(item), timeout=0)
+        path = self.folder / f".{self.kind}-{item:06d}.lock"
+        lock = FileLock(path, timeout=0)
         try:
             lock.acquire()
         except Timeout:
@@ -236,7 +234,7 @@ class Store:
             if not self.has(item):
                 work(item)
         finally:
-            self._lock(item).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
             lock.release()
         return True
 
