@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow import simulator
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.errors import InputError, warn_odd
 from r2flow.lidar.beams import Doubt, is_unclear, other_sensor
@@ -283,21 +284,15 @@ class SimulatedScans(MadeScans):
         return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}
 
     def identity(self) -> dict[str, Any]:
-        from r2flow import simulator
-
         numbers = hashlib.sha256(np.asarray(self.numbers, dtype=np.int64).tobytes()).hexdigest()[:16]
         return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": self.sensor.described()}
 
     @property
     def contents(self) -> str:  # type: ignore[override]
-        from r2flow import simulator
-
         return f"simulator {simulator.REVISION}"  # its revisions draw different scans of the same name
 
     def __getitem__(self, index: int) -> np.ndarray:
-        from r2flow.simulator import simulate
-
-        return simulate(self.sensor, self.seed, self.numbers[index]).image[: 1 + self.reflectance]
+        return simulator.simulate(self.sensor, self.seed, self.numbers[index]).image[: 1 + self.reflectance]
 
 
 class InMemory(ScanSource):
