@@ -34,10 +34,11 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     for name in config["callbacks"]:
         CALLBACKS[name]
     wanted = {name: options for name, options in config["callbacks"].items() if options is not None}
-    averages = [name for name in wanted if name in ("ema", "half_life_ema")]
-    if len(averages) > 1:
-        raise InputError(f"a run keeps one average of its weights, found callbacks.{' and callbacks.'.join(averages)}; "
-                         "leave one out, as callbacks.ema=null.")  # fmt: skip
+    if {"ema", "half_life_ema"} <= wanted.keys():
+        raise InputError(
+            "a run keeps one average of its weights, found callbacks.ema and callbacks.half_life_ema; leave one out, "
+            "as callbacks.ema=null."
+        )
     for name, key in (("checkpoint", "enable_checkpointing"), ("progress", "enable_progress_bar")):
         if not config["trainer"][key]:
             wanted.pop(name, None)
@@ -86,10 +87,7 @@ CALLBACKS = Registry(
     reflow_pairs=Entry(ReflowPairs, lambda config: (drawn_by(config),)),
     ema=Entry(EMA),
     half_life_ema=Entry(HalfLifeEMA, lambda config: (config["data"]["batch_size"],)),
-    pictures=Entry(
-        SamplePictures,
-        lambda config: (Path(config["run_dir"], "pictures"), config["seed"]),
-    ),
+    pictures=Entry(SamplePictures, lambda config: (Path(config["run_dir"], "pictures"), config["seed"])),
     curvature=Entry(Curvature, lambda config: (config["seed"],)),
     guard=Entry(Guard, lambda config: (config["run_dir"],)),
     requeue=Entry(Stopping, lambda config: (config["run_dir"],)),
