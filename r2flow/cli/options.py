@@ -4,7 +4,7 @@ import inspect
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
@@ -47,7 +47,6 @@ ColumnsOption = Annotated[
 
 
 def named_columns(text: str | None) -> tuple[str, ...] | None:
-    """Parse and check `--columns`."""
     from r2flow.lidar.scan_files import check_columns
 
     columns = None if text is None else tuple(name.strip() for name in text.split(","))
@@ -124,10 +123,8 @@ class ReadingOptions:
         """The reading for scans and a model under these options."""
         from r2flow.data.opening import reading_for
 
-        return reading_for(
-            specs, model, self.sensor, rows_and_columns(self.size), self.projection, self.convention,
-            self.reflectance_scale, named_columns(self.columns), estimate_scale,
-        )  # fmt: skip
+        given = asdict(self) | {"size": rows_and_columns(self.size), "columns": named_columns(self.columns)}
+        return reading_for(specs, model, estimate_scale=estimate_scale, **given)
 
 
 @dataclass(frozen=True)
