@@ -58,9 +58,7 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
         raise InputError(explain(error)) from None
 
 
-def names_folder(text: str) -> bool:
-    """Whether a text is the name of a subfolder."""
-    return bool(text.strip("./")) and ".." not in Path(text).parts
+IN_RUNS = Bound("that names a folder in runs", lambda text: text.strip("./") and ".." not in Path(text).parts)
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ class Keys:
     samples: Mapping[str, Any]
     run_dir: Annotated[str, Bound("that names a folder", lambda text: text.strip("/ "))]
     seed: Seed
-    name: Annotated[str, Bound("that names a folder in runs", names_folder)] | int | float = "run"
+    name: Annotated[str, IN_RUNS] | int | float = "run"
     experiment: str | Sequence[str] | None = None
     generator: Mapping[str, Any] | str | None = None
     sampler: Mapping[str, Any] | None = None
@@ -91,7 +89,6 @@ class Keys:
 
 
 def check_keys(config: Mapping[str, Any]) -> None:
-    """Check the top-level keys of a config."""
     check_options("the config", Keys, config)
 
 
@@ -135,36 +132,27 @@ def add_choices(group: str) -> None:
 
 
 def with_choices(compose: Callable[[], T]) -> T:
-    """The result of a composition; if it lacks a choice that a registry has, such as a plug-in's, of a second one."""
-    try:
-        return compose()
-    except MissingConfigException as error:
-        if not _add_choice(error):
-            raise
-        return compose()
-
-
-def _add_choice(error: MissingConfigException) -> bool:
-    """Whether a choice that Hydra did not find is in a registry; adds all registries' choices.
+    """The result of a composition; if it lacks a choice that a registry has, such as a plug-in's, of a second one.
 
     A name that resembles a file's is not looked up if that would import torch. All groups get their choices, since the
     same command may name several.
     """
-    group, _, name = str(error.missing_cfg_file or "").rpartition("/")
-    if group not in REGISTRIES:
-        return False
-    module, table, _ = REGISTRIES[group]
-    if module not in sys.modules and did_you_mean(name, choices(group)):
-        return False
-    if name not in getattr(import_module(module), table):
-        return False
-    for registered in REGISTRIES:
-        add_choices(registered)
-    return True
+    try:
+        return compose()
+    except MissingConfigException as error:
+        group, _, name = str(error.missing_cfg_file or "").rpartition("/")
+        if group not in REGISTRIES:
+            raise
+        module, table, _ = REGISTRIES[group]
+        misspelt = module not in sys.modules and did_you_mean(name, choices(group))
+        if misspelt or name not in getattr(import_module(module), table):
+            raise
+        for registered in REGISTRIES:
+            add_choices(registered)
+        return compose()
 
 
 def choices(group: str) -> list[str]:
-    """Names of a group's configs."""
     files = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
     stored = ConfigStore.instance().repo.get(group, {})
     return sorted(files | {name.removesuffix(".yaml") for name in stored})

@@ -54,12 +54,9 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
 def read_config(run: str | Path) -> dict[str, Any] | None:
     """The config of a run folder, or None. If the file is missing, the config of the newest checkpoint."""
     path = Path(run, CONFIG)
-    stored = (content.get("config") for _, content in _readable(run))
-    config = _read_yaml(path) if path.is_file() else next((kept for kept in stored if isinstance(kept, dict)), None)
-    return config or None
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        stored = (content.get("config") for _, content in _readable(run))
+        return next((config for config in stored if isinstance(config, dict)), None) or None
     try:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
         check_tree(config)
@@ -68,7 +65,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
             f"{path} is damaged ({str(error).splitlines()[0]}); remove it, and r2flow takes the config of the run's "
             "newest checkpoint."
         ) from None
-    return dict(config)
+    return dict(config) or None
 
 
 def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
