@@ -4,7 +4,6 @@ import logging
 import os
 import sys
 import webbrowser
-from collections.abc import Iterator
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -26,13 +25,6 @@ SCANS, SAMPLES = 16, 4  # default numbers per folder and per generator
 MOST = 256  # largest number of each per page
 
 
-def panels_of(spec: str, how: ReadingOptions, most: int, labelled: bool = True) -> "Iterator[Panel]":
-    """At most `most` scans of a set as panels."""
-    from r2flow.reports.view.panels import scan_panels
-
-    return scan_panels(spec, how.reading([spec], estimate_scale=True), most, labelled)
-
-
 @app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
 @grouped
 def show(
@@ -48,11 +40,15 @@ def show(
     """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write range images."""
     from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure
+    from r2flow.reports.view.panels import scan_panels
 
     if out.suffix.lower() in (".png", ".pdf", ".npy"):
         raise InputError(f"--out must be a folder, for a file per scan, found {out}.")
     names: list[str] = []
-    for caption, (image,), rays, classes in (panel for spec in scans for panel in panels_of(spec, how, most, labels)):
+    panels = (
+        panel for spec in scans for panel in scan_panels(spec, how.reading([spec], estimate_scale=True), most, labels)
+    )
+    for caption, (image,), rays, classes in panels:
         file = Path(caption)
         names.append(next(s for n in count(1) if (s := file.stem if n == 1 else f"{file.stem}_{n}") not in names))
         path = out / f"{names[-1]}.{format}"
@@ -99,7 +95,7 @@ def view(
     """
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.reports.view.panels import in_turn, sample_panels, way_panels, write_panels
+    from r2flow.reports.view.panels import in_turn, sample_panels, scan_panels, way_panels, write_panels
 
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out must be a file that ends in .html, found {out}.")
@@ -116,7 +112,7 @@ def view(
     frames: list[str] = []
     for spec in what:
         if spec not in models:
-            new = list(panels_of(spec, how, num or SCANS))
+            new = list(scan_panels(spec, how.reading([spec], estimate_scale=True), num or SCANS))
             if sequence and len(new) > 1:
                 combined, frames = in_turn(new, spec)
                 new = [combined]
