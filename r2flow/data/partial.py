@@ -190,7 +190,10 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
     target, points = reading.sensor, read_points(path, reading.columns)
     if fired is None and reading.projection == "unfolding":
         points = points.with_lost_rays()
-    strength = _strength(path, points, scale, strict)
+    strength = None  # reflectance in [0, 1]; None if the file has none, or only 0
+    if points.reflectance is not None and points.reflectance.any():
+        scaled = scaled_reflectance(path, points, scale) if strict else points.reflectance / np.float32(scale)
+        strength = scaled.clip(0, 1)
     with naming(path):
         if fired is None:
             seen = points_of_same(points, target, reading.projection, reading.convention, strength)
@@ -232,11 +235,3 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
 
 def _seen(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:
     return image_of_same(image, target) if source.same_image(target) else image_through(image, source, target)
-
-
-def _strength(path: Path, points: Points, scale: float, strict: bool) -> np.ndarray | None:
-    """Reflectance in [0, 1]; None if a file has no reflectance, or only 0."""
-    if points.reflectance is None or not points.reflectance.any():
-        return None
-    scaled = scaled_reflectance(path, points, scale) if strict else points.reflectance / np.float32(scale)
-    return scaled.clip(0, 1)
