@@ -61,7 +61,6 @@ ELSEWHERE = (WandbLogger, MLFlowLogger)  # may be viewed without access to the r
 
 
 def build_loggers(names: Sequence[str] | None, run_dir: Path) -> list[Logger]:
-    """Build the loggers of a run."""
     return [LOGGERS[name](run_dir) for name in names or []]
 
 

@@ -90,8 +90,8 @@ def one_line(text: str) -> str:
 
 def printable(text: str) -> str:
     """Escape control characters and bytes that are not UTF-8, as in file names."""
-    safe = (c == "\n" or unicodedata.category(c)[0] != "C" for c in text)
-    return "".join(c if plain else c.encode("unicode_escape").decode() for c, plain in zip(text, safe, strict=True))
+    safe = {c for c in text if c == "\n" or unicodedata.category(c)[0] != "C"}
+    return "".join(c if c in safe else c.encode("unicode_escape").decode() for c in text)
 
 
 class PlainFormatter(logging.Formatter):

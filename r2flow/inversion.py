@@ -131,8 +131,6 @@ def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
 
 
 class Interpolation(NamedTuple):
-    """Interpolated scans."""
-
     ends: Inversion  # inversion of the two given scans
     weights: Tensor  # interpolation weight of each frame, (N,), from 0 to 1
     images: Tensor  # range in metres and reflectance, (N, 2 or 1, H, W); first and last are round trips of the ends

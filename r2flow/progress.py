@@ -37,7 +37,6 @@ class Bar(Progress):
         self._first: tuple[float, float] | None = None  # units done at the first call, above 0 after resuming; its time
 
     def __call__(self, units: float = 1) -> None:
-        """Advance by a number of units."""
         self.advance(self._task, units)
         self._print()
 

@@ -38,8 +38,6 @@ SCENES = 1000  # default number of simulated scans
 
 
 class Simulated(SourceKind):
-    """Scenes of the simulator."""
-
     levels = 100
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:

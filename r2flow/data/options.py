@@ -135,7 +135,6 @@ class DataOptions(SourceOptions):
 
     @property
     def validation_options(self) -> ValidationOptions:
-        """`validation`, checked."""
         return construct("data.validation", ValidationOptions, self.validation)
 
     # The following properties need the `data` of `r2flow.data.resolving.resolve`.

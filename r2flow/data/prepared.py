@@ -105,7 +105,6 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
 
 
 def _make_shard(store: Store, source: ScanSource, skip: bool, shard: int) -> None:
-    """Project and encode the scans of a shard."""
     recipe, numbers, left_out, errors = store.described, shards_of(store.described)[shard], [], [0.0, 0.0]
     coders = dict(zip(CHANNELS, codes_of(recipe), strict=False))
     shape = (len(numbers), *Reading.of(recipe["reading"]).sensor.shape)

@@ -59,7 +59,6 @@ def _whole_reading(options: SourceOptions, usual: Mapping[str, Any], scale: floa
 
 
 def _checked_parts(run: DataOptions) -> list[Data]:
-    """The parts of a mixture, checked."""
     if not run.parts:
         example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")

@@ -315,8 +315,7 @@ class InMemory(ScanSource):
 
 def spread(count: int, most: int) -> list[int]:
     """At most `most` numbers of range(count), evenly spread and in order."""
-    if count <= most:
-        return list(range(count))
+    most = min(most, count)
     return [math.floor((i + 0.5) * count / most) for i in range(most)]
 
 
