@@ -126,7 +126,7 @@ class ScanMetric(Metric):
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         """Values for resampled sets, (R,) per name with intervals; `weights` are the weights of the stored scans,
-        (R, N)."""
+        (R, N), all 1 unless the metric `resamples`."""
         raise NotImplementedError
 
     def update(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> None:

@@ -3,9 +3,10 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, blocks
+from r2flow.metrics.base import SIDES, Side, blocks
 from r2flow.metrics.features import FeatureMetric
 
 BLOCK = 2000  # scans per block: the kernel takes 32 MB
@@ -24,22 +25,18 @@ class KernelDistance(FeatureMetric):
     keeping = True
     resamples = False  # repeated scans would form pairs of equal scans and bias the estimate
 
-    def figures(self) -> tuple[dict[str, float], list[str]]:
-        if any(self.count(side) < 2 for side in SIDES):
-            return {self.name: float("nan")}, [f"{self.name} needs two scans of each set."]
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         x, y = (self.kept(side) for side in SIDES)
-        return {self.name: _mean(x, x) + _mean(y, y) - 2 * _mean(x, y)}, []
+        return {self.name: _mean(x, x) + _mean(y, y) - 2 * _mean(x, y)}
 
 
-def _mean(x: Tensor, y: Tensor) -> float:
-    """Mean of k - 1 over all pairs of two sets; if x is y, without pairs of a scan with itself."""
-    within = x is y
-    total = sum(_sum(a, b, within and i == j) for i, a in blocks(x, BLOCK) for j, b in blocks(y, BLOCK))
-    return total / (len(x) * (len(y) - within))
-
-
-def _sum(x: Tensor, y: Tensor, same: bool) -> float:
-    """Sum of k - 1 over pairs of features (m, D) and (n, D); the 1 cancels in MMD^2 and would cost digits."""
-    z = x @ y.T / x.shape[1]
-    kernel = z * (3 + z * (3 + z))  # (z + 1)^3 - 1
-    return float(kernel.sum() - (kernel.trace() if same else 0))
+def _mean(x: Tensor, y: Tensor) -> Tensor:
+    """Mean of k - 1 over all pairs of two sets, which cancels the 1 in MMD^2; if x is y, without pairs of a scan with
+    itself."""
+    total = x.new_zeros((), dtype=torch.float64)
+    for i, a in blocks(x, BLOCK):
+        for j, b in blocks(y, BLOCK):
+            z = a @ b.T / x.shape[1]
+            kernel = z * (3 + z * (3 + z))  # (z + 1)^3 - 1
+            total += kernel.sum() - (kernel.trace() if x is y and i == j else 0)
+    return total / (len(x) * (len(y) - (x is y)))

@@ -79,36 +79,29 @@ class MMDLiDM(ScanMetric):
         "cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"
     }  # fmt: skip
     keeping = True
+    fewest = 1
     resamples = False  # the nearest scan is not a smooth function of the scans
 
     def rows(self, scans: Scans) -> Tensor:
         side = round(2 * EXTENT / COARSE)
-        maps = torch.empty(len(scans), side * side)
-        for distances, points in zip(maps, scans.points, strict=True):
-            cells = np.zeros((side, side), dtype=bool)
-            cells.flat[occupied(points, COARSE).cpu().numpy()] = True
-            distances[:] = torch.from_numpy(squared_distance_map(cells)).flatten()
+        maps = torch.full((len(scans), side * side), torch.nan)
+        for squared, points in zip(maps, scans.points, strict=True):
+            free = np.ones((side, side), dtype=bool)
+            free.flat[occupied(points, COARSE).cpu().numpy()] = False
+            if not free.all():  # integers up to rounding of the root
+                squared[:] = torch.from_numpy(np.rint(distance_transform_edt(free) ** 2)).flatten()
         return maps
 
-    def figures(self) -> tuple[dict[str, float], list[str]]:
-        if not all(self.count(side) for side in SIDES):
-            return {"mmd_lidm": float("nan")}, []
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         real, generated = (self.kept(side) for side in SIDES)
         nearest = torch.full((len(real),), torch.inf, dtype=torch.float64)
         for i, x in blocks(real, BLOCK):
             for _, y in blocks(generated, BLOCK):
                 nearest[i] = torch.minimum(nearest[i], _chamfer(x, y).amin(1))
-        return {"mmd_lidm": float(nearest.mean()) * (COARSE / (2 * EXTENT)) ** 2}, []
+        return {self.name: nearest.mean() * (COARSE / (2 * EXTENT)) ** 2}
 
 
 def _chamfer(x: Tensor, y: Tensor) -> Tensor:
     """Chamfer distances in squared cells of all pairs of distance maps, (N, cells) and (M, cells)."""
     a, b = (x == 0).double(), (y == 0).double()
     return ((a @ y.T) / a.sum(1)[:, None] + (x @ b.T) / b.sum(1)) / 2
-
-
-def squared_distance_map(held: np.ndarray) -> np.ndarray:
-    """Squared distance of every cell to the nearest occupied cell, in cells, (H, W); NaN if none is occupied."""
-    if not held.any():
-        return np.full(held.shape, np.nan)
-    return np.rint(distance_transform_edt(~held) ** 2)  # integers up to rounding of the root
