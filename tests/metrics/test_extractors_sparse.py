@@ -41,7 +41,7 @@ def test_the_order_of_the_weights_is_torchsparse_s():
     # A voxel at the origin, one behind it in x and one above it: weight k is k, so that a sum says which were used.
     coords = torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     x = Sparse(torch.tensor([[1.0], [10.0], [100.0]]), VoxelGrid(coords))
-    odd, down = SparseConv3d(1, 1, 3), SparseConv3d(1, 1, 2, 2)
+    odd, down = SparseConv3d(1, 1, 3), SparseConv3d(1, 1, 2)
     odd.kernel.data = torch.arange(27.0).view(27, 1, 1)
     down.kernel.data = torch.arange(8.0).view(8, 1, 1)
     # +x is offset 14 and +z offset 22; the origin is 12 from the first and 4 from the second; and so on.
@@ -78,7 +78,7 @@ class Dense:
                 if module.transposed:
                     x = F.conv_transpose3d(x, weight.transpose(0, 1), stride=2)
                 else:
-                    x = F.conv3d(x, weight, stride=module.stride, padding=1 if module.size == 3 else 0)
+                    x = F.conv3d(x, weight, stride=2 if module.size == 2 else 1, padding=1 if module.size == 3 else 0)
             elif isinstance(module, nn.BatchNorm1d):
                 parameters = (module.running_mean, module.running_var, module.weight, module.bias)
                 x = F.batch_norm(x, *parameters, eps=module.eps)

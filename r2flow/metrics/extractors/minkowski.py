@@ -22,8 +22,8 @@ WIDTHS = (16, 16, 32, 64, 128, 128, 64, 48, 48)  # stem, four levels down, four 
 CLASSES = 20
 
 
-def _step(channels: int, out: int, size: int, stride: int = 1, transposed: bool = False) -> list[nn.Module]:
-    return [SparseConv3d(channels, out, size, stride, transposed), SparseNorm(out), SparseReLU()]
+def _step(channels: int, out: int, size: int, transposed: bool = False) -> list[nn.Module]:
+    return [SparseConv3d(channels, out, size, transposed), SparseNorm(out), SparseReLU()]
 
 
 class Block(nn.Module):
@@ -31,7 +31,7 @@ class Block(nn.Module):
 
     def __init__(self, channels: int, out: int, transposed: bool = False) -> None:
         super().__init__()
-        self.net = nn.Sequential(*_step(channels, out, size=2, stride=2, transposed=transposed))
+        self.net = nn.Sequential(*_step(channels, out, 2, transposed))
 
     def forward(self, x: Sparse) -> Sparse:
         return self.net(x)

@@ -40,7 +40,6 @@ class VoxelGrid:
     def __init__(self, coords: Tensor, finer: Self | None = None) -> None:
         self.coords = coords
         self.finer = finer
-        self._around: dict[int, KernelMap] = {}
         self.low, self.high = coords.amin(0), coords.amax(0)
         self.sizes = (self.high - self.low + 1).tolist()
         assert math.prod(self.sizes) < 2**63, self.sizes
@@ -68,11 +67,10 @@ class VoxelGrid:
         coords[:, 1:] = coords[:, 1:].div(2, rounding_mode="floor")
         return VoxelGrid(coords.unique(dim=0), finer=self)
 
-    def around(self, size: int) -> KernelMap:
-        """Kernel map of a kernel of size^3 with stride 1."""
-        if size not in self._around:
-            self._around[size] = self._map(self, size, 1)
-        return self._around[size]
+    @cached_property
+    def around(self) -> KernelMap:
+        """Kernel map of a kernel of 3^3 with stride 1."""
+        return self._map(self, 3, 1)
 
     @cached_property
     def inside(self) -> KernelMap:
@@ -108,14 +106,14 @@ class Sparse:
 class SparseConv3d(nn.Module):
     """A sparse convolution without bias, with a kernel of `size` voxels along each axis.
 
-    Stride 1 keeps the voxels; stride 2, with a kernel of 2, doubles their size; a transposed convolution returns to the
-    finer voxels by the inverse map. A kernel of 1 is a linear map.
+    A kernel of 1 is a linear map, and one of 3 keeps the voxels, too. A kernel of 2 has stride 2, which doubles their
+    size; transposed, it returns to the finer voxels by the inverse map.
     """
 
-    def __init__(self, channels: int, out: int, size: int = 3, stride: int = 1, transposed: bool = False) -> None:
+    def __init__(self, channels: int, out: int, size: int, transposed: bool = False) -> None:
         super().__init__()
-        assert (size, stride) == (2, 2) or (stride == 1 and not transposed)
-        self.size, self.stride, self.transposed = size, stride, transposed
+        assert size in ((2,) if transposed else (1, 2, 3))
+        self.size, self.transposed = size, transposed
         shape = (channels, out) if size == 1 else (size**3, channels, out)
         bound = ((out if transposed else channels) * size**3) ** -0.5
         self.kernel = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
@@ -123,14 +121,14 @@ class SparseConv3d(nn.Module):
     def forward(self, x: Sparse) -> Sparse:
         if self.size == 1:
             return x.with_features(x.features @ self.kernel)
+        if self.size == 3:
+            return x.with_features(convolve(x.features, self.kernel, x.grid.around, len(x.grid)))
         if self.transposed:
             reverse = [(outputs, inputs) for inputs, outputs in x.grid.inside]
             finer = cast(VoxelGrid, x.grid.finer)
             return Sparse(convolve(x.features, self.kernel, reverse, len(finer)), finer)
-        if self.stride > 1:
-            coarser = x.grid.coarser()
-            return Sparse(convolve(x.features, self.kernel, coarser.inside, len(coarser)), coarser)
-        return x.with_features(convolve(x.features, self.kernel, x.grid.around(self.size), len(x.grid)))
+        coarser = x.grid.coarser()
+        return Sparse(convolve(x.features, self.kernel, coarser.inside, len(coarser)), coarser)
 
 
 def convolve(features: Tensor, kernel: Tensor, where: KernelMap, num: int) -> Tensor:
