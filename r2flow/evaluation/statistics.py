@@ -1,6 +1,5 @@
 """Disk cache of the metrics' statistics of real scans."""
 
-import hashlib
 import json
 import logging
 from collections.abc import Mapping
@@ -8,14 +7,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import save
 from torch import Tensor
 
 from r2flow.data.sets import ScanSet
-from r2flow.files import cache_folder, write_file
+from r2flow.files import cache_folder
 from r2flow.metrics.base import ScanMetric
-from r2flow.model.checkpoint import read_tensors
+from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)
 
@@ -33,34 +30,30 @@ class Statistics:
 
 
 class Cache:
-    """Folder of statistics of real scans; file names are hashes of everything the statistics depend on."""
+    """Folder of statistics of real scans; names in it are hashes of everything the statistics depend on."""
 
     def __init__(self, folder: str | Path | None = None) -> None:
         self.folder = cache_folder("R2FLOW_CACHE") / "statistics" if folder is None else Path(folder)
 
-    def path(self, key: str) -> Path:
-        """File of a key from `key_of`."""
-        metric = json.loads(key)["protocol"]["metric"]
-        return self.folder / f"{metric}-{hashlib.sha256(key.encode()).hexdigest()[:24]}.safetensors"
+    def _store(self, key: str) -> Store:
+        return Store(self.folder / checksum(key)[:24], "statistics", {"key": key})
 
     def read(self, key: str) -> Statistics | None:
-        """Read the statistics of a key; None if missing or damaged."""
-        path = self.path(key)
-        if not path.is_file():
-            return None
+        """Read the statistics of a key from `key_of`; None if missing or damaged."""
         try:
-            states, notes = read_tensors(path)
-            return Statistics(states, int(notes["scans"]), int(notes["empty"])) if notes["key"] == key else None
-        except (SafetensorError, OSError, KeyError, ValueError):
-            log.warning("%s is damaged; recomputing its statistics.", path)
+            states, notes = self._store(key).read(0)
+        except FileNotFoundError:
             return None
+        except Damaged as error:
+            log.warning("statistics in %s are damaged (%s): recomputing them.", self.folder, error)
+            return None
+        return Statistics({name: torch.from_numpy(value) for name, value in states.items()}, **notes)
 
     def write(self, key: str, statistics: Statistics) -> None:
         """Store statistics; only warn if the disk is not writable."""
-        notes = {"key": key, "scans": str(statistics.scans), "empty": str(statistics.empty)}
-        data = save({name: value.contiguous() for name, value in statistics.states.items()}, metadata=notes)
+        states = {name: value.numpy() for name, value in statistics.states.items()}
         try:
-            write_file(self.path(key), data)
+            self._store(key).write(0, states, {"scans": statistics.scans, "empty": statistics.empty})
         except OSError as error:
             log.warning("statistics are not cached: %s: %s", self.folder, error.strerror or error)
 
