@@ -4,9 +4,9 @@ import json
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.measuring import MetricResult, Work, gather_real, measure, speed_result
@@ -68,6 +68,7 @@ def with_equal_panels(comparisons: Sequence[Comparison]) -> list[Comparison]:
     return [replace(c, measured=[*map(equal, c.measured)]) for c in comparisons] if lacking else list(comparisons)
 
 
+@dataclass
 class Comparer:
     """Measures pairs of sets; statistics of a real set are gathered once.
 
@@ -75,21 +76,14 @@ class Comparer:
     stored in `folder`, if given, in files named by a hash of everything that these depend on.
     """
 
-    def __init__(
-        self,
-        metrics: Mapping[str, ScanMetric],
-        work: Work,
-        rules: Rules,
-        draws: int = 0,
-        cache: Cache | None = None,
-        folder: Path | None = None,
-        device: str = "cpu",
-    ) -> None:
-        self.metrics, self.work, self.rules, self.draws, self.cache = metrics, work, rules, draws, cache
-        self.folder = folder
-        protocols = {name: asdict(metric.protocol) for name, metric in metrics.items()}
-        self.recipe = {"metrics": protocols, "bootstrap": draws, "protocol": rules.name, "device": device}
-        self._statistics: dict[int, dict[str, Statistics]] = {}
+    metrics: Mapping[str, ScanMetric]
+    work: Work
+    rules: Rules
+    draws: int
+    cache: Cache | None
+    folder: Path | None
+    device: str
+    _statistics: dict[int, dict[str, Statistics]] = field(default_factory=dict)
 
     def __call__(self, kind: Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
         """Compare two sets, or read the stored results."""
@@ -111,8 +105,12 @@ class Comparer:
         """File of the results; None unless they are stored."""
         if self.folder is None or not other.source.drawn:
             return None
-        recipe: dict[str, Any] = {"real": real.identity or [real.label, len(real)], "sampled": other.about}
-        return self.folder / f"{checksum({**recipe, **self.recipe})[:16]}.json"
+        recipe = {
+            "real": real.identity or [real.label, len(real)], "sampled": other.about, "bootstrap": self.draws,
+            "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
+            "protocol": self.rules.name, "device": self.device,
+        }  # fmt: skip
+        return self.folder / f"{checksum(recipe)[:16]}.json"
 
 
 def _read(path: Path) -> list[MetricResult] | None:
