@@ -19,7 +19,7 @@ from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.errors import InputError, naming
-from r2flow.lidar.beams import FULL_REFLECTANCE, full_reflectance, other_sensor
+from r2flow.lidar.estimation import FULL_REFLECTANCE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.transfer import (

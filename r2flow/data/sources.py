@@ -22,7 +22,7 @@ from torch import Tensor
 from r2flow import simulator
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.errors import InputError, warn_odd
-from r2flow.lidar.beams import Doubt, is_unclear, other_sensor
+from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from r2flow.errors import InputError
-from r2flow.lidar.beams import estimate_sensor, steps_of_a_turn
+from r2flow.lidar.estimation import estimate_sensor, steps_of_a_turn
 from r2flow.lidar.known import Ray
 from r2flow.lidar.projection import Convention, Projection, nearest, project_indices, scatter
 from r2flow.lidar.scan_files import Points

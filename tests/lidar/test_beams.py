@@ -9,18 +9,8 @@ import pytest
 from r2flow.data.reading import Reading
 from r2flow.data.sources import warn_of_other_sensor
 from r2flow.errors import InputError
-from r2flow.lidar.beams import (
-    FIRINGS,
-    RING_AFTER_RING,
-    RINGS,
-    UNORDERED,
-    estimate_sensor,
-    find_beams,
-    full_reflectance,
-    is_tilted,
-    nearest_sensor,
-    other_sensor,
-)
+from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_beams
+from r2flow.lidar.estimation import estimate_sensor, full_reflectance, is_tilted, nearest_sensor, other_sensor
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -87,7 +77,7 @@ def test_two_returns_of_each_ray_are_of_one_beam():
     points = scan(SENSORS["vlp16"].resized(columns=192), FIRINGS)
     xyz = np.repeat(points.xyz, 2, axis=0)
     xyz[1::2] *= 0.9 * (np.random.default_rng(1).random((len(points.xyz), 1)) < 0.3)  # 7 of 10 have one return
-    found = find_beams([Points(xyz)])
+    found = find_beams(Points(xyz))
     np.testing.assert_allclose(found.elevations, SENSORS["vlp16"].elevations, atol=1e-3)
     assert found.firing == SENSORS["vlp16"].firing
 
@@ -285,7 +275,7 @@ def test_real_scans_are_tilted_only_in_another_frame(shared: Path):
     for points in real(shared, "other_sensors/vlp16/*.pcd"):
         assert is_tilted([pitched(points, 5)])
     for points in real(shared, "*/**/*.bin", step=6):
-        quarter = points.xyz[find_beams([points]).of_point[0] % 4 == 0]
+        quarter = points.xyz[find_beams(points).of_point[0] % 4 == 0]
         noisy = quarter + np.random.default_rng(0).normal(0, 0.02, quarter.shape).astype(np.float32)
         assert [is_tilted([one]) for one in (points, Points(quarter), Points(noisy))] == [False] * 3
         assert is_tilted([pitched(Points(quarter), 5)])
@@ -306,7 +296,7 @@ def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
     points = read_points(next((shared / "real" / "kitti360").rglob("*.bin")))
     lost = Points(np.random.default_rng(0).permutation(points.xyz))
     with pytest.raises(InputError, match="cannot be told apart"):
-        find_beams([lost])
+        find_beams(lost)
     assert other_sensor([lost], SENSORS["hdl64e"]) is None
     assert other_sensor([lost], SENSORS["vlp16"]).name is None
 
@@ -352,14 +342,14 @@ def without_beams(pattern: str) -> Points:
 def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, pattern: str):
     scan = without_beams(pattern)
     with pytest.raises(InputError, match="lie on no beams, as those of a Livox"):
-        find_beams([scan])
+        find_beams(scan)
     write_points(tmp_path / "0.ply", scan.xyz)
     with pytest.raises(InputError, match="lie on no beams"):
         warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["hdl64e"], within_limits=True), tmp_path)
     for name in SENSORS:
         assert other_sensor([scan], SENSORS[name]).hopeless
     with pytest.raises(InputError, match="lie on no beams"):  # the number of one of its lasers is no ring
-        find_beams([Points(scan.xyz, ring=np.arange(len(scan.xyz)) % 6)])
+        find_beams(Points(scan.xyz, ring=np.arange(len(scan.xyz)) % 6))
 
 
 def test_rings_of_one_elevation_have_a_row_each():

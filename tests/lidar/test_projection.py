@@ -8,7 +8,8 @@ import torch
 from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading, read_projected
 from r2flow.errors import InputError
-from r2flow.lidar.beams import find_beams, steps_of_a_turn
+from r2flow.lidar.beams import find_beams
+from r2flow.lidar.estimation import steps_of_a_turn
 from r2flow.lidar.projection import image_to_points, project, project_indices, unproject
 from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -279,7 +280,7 @@ def test_lost_rays_of_whole_firings_may_be_nan(tmp_path):
     np.save(tmp_path / "0.npy", xyz)
     found = read_projected(tmp_path / "0.npy", Reading(sensor, "unfolding", reflectance=False))
     np.testing.assert_allclose(found.image[0], image, rtol=1e-6)
-    assert find_beams([read_points(tmp_path / "0.npy")]).firing is not None
+    assert find_beams(read_points(tmp_path / "0.npy")).firing is not None
     (scan,), _ = open_partial([str(tmp_path / "0.npy")], Reading(sensor, "unfolding"), sensor)  # as complete reads it
     np.testing.assert_allclose(scan.read().image[0], image, rtol=1e-6)
 
@@ -325,6 +326,6 @@ def test_lost_rays_leave_every_point_its_beam(tmp_path):
     xyz[lost] = np.nan
     np.save(tmp_path / "0.npy", xyz)
     scan = read_points(tmp_path / "0.npy")
-    beams = find_beams([scan])
+    beams = find_beams(scan)
     np.testing.assert_array_equal(beams.of_point[0], row[mixed][~lost])
     assert steps_of_a_turn([scan], beams.of_point) == pytest.approx(480, rel=1e-3)
