@@ -44,7 +44,7 @@ def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = Fal
     returns values and known mask."""
     count = known.shape[1]
     at, lines = np.arange(count), np.arange(len(known))[:, None]
-    left, right = _neighbours(known, at)
+    left, right = nearest_known(known)
     inside = (left >= 0) & (right < count)
     fillable = (left >= 0) | (right < count) if extend else inside & (known.sum(1, keepdims=True) > 1)
     nearest = np.where((left < 0) | ((right < count) & (right - at < at - left)), right, left).clip(0, count - 1)
@@ -53,7 +53,7 @@ def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = Fal
     if rule == "nearest":
         filled = values[:, lines, nearest]
     else:
-        a, b = _neighbours(returned, at)
+        a, b = nearest_known(returned)
         low, high = np.where(a < 0, b, a).clip(0, count - 1), np.where(b >= count, a, b).clip(0, count - 1)
         share = np.where(high > low, (at - low) / np.maximum(high - low, 1), 0.0)
         invert = rule == "inverse"
@@ -64,9 +64,9 @@ def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = Fal
     return np.where(known, values, np.where(back & fillable, filled, 0)), known | fillable
 
 
-def _neighbours(known: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest known positions at or before each position of a line (or -1), and at or after it (or L)."""
-    count = len(at)
-    left = np.maximum.accumulate(np.where(known, at, -1), axis=1)
-    right = np.minimum.accumulate(np.where(known, at, count)[:, ::-1], axis=1)[:, ::-1]
+def nearest_known(known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest known positions at or before each position of a line, (..., L), or -1, and at or after it, or L."""
+    at = np.arange(known.shape[-1])
+    left = np.maximum.accumulate(np.where(known, at, -1), axis=-1)
+    right = np.minimum.accumulate(np.where(known, at, len(at))[..., ::-1], axis=-1)[..., ::-1]
     return left, right

@@ -16,9 +16,10 @@ from torch import Tensor
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.base import SIDES
 from r2flow.metrics.birds_eye import js_distance
+from r2flow.metrics.extractors.base import nan_where_empty
 from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
-from r2flow.metrics.surfaces import bridged, drop_rate, normals
+from r2flow.metrics.surfaces import bridged, normals
 
 GRADIENTS = np.concatenate([[0], np.geomspace(0.01, 80, 24)])  # metres
 STEPS, SECTORS = np.array([-20, -6, -2, -0.6, -0.2, -0.05, -0.02, 0.02, 0.05, 0.2, 0.6, 2, 6, 20]), 8  # metres
@@ -50,10 +51,15 @@ class Scan:
 
 
 def histogram(x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Counts of values in [a, b) per bin, (bins,); like numpy's histogram, faster for few bins."""
+    """Counts of values in [a, b) per bin, (bins,), without NaN; like numpy's histogram, faster for few bins."""
     place = np.searchsorted(edges[:-1], x, side="right") - 1
     inside = (place >= 0) & (x <= edges[-1])
     return np.bincount(place[inside], None if weights is None else weights[inside], len(edges) - 1)
+
+
+def drop_rate(value: np.ndarray, missing: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Counts of missing rays and of all rays per bin of a value, (2, bins)."""
+    return np.stack([histogram(value, edges, missing), histogram(value, edges)])
 
 
 def gradient_azimuth(scan: Scan) -> np.ndarray:
@@ -229,8 +235,7 @@ class Panel(SumMetric):
     resamples = False  # |a - b| of rates is not smooth for nearly equal sets
 
     def rows(self, scans: Scans) -> Tensor:
-        returned = scans.returned.flatten(1).any(1).cpu()
-        return torch.where(returned[:, None], panel_rows(scans), torch.nan)
+        return nan_where_empty(panel_rows(scans), scans)
 
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
         if not (real.any() and generated.any()):

@@ -1,7 +1,8 @@
-"""Surfaces in range images: normals, angle of incidence, ray-drop rate."""
+"""Surfaces in range images: normals, angle of incidence, gaps."""
 
 import numpy as np
 
+from r2flow.lidar.interpolation import nearest_known
 from r2flow.lidar.sensors import Sensor
 
 SPAN = 2  # columns to either side for a surface's direction; range noise dominates for 1
@@ -43,18 +44,7 @@ def bridged(x: np.ndarray, known: np.ndarray, gap: int = GAP) -> np.ndarray:
     width = x.shape[-1]
     gap = min(gap, width - 1)
     turn = np.arange(-gap - 1, width + gap + 1) % width  # periodic padding
-    wide, valid = x[..., turn], known[..., turn]
-    place, nowhere = np.arange(len(turn)), 2 * len(turn)
-    before = np.maximum.accumulate(np.where(valid, place, -nowhere), axis=-1)
-    after = np.minimum.accumulate(np.where(valid, place, nowhere)[..., ::-1], axis=-1)[..., ::-1]
-    short = after - before - 1 <= gap
-    low, high = (np.take_along_axis(wide, np.where(short, end, 0), -1) for end in (before, after))
-    mean = np.where(short, (low + high) / 2, np.nan)
-    return np.where(known, x, mean[..., gap + 1 : gap + 1 + width])
-
-
-def drop_rate(value: np.ndarray, missing: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Counts of missing rays and of all rays per bin of a value, (2, bins); NaN values are left out."""
-    inside = np.isfinite(value) & (value >= edges[0]) & (value <= edges[-1])
-    place, bins = np.searchsorted(edges[1:-1], value[inside], side="right"), len(edges) - 1
-    return np.stack([np.bincount(place, weights, bins) for weights in (missing[inside], None)])
+    before, after = (end[..., gap + 1 : gap + 1 + width] for end in nearest_known(known[..., turn]))
+    low, high = (np.take_along_axis(x, (end - gap - 1) % width, -1) for end in (before, after))
+    mean = np.where(after - before - 1 <= gap, (low + high) / 2, np.nan)
+    return np.where(known, x, mean)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.panel import Scan, drop_incidence, drop_range, surface_normals
-from r2flow.metrics.surfaces import bridged, drop_rate, normals
+from r2flow.metrics.panel import Scan, drop_incidence, drop_range, drop_rate, surface_normals
+from r2flow.metrics.surfaces import bridged, normals
 
 SENSOR = SENSORS["hdl64e"].resized(32, 512)
 E, A = SENSOR.rays().numpy().astype(np.float64)
