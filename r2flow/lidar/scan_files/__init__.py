@@ -35,9 +35,8 @@ __all__ = [
     "write_points",
 ]
 
+_ROWS = (".pcd.bin", ".bin")  # rows of float32; the one that ends with the other first
 _READERS = {
-    ".pcd.bin": read_rows,  # before ".bin", which it ends with
-    ".bin": read_rows,
     ".pcd": read_pcd,
     ".ply": read_ply,
     ".npy": read_npy,
@@ -63,7 +62,7 @@ ELSEWHERE = {
     **dict.fromkeys((".lvx", ".lvx2", ".lvx3"), "is of a Livox, which has no beams; r2flow needs a spinning LiDAR"),
 }
 WRITTEN = (".bin", ".pcd", ".ply", ".npy")
-SCAN_ENDINGS = tuple(_READERS)
+SCAN_ENDINGS = (*_ROWS, *_READERS)
 LOOSE_ENDINGS = (".csv", ".txt", ".npz")  # also used for other files than scans
 FIRM_ENDINGS = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
 
@@ -96,9 +95,9 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     ending = _ending(path)
     if ending == ".pcd.bin" and columns is None:
         columns = ("x", "y", "z", "intensity", "ring")
-    raw = ending in (".bin", ".pcd.bin")
+    raw = ending in _ROWS
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
-        names, arrays = _READERS[ending](path, columns)
+        names, arrays = (None, read_rows(path, columns)) if raw else _READERS[ending](path)
         check(names is None or columns is None, "it names its columns: leave --columns (data.reading.columns) out.")
         return column_points(names or usual_names(len(arrays), columns), arrays, raw)
 

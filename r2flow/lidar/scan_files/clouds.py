@@ -27,7 +27,7 @@ PLY_CODES = {  # NumPy's codes of PLY's types
 Table = tuple[list[str] | None, list[np.ndarray]]  # names of the columns, or None; columns
 
 
-def read_pcd(path: Path, columns: object = None) -> Table:
+def read_pcd(path: Path) -> Table:
     """All fields of a PCD of version 0.7. VIEWPOINT is not applied: points are in the sensor's frame."""
     data = path.read_bytes()
     lines, start = _split_header(data, "DATA")
@@ -97,7 +97,7 @@ class _Element:
     listed: bool = False
 
 
-def read_ply(path: Path, columns: object = None) -> Table:
+def read_ply(path: Path) -> Table:
     """All properties of the element `vertex`. Only later elements, such as the faces of a mesh, may have lists."""
     data = path.read_bytes()
     lines, start = _split_header(data, "end_header")

@@ -18,7 +18,7 @@ MOST_UNPACKED = 100  # maximum expansion of a compressed file, plus 1 MiB
 TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar", "scan", "data", "arr_0")
 
 
-def read_rows(path: Path, columns: Sequence[str] | None) -> Table:
+def read_rows(path: Path, columns: Sequence[str] | None) -> list[np.ndarray]:
     """Rows of little-endian float32: as many as `columns`, or 4 of KITTI."""
     content = path.read_bytes()
     head = content[:64]
@@ -32,16 +32,16 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> Table:
     table = np.frombuffer(content, "<f4").reshape(rows, width)
     memory = columns is None and rows > 4 and table[1::2, 0].any() and not table[1::2, 1:3].any()
     check(not memory, "every second row has y = z = 0, as 8 floats a point: give --columns x,y,z,_,intensity,_,_,_.")
-    return None, list(table.T)
+    return list(table.T)
 
 
-def read_npy(path: Path, columns: object = None) -> Table:
+def read_npy(path: Path) -> Table:
     """An array (N, 3) or wider, or with named fields."""
     with path.open("rb") as file:
         return _columns_of(read_array(file, path.stat().st_size))
 
 
-def read_npz(path: Path, columns: object = None) -> Table:
+def read_npz(path: Path) -> Table:
     """An archive with an array of points, by a usual name or as its only member, and further columns; or of columns."""
     with zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
@@ -90,7 +90,7 @@ def _columns_of(array: np.ndarray) -> Table:
     return None, list(array.T)
 
 
-def read_text(path: Path, columns: object = None) -> Table:
+def read_text(path: Path) -> Table:
     """A point per line, separated by commas, semicolons, tabs or spaces; names in the first line or a comment."""
     lines = [line.strip(" \r") for line in path.read_text("utf-8-sig", "replace").split("\n") if line.strip()]
     rows = [line for line in lines if line[0] not in "#/"]
@@ -126,7 +126,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def read_arrow(path: Path, columns: object = None) -> Table:
+def read_arrow(path: Path) -> Table:
     """A Feather or Parquet table: Argoverse 2's lidar."""
     require(str(path), "formats", "pyarrow")
     import pyarrow
@@ -144,7 +144,7 @@ def read_arrow(path: Path, columns: object = None) -> Table:
     return table.column_names, [column.to_numpy() for column in table.columns]
 
 
-def read_las(path: Path, columns: object = None) -> Table:
+def read_las(path: Path) -> Table:
     """LAS, read with laspy: scaled x, y, z in the sensor's frame, intensity if measured, extra fields."""
     require(str(path), "formats", "laspy")
     import laspy
