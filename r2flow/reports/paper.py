@@ -129,10 +129,10 @@ def table_i(rows: Sequence[Row]) -> str:
     lines: list[dict[str, Any]] = []
     placed: list[Row] = []
     for printed in TABLE_I:
-        role, count = printed.role or printed.method, printed.evaluations
-        line: dict[str, Any] = {"method": role, "of": "paper", "evaluations": count}
+        count = printed.evaluations
+        line: dict[str, Any] = {"method": printed.method, "of": "paper", "evaluations": count}
         lines.append(line | dict(zip(COLUMNS, printed.figures, strict=True)))
-        same = [row for row in rows if row["role"] == role]
+        same = [row for row in rows if row["role"] == printed.method]
         most = max((row["evaluations"] for row in same), default=0)
         like = [row for row in same if row["evaluations"] in ((count, most) if min(count, most) >= MANY else (count,))]
         lines += map(_evaluated, like)
