@@ -83,30 +83,20 @@ def completion_rows(
             answers[way.name] = [result.images.numpy() for result in results]
             evaluations = float(torch.cat([result.evaluations for result in results]).float().mean())
             cost[way.name] = evaluations, sum(result.seconds for result in results) / num / len(results)
-        firsts = [[of_method[i][0] for of_method in answers.values()] for i in range(len(truths))]
-        cases = zip(truths, firsts, masks, strict=True)
+        firsts = {name: [images[0] for images in of_method] for name, of_method in answers.items()}
+        cases = zip(truths, zip(*firsts.values(), strict=True), masks, strict=True)
         common = means([dict(zip(answers, common_mae(x, y, ~mask), strict=True)) for x, y, mask in cases])
         for name, of_method in answers.items():
             evaluations, seconds = cost.get(name, (0.0, math.nan))
             row = {"task": task, "method": name, "evaluations": evaluations, "seconds": seconds}
             row["mae_common_m"] = common[name]
-            yield row | _errors(truths, of_method, masks, sensor, reference), of_method[0][0]
-
-
-def _errors(
-    truths: Sequence[np.ndarray],
-    answers: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray],
-    sensor: Sensor,
-    reference: np.ndarray,
-) -> dict[str, float]:
-    cases = list(zip(truths, answers, masks, strict=True))
-    scans = [means([errors(truth, image, ~mask, sensor) for image in images]) for truth, images, mask in cases]
-    row = {key: value for key, value in means(scans).items() if np.isfinite(value)}
-    row["panel"] = mean_distance(distances(panel(np.stack([images[0] for images in answers]), sensor), reference))
-    if len(answers[0]) > 1:
-        row |= means([spread_errors(truth, images, ~mask) for truth, images, mask in cases])
-    return row
+            scans = list(zip(truths, of_method, masks, strict=True))
+            off = means([means([errors(x, y, ~mask, sensor) for y in images]) for x, images, mask in scans])
+            row |= {key: value for key, value in off.items() if np.isfinite(value)}
+            row["panel"] = mean_distance(distances(panel(np.stack(firsts[name]), sensor), reference))
+            if num > 1 and name in cost:
+                row |= means([spread_errors(x, images, ~mask) for x, images, mask in scans])
+            yield row, firsts[name][0]
 
 
 def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
