@@ -42,7 +42,7 @@ class LogScale(RangeFormat):
         return torch.exp2(y * self.scale) - 1
 
 
-class ShiftedLog(RangeFormat):
+class ShiftedLog(LogScale):
     """log2(r + 1.0001) / scale, clipped to [0, 1], with scale = log2(r_max + 1) rounded up to hundredths.
 
     Used by LiDARGen (r_max 63 m, scale 6) and LiDM (56 m, 5.84). A ray without return is log2(1.0001) / scale, not
@@ -53,10 +53,10 @@ class ShiftedLog(RangeFormat):
         self.scale = math.ceil(100 * math.log2(sensor.max_range + 1) - 1e-9) / 100
 
     def forward(self, r: Tensor) -> Tensor:
-        return (torch.log2(r.clamp(min=0) + 1e-4 + 1) / self.scale).clamp(0, 1)
+        return super().forward(r.clamp(min=0) + 1e-4).clamp(0, 1)
 
     def inverse(self, y: Tensor) -> Tensor:
-        return torch.exp2(y.clamp(0, 1) * self.scale) - 1
+        return super().inverse(y.clamp(0, 1))
 
 
 class Inverse(RangeFormat):

@@ -37,8 +37,7 @@ def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
         measured: True for measured rays, (H, W) or (B, H, W) bool; None: all rays are measured.
     """
     returned = images[:, 0] > 0
-    state = torch.full(returned.shape, int(Ray.EMPTY), dtype=torch.uint8, device=images.device)
-    state[returned] = int(Ray.RETURN)
+    state = torch.where(returned, int(Ray.RETURN), int(Ray.EMPTY)).to(torch.uint8)
     if measured is not None:
         state[~measured.to(images.device).expand_as(returned)] = int(Ray.UNKNOWN)
     return state

@@ -154,7 +154,6 @@ class ScanMetric(Metric):
             self.take_in(scans, side, first)
 
     def take_in(self, scans: Scans, side: Side, first: int) -> None:
-        """Add a batch to the statistics of a side."""
         self.add_rows(self.rows(scans), side, first)
 
     def add_rows(self, rows: Tensor, side: Side, first: int = 0) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Rays, Sensor
-from r2flow.metrics.birds_eye import BINS, birds_eye_histogram
+from r2flow.metrics.birds_eye import birds_eye_histogram
 
 FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
 FAR = 300.0  # metres, above any scan's median range
@@ -83,10 +83,7 @@ class Scans:
     @cached_property
     def birds_eye(self) -> np.ndarray:
         """Bird's-eye histogram of each scan, (B, 100, 100), float64: see `birds_eye_histogram`."""
-        counts = np.zeros((len(self), BINS, BINS))
-        for i, points in enumerate(self.points):
-            counts[i] = birds_eye_histogram(points.cpu().numpy())
-        return counts
+        return np.stack([birds_eye_histogram(points.cpu().numpy()) for points in self.points])
 
 
 def on_bin_corners(r: Tensor, sensor: Sensor) -> Tensor:

@@ -24,19 +24,18 @@ def backbone_costs(
 ) -> Iterator[dict[str, Any]]:
     """Parameters, GMAC and median latency in float32 of every configuration for one image of two channels.
 
-    The latency is None without `repeats`. A configuration that does not support the size has an `error`.
+    The latency is None without `repeats`. A configuration that does not support the size has only an `error`.
     """
     table = configurations()
     for name in names or table:
         options = table[name]
-        row: dict[str, Any] = {"name": name, "parameters": None, "gmac": None, "latency_ms": None}
         try:
             with torch.device("cpu" if repeats > 0 else "meta"):  # counting needs no weights
                 model = build_backbone(options, sensor.rays(), 2).eval()
         except InputError as error:
-            yield {**row, "error": str(error)}
-            continue
-        yield {**row, **_cost_of(model, repeats, device)}
+            yield {"name": name, "error": str(error)}
+        else:
+            yield {"name": name, **_cost_of(model, repeats, device)}
 
 
 def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> dict[str, Any]:
@@ -72,9 +71,8 @@ def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T,
 
 
 def print_costs(rows: Sequence[dict[str, Any]], sensor: Sensor, device: str) -> None:
-    """Print the rows as a table, with the counting rule."""
     forms = {"parameters": "{:,}", "gmac": "{:.2f}", "latency_ms": "{:,.0f}"}
-    cells = [row | {key: form.format(row[key]) for key, form in forms.items() if row[key] is not None} for row in rows]
+    cells = [row | {key: form.format(row[key]) for key, form in forms.items() if row.get(key)} for row in rows]
     columns = {"name": "backbone", "parameters": "parameters", "gmac": "GMAC", "latency_ms": "latency, ms"}
     if any("error" in row for row in rows):
         columns["error"] = ""

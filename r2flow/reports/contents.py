@@ -37,7 +37,6 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def print_contents(contents: dict[str, Any]) -> None:
-    """Print the contents as two short tables."""
     summary = {key: value for key, value in contents.items() if key != "config"}
     summary["image"] = " x ".join(map(str, contents["image"]))
     for name in ("encoding", "sampler", "few"):

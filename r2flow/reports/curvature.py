@@ -151,7 +151,6 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
 
 
 def curvature_page(flows: Sequence[Paths], seed: int, device: str = "cpu") -> Page:
-    """Build the report on one or several checkpoints."""
     figures = {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)}
     return Page(
         "curvature", "Straightness of flows", curvature_text(flows), curvature_rows(flows), figures,

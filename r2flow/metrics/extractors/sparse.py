@@ -146,14 +146,10 @@ def convolve(features: Tensor, kernel: Tensor, where: KernelMap, num: int) -> Te
 
 
 class SparseNorm(nn.BatchNorm1d):
-    """Batch normalisation of voxel features."""
-
     def forward(self, x: Sparse) -> Sparse:  # type: ignore[override]
         return x.with_features(super().forward(x.features))
 
 
 class SparseReLU(nn.Module):
-    """ReLU of voxel features."""
-
     def forward(self, x: Sparse) -> Sparse:
         return x.with_features(torch.relu(x.features))

@@ -56,7 +56,8 @@ def page(
     Returns:
         The page, about 50 kB and 130 kB for each image of 64 x 1024. Texts in it are never read as HTML.
     """
-    stacks = [_frames_of(scan) for scan in images]
+    arrays = [np.asarray(scan, dtype=np.float32) for scan in images]
+    stacks = [array.reshape(-1, *array.shape[-3:]) for array in arrays]
     count, pixels = sum(map(len, stacks)), sum(stack[:, 0].size for stack in stacks)
     if not 0 < pixels <= MOST:
         raise InputError(
@@ -122,13 +123,6 @@ def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = No
     if numbers is not None:
         planes.append(numbers.astype(np.uint8).tobytes())
     return _text(zlib.compress(b"".join(planes), 6))
-
-
-def _frames_of(images: Images) -> np.ndarray:
-    """Frames of a scan, (T, 2 or 1, H, W)."""
-    stack = np.asarray(images, dtype=np.float32)
-    assert stack.shape[-3] in (1, 2), stack.shape
-    return stack.reshape(-1, *stack.shape[-3:])
 
 
 def _described(rays: np.ndarray) -> dict[str, Any]:

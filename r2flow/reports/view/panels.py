@@ -40,7 +40,6 @@ class Panel(NamedTuple):
 
 
 def write_panels(path: str | Path, panels: Sequence[Panel], frames: Sequence[str] = (), title: str = "r2flow") -> Path:
-    """Write a page of panels."""
     captions, images, rays, labels = zip(*panels, strict=True) if panels else ((), (), (), ())
     return write_page(path, images, rays, captions, frames=frames, labels=labels, title=title)
 
