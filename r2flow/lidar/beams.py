@@ -41,10 +41,10 @@ class Beams:
     order: str = UNORDERED  # storage order of the scans: `RINGS`, `FIRINGS`, ...
     firing: tuple[int, ...] | None = None  # row of laser 0, 1, ...; None if lasers are numbered by elevation
 
-    def off(self, elevations: Sequence[np.ndarray]) -> np.ndarray:
-        """Distance of each return from its beam in degrees, (N,), from the elevations of the points of each scan."""
-        pairs = zip(elevations, self.of_point, strict=True)
-        return np.concatenate([np.abs(e - self.elevations[row])[row >= 0] for e, row in pairs])
+    def off(self, scans: Sequence[Points]) -> np.ndarray:
+        """Distance of each return of the scans from its beam in degrees, (N,)."""
+        pairs = zip(scans, self.of_point, strict=True)
+        return np.concatenate([np.abs(elevations_of(s.xyz) - self.elevations[row])[row >= 0] for s, row in pairs])
 
 
 @lru_cache(maxsize=1)  # for further questions about the same scans
@@ -60,7 +60,7 @@ def _beams(scans: Sequence[Points]) -> Beams:
     elevations = [elevations_of(scan.xyz) for scan in scans]
     if all(scan.ring is not None for scan in scans):
         by_ring = _by_laser(elevations, [np.asarray(scan.ring, dtype=np.int64) for scan in scans], RINGS)
-        if np.mean(by_ring.off(elevations) ** 2) < RINGLESS * np.nanvar(np.concatenate(elevations)):
+        if np.mean(by_ring.off(scans) ** 2) < RINGLESS * np.nanvar(np.concatenate(elevations)):
             return by_ring
     if count := _lasers_of_firings(elevations):
         middle = median_of_seen(np.concatenate([e.reshape(-1, count) for e in elevations]))

@@ -116,7 +116,7 @@ def is_tilted(scans: Sequence[Points]) -> bool:
 def is_unclear(scans: Sequence[Points]) -> bool:
     """Whether points lie far from their beams, as of two sensors in one file, or `is_tilted`."""
     with suppress(InputError):
-        if np.median(find_beams(*scans).off([elevations_of(scan.xyz) for scan in scans])) > MOST_OFF:
+        if np.median(find_beams(*scans).off(scans)) > MOST_OFF:
             return True
     return is_tilted(scans)
 
@@ -176,7 +176,7 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         beams.firing,
         full_reflectance(scans),
     )
-    off = float(np.median(beams.off([elevations_of(scan.xyz) for scan in scans])))
+    off = float(np.median(beams.off(scans)))
     return Estimate(sensor, beams, steps, off, ground is not None)
 
 
@@ -207,8 +207,7 @@ def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> floa
         gaps.append(np.diff(azimuth[order])[np.diff(row[order]) == 0])
     gap = np.concatenate(gaps)
     apart = gap[gap > 1e-2]  # two returns of a ray have the same azimuth
-    if not len(apart):
-        raise InputError("no beam returned at two azimuths in these scans. Are they whole?")
+    check(len(apart), "no beam returned at two azimuths in these scans. Are they whole?")
     step = float(np.quantile(apart, 0.3))
     for _ in range(3):
         near = gap[gap < 3.5 * step]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -120,8 +120,7 @@ def _beams(top: float, step: float, count: int) -> tuple[float, ...]:
 
 def _halves_in_turn(rows: int) -> tuple[int, ...]:
     """Firing order of Velodyne's 16 and 32 evenly spaced lasers: lower and upper half alternate, both upwards."""
-    middle = rows // 2
-    return tuple(chain.from_iterable(zip(range(rows - 1, middle - 1, -1), range(middle - 1, -1, -1), strict=True)))
+    return tuple(np.arange(rows)[::-1].reshape(2, -1).T.ravel().tolist())
 
 
 def _by_laser(elevations: Sequence[float]) -> dict[str, Any]:
