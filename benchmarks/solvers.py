@@ -49,14 +49,13 @@ class Mixed(Problem):
         """The problem of some of the scenes, indices (N,)."""
         return Mixed([self.problems[scene] for scene in scenes.tolist()])
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         v = torch.empty_like(x)
         for problem, scenes in self._groups:
             v[scenes] = problem(t[scenes] if t.ndim else t, x[scenes])
         return v
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        t = torch.as_tensor(t, dtype=torch.float64)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         x_t = torch.empty_like(x_0, dtype=torch.float64)
         for problem, scenes in self._groups:
             x_t[scenes] = problem.solution(x_0[scenes], t[scenes] if t.ndim else t)

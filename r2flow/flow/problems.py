@@ -7,6 +7,7 @@ do not model data; each has a different difficulty for solvers.
 
 import functools
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -16,16 +17,23 @@ from r2flow.flow.path import expand_time
 from r2flow.registry import Registry
 
 
-class Problem:
-    """A velocity and its exact paths."""
+class Problem(ABC):
+    """A velocity and its exact paths; a subclass gets times that broadcast with the state."""
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         """v(t, x) in x's type, with t of shape () or (B,) and x (B, ...)."""
-        raise NotImplementedError
+        return self.velocity(expand_time(t, x), x)
 
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
         """x_t, (B, ...) float64, of the path that starts at x_0; t of shape () or (B,)."""
-        raise NotImplementedError
+        x_0 = x_0.double()
+        return self.path(x_0, expand_time(torch.as_tensor(t, dtype=torch.float64, device=x_0.device), x_0))
+
+    @abstractmethod
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor: ...
+
+    @abstractmethod
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor: ...
 
 
 class Gaussian(Problem):
@@ -41,13 +49,12 @@ class Gaussian(Problem):
         """std, broadcastable with x."""
         return self.std
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        t, s = expand_time(t, x), self.deviation(x)
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
+        s = self.deviation(x)
         rate = (t * s**2 - (1 - t)) / ((1 - t) ** 2 + (t * s) ** 2)  # sigma' / sigma
         return self.mean + rate * (x - t * self.mean)
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        x_0, t = _exact(x_0, t)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         return t * self.mean + ((1 - t) ** 2 + (t * self.deviation(x_0)) ** 2).sqrt() * x_0
 
 
@@ -79,8 +86,7 @@ class GaussianMixture(Problem):
     def __init__(self, weights: Sequence[float], means: Sequence[float], stds: Sequence[float]) -> None:
         self.weights, self.means, self.stds = tuple(weights), tuple(means), tuple(stds)
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        t = expand_time(t, x)
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         scores, slopes = [], []
         for weight, mean, std in zip(self.weights, self.means, self.stds, strict=True):
             variance = (1 - t) ** 2 + (t * std) ** 2
@@ -89,9 +95,8 @@ class GaussianMixture(Problem):
             slopes.append(mean + (t * std**2 - (1 - t)) / variance * offset)
         return (torch.stack(scores).softmax(0) * torch.stack(slopes)).sum(0)
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         """x_t by bisection, to full precision: the quantile of a mixture lies between those of its components."""
-        x_0, t = _exact(x_0, t)
         means = torch.stack([t * mean + torch.zeros_like(x_0) for mean in self.means])
         stds = torch.stack([((1 - t) ** 2 + (t * std) ** 2).sqrt() + torch.zeros_like(x_0) for std in self.stds])
         weights = torch.tensor(self.weights, dtype=torch.float64, device=x_0.device).view(-1, *(1,) * x_0.ndim)
@@ -127,11 +132,10 @@ class PointMass(Problem):
     def __init__(self, point: float = 0.5) -> None:
         self.point = point
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        return (self.point - x) / (1 - expand_time(t, x))
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
+        return (self.point - x) / (1 - t)
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        x_0, t = _exact(x_0, t)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         return (1 - t) * x_0 + t * self.point
 
 
@@ -141,12 +145,10 @@ class Straight(Problem):
     def __init__(self, mean: float = 0.7, std: float = 0.25) -> None:
         self.mean, self.std = mean, std
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        t = expand_time(t, x)
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         return self.mean + (self.std - 1) / (1 - t + t * self.std) * (x - t * self.mean)
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        x_0, t = _exact(x_0, t)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         return (1 - t) * x_0 + t * (self.mean + self.std * x_0)
 
 
@@ -156,12 +158,11 @@ class Rotating(Problem):
     def __init__(self, turns: float = 0.5) -> None:
         self.speed = 2 * math.pi * turns
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         first, second = x.flatten(1).chunk(2, 1)
         return self.speed * torch.cat([-second, first], 1).view(x.shape)
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        x_0, t = _exact(x_0, t)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         first, second = x_0.flatten(1).chunk(2, 1)
         angle = self.speed * t.view(-1, 1)
         c, s = angle.cos(), angle.sin()
@@ -177,12 +178,10 @@ class StiffLinear(Problem):
     def __init__(self, rate: float = 1e2) -> None:
         self.rate = rate
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        t = expand_time(t, x)
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         return t.cos() - self.rate * (x - t.sin())
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        x_0, t = _exact(x_0, t)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         return t.sin() + x_0 * (-self.rate * t).exp()
 
 
@@ -192,11 +191,10 @@ class Discontinuous(Problem):
     def __init__(self, jump: float = 3.0, at: float = math.sqrt(2) - 1) -> None:
         self.jump, self.at = jump, at
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        return self.jump * (expand_time(t, x) >= self.at) - x
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
+        return self.jump * (t >= self.at) - x
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        x_0, t = _exact(x_0, t)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         return x_0 * (-t).exp() - self.jump * torch.expm1(-(t - self.at).clamp(min=0))
 
 
@@ -206,12 +204,11 @@ class NarrowJet(Problem):
     def __init__(self, width: float = 2e-3, at: float = 0.6) -> None:
         self.width, self.at = width, at
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        z = (expand_time(t, x) - self.at) / self.width
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
+        z = (t - self.at) / self.width
         return (-0.5 * z**2).exp() / (self.width * math.sqrt(2 * math.pi)) - x
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        x_0, t = _exact(x_0, t)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         w = self.width
         passed = _normal_cdf((t - self.at) / w - w) - _normal_cdf(t.new_tensor(-self.at / w - w))
         return x_0 * (-t).exp() + (self.at - t + w**2 / 2).exp() * passed
@@ -223,19 +220,12 @@ class Pulse(Problem):
     def __init__(self, width: float = 0.2, at: float = 0.45) -> None:
         self.width, self.at = width, at
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        inside = (expand_time(t, x) - self.at).abs() < self.width / 2
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
+        inside = (t - self.at).abs() < self.width / 2
         return (inside / self.width).to(x.dtype) + torch.zeros_like(x)
 
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        x_0, t = _exact(x_0, t)
+    def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         return x_0 + ((t - self.at) / self.width + 0.5).clamp(0, 1)
-
-
-def _exact(x_0: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor]:
-    """x_0 and t in float64, t broadcastable with x_0."""
-    x_0 = x_0.double()
-    return x_0, expand_time(torch.as_tensor(t, dtype=torch.float64, device=x_0.device), x_0)
 
 
 PROBLEMS: Registry = Registry(
