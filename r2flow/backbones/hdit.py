@@ -13,13 +13,12 @@ from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.detail import Detail
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, mean_rays, position_name, rotate
 from r2flow.backbones.layers import (
-    GEGLU,
     AdaRMSNorm,
-    ExactBuffers,
     ExactLinear,
     RandomFourierFeatures,
     RMSNorm,
     at_least_float32,
+    geglu,
     in_bands,
     mapping_network,
     shared,
@@ -57,6 +56,7 @@ class HDiT(Backbone):
 
     takes_second_time = True
     croppable = True
+    features: Tensor  # of the tokens' rays
 
     def __init__(
         self,
@@ -98,11 +98,12 @@ class HDiT(Backbone):
         self.timestep_pe = time_embedding(time_channels, dropout)
         self.tokenizer = nn.Sequential(nn.Conv2d(self.in_channels, base_channels, self.patch, self.patch, bias=False))
         name, tokens = position_name(position, "learnable", "none"), (rows, columns)
-        self.spatial_pe: LearnablePosition | FeaturePosition | None = None
+        self.spatial_pe: LearnablePosition | nn.Sequential | None = None
         if name == "learnable":
             self.spatial_pe = LearnablePosition(tokens, base_channels)
         elif name != "none":
-            self.spatial_pe = FeaturePosition(name, tokens, base_channels, dropout)
+            features = RayFeatures(ENCODINGS[name](tokens), base_channels)
+            self.spatial_pe = nn.Sequential(features, mapping_network(base_channels, nn.Linear, dropout))
         self.down_levels, self.up_levels = nn.ModuleDict(), nn.ModuleDict()
         for level in range(levels - 1):
             for side in (self.down_levels, self.up_levels):
@@ -124,8 +125,10 @@ class HDiT(Backbone):
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         condition = self.condition(self.timestep_pe, t, s)
         h = uncast(self.tokenizer, x).permute(0, 2, 3, 1).contiguous()
-        if self.spatial_pe is not None:
-            h = h + self.spatial_pe().to(h.dtype)
+        if isinstance(self.spatial_pe, LearnablePosition):
+            h = h + self.spatial_pe.embedding.to(h.dtype)
+        elif self.spatial_pe is not None:
+            h = h + self.spatial_pe(self.features).to(h.dtype)
         skips = []
         for level in range(self.levels - 1):
             for block in _level(self.down_levels, level):
@@ -146,8 +149,10 @@ class HDiT(Backbone):
             rays = mean_rays(self.coords, (self.patch[0] << level, self.patch[1] << level))
             table = _shared_rotation(level, self._blocks(level)).table(rays)
             self.register_buffer(f"table_{level}", table, persistent=False)
-        if isinstance(self.spatial_pe, FeaturePosition):
-            self.spatial_pe.follow(mean_rays(self.coords, self.patch))
+        if isinstance(self.spatial_pe, nn.Sequential):
+            encoding = cast(RayFeatures, self.spatial_pe[0]).embedding
+            features = encoding(mean_rays(self.coords, self.patch)).permute(0, 2, 3, 1)
+            self.register_buffer("features", features, persistent=False)
 
     @property
     def learns_directions(self) -> bool:  # type: ignore[override]
@@ -156,7 +161,10 @@ class HDiT(Backbone):
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
         part = super().cropped(rows, columns)
         if isinstance(part.spatial_pe, LearnablePosition):
-            part.spatial_pe.crop(*(n[::step] // step for n, step in zip((rows, columns), self.patch, strict=True)))
+            learned = part.spatial_pe.embedding.detach()
+            for dim, numbers, step in zip((1, 2), (rows, columns), self.patch, strict=True):
+                learned = learned.index_select(dim, numbers[::step].to(learned.device) // step)
+            part.spatial_pe.embedding = nn.Parameter(learned, requires_grad=False)
         return part
 
     def _table(self, level: int) -> Tensor:
@@ -193,45 +201,17 @@ class LearnablePosition(nn.Module):
         super().__init__()
         self.embedding = nn.Parameter(nn.init.trunc_normal_(torch.empty(1, *tokens, channels), std=0.02))
 
-    def forward(self) -> Tensor:
-        return self.embedding
 
-    def crop(self, rows: Tensor, columns: Tensor) -> None:
-        """Keep the tokens of these rows and columns, as a constant."""
-        rows, columns = rows.to(self.embedding.device), columns.to(self.embedding.device)
-        kept = self.embedding.detach().index_select(1, rows).index_select(2, columns)
-        self.embedding = nn.Parameter(kept, requires_grad=False)
-
-
-class FeaturePosition(nn.Sequential):
-    """Features of the mean ray of each token through a mapping network."""
-
-    def __init__(self, name: str, tokens: tuple[int, int], channels: int, dropout: float) -> None:
-        features = RayFeatures(ENCODINGS[name](tokens), channels)
-        super().__init__(features, mapping_network(channels, linear=nn.Linear, dropout=dropout))
-
-    def follow(self, rays: Tensor) -> None:
-        """Recompute the features for new rays."""
-        features = cast(RayFeatures, self[0])
-        features.register_buffer("features", features.embedding(rays).permute(0, 2, 3, 1), persistent=False)
-
-    def forward(self) -> Tensor:  # type: ignore[override]  # the input is the stored features
-        features, mapping = self
-        return mapping(features())
-
-
-class RayFeatures(ExactBuffers):
-    """W f(rays) with fixed features f, computed once."""
-
-    features: Tensor
+class RayFeatures(nn.Module):
+    """W f for fixed features f of rays, by `embedding`."""
 
     def __init__(self, embedding: RayEncoding, channels: int) -> None:
         super().__init__()
         self.embedding = embedding
         self.linear = ExactLinear(embedding.channels, channels, bias=False)
 
-    def forward(self) -> Tensor:
-        return self.linear(self.features).to(self.linear.weight.dtype)
+    def forward(self, features: Tensor) -> Tensor:
+        return self.linear(features).to(self.linear.weight.dtype)
 
 
 class Neighbourhood(NamedTuple):
@@ -335,12 +315,11 @@ class FeedForward(nn.Module):
         channels = options.channels
         self.adarms = AdaRMSNorm(channels, options.condition_channels)
         self.gegelu = nn.Linear(channels, 2 * 3 * channels, bias=False)
-        self.glu = GEGLU()
         self.dropout = nn.Dropout(options.dropout)
         self.linear = zero_initialised(nn.Linear(3 * channels, channels, bias=False))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        return self.linear(self.dropout(self.glu(self.gegelu(self.adarms(x, condition)))))
+        return self.linear(self.dropout(geglu(self.gegelu(self.adarms(x, condition)))))
 
 
 class Merge(nn.Sequential):

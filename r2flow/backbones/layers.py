@@ -93,12 +93,10 @@ class AdaRMSNorm(nn.Module):
         return rms_norm(x, 1 + self.proj(condition)[:, None, None, :])
 
 
-class GEGLU(nn.Module):
+def geglu(x: Tensor) -> Tensor:
     """h gelu(g) with (h, g) the two halves of a projection, and the exact gelu (erf)."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        h, gate = x.chunk(2, dim=-1)
-        return h * F.gelu(gate)
+    h, gate = x.chunk(2, dim=-1)
+    return h * F.gelu(gate)
 
 
 class RandomFourierFeatures(ExactBuffers):
@@ -124,12 +122,11 @@ class MappingLayer(nn.Module):
         super().__init__()
         self.norm = RMSNorm(channels)
         self.gegelu = linear(channels, 2 * 3 * channels, bias=False)
-        self.glu = GEGLU()
         self.dropout = nn.Dropout(dropout)
         self.linear = linear(3 * channels, channels, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.linear(self.dropout(self.glu(self.gegelu(self.norm(x)))))
+        return x + self.linear(self.dropout(geglu(self.gegelu(self.norm(x)))))
 
 
 def mapping_network(channels: int, linear: type[nn.Linear] = ExactLinear, dropout: float = 0.0) -> nn.Sequential:
