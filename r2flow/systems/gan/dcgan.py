@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
 
-from torch import Tensor, nn
+from torch import nn
 
-from r2flow.backbones.layers import at_least_float32, halved
+from r2flow.backbones.layers import halved
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Count, Positive
 from r2flow.systems.gan.generator import Gan
@@ -17,6 +17,7 @@ from r2flow.systems.gan.layers import (
     BiasedLeakyReLU,
     BlurBoth,
     Equalised,
+    Heads,
     LatentGenerator,
     Pad,
     RayDrop,
@@ -26,19 +27,6 @@ from r2flow.systems.gan.layers import (
 def _doubling(in_channels: int, out_channels: int, ring: bool, bias: bool) -> list[nn.Module]:
     layer = nn.ConvTranspose2d(in_channels, out_channels, 4, stride=2, padding=3, bias=bias)
     return [Pad(ring, "reflect"), Equalised(layer)]
-
-
-class Heads(nn.Module):
-    """A final upsampling layer per output."""
-
-    def __init__(self, in_channels: int, made: dict[str, int], ring: bool) -> None:
-        super().__init__()
-        self.heads = nn.ModuleDict(
-            {name: nn.Sequential(*_doubling(in_channels, n, ring, True)) for name, n in made.items()}
-        )
-
-    def forward(self, x: Tensor) -> dict[str, Tensor]:
-        return {name: at_least_float32(head(x)) for name, head in self.heads.items()}
 
 
 class VanillaGan(Gan):
@@ -79,7 +67,8 @@ class VanillaGan(Gan):
             nn.Sequential(*_doubling(wide, narrow, ring, False), BiasedLeakyReLU(narrow))
             for wide, narrow in pairwise(widths)
         ]
-        heads = Heads(widths[-1], {IMAGE: channels, LOGIT: 1} if self.drops else {IMAGE: channels}, ring)
+        made = {IMAGE: channels, LOGIT: 1} if self.drops else {IMAGE: channels}
+        heads = Heads({name: nn.Sequential(*_doubling(widths[-1], n, ring, True)) for name, n in made.items()})
         synthesis = nn.Sequential(projection, *blocks, heads)
         mask = RayDrop() if self.drops else None
         super().__init__(space, LatentGenerator(latent, latent, nn.Identity(), synthesis, mask, tanh))

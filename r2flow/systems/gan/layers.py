@@ -100,6 +100,17 @@ class BlurBoth(nn.Module):
         return torch.cat([self.blur_v(x), self.blur_h(x)], dim=1)
 
 
+class Heads(nn.Module):
+    """A layer per output, by name."""
+
+    def __init__(self, heads: dict[str, nn.Module]) -> None:
+        super().__init__()
+        self.heads = nn.ModuleDict(heads)
+
+    def forward(self, *inputs: Tensor) -> dict[str, Tensor]:
+        return {name: at_least_float32(head(*inputs)) for name, head in self.heads.items()}
+
+
 def logistic(uniform: Tensor) -> Tensor:
     """Standard logistic noise log u - log(1 - u) for u in [0, 1), clamped to [eps, 1 - eps] of float32."""
     u = uniform.clamp(EPS, 1 - EPS)

@@ -24,6 +24,7 @@ from r2flow.systems.gan.layers import (
     BlurBoth,
     Equalised,
     Filter,
+    Heads,
     LatentGenerator,
     Pad,
     RayDrop,
@@ -98,17 +99,6 @@ class ModulatedConv(nn.Module):
         return made if self.bias is None else made + self.bias.to(made.dtype)
 
 
-class Heads(nn.Module):
-    """A modulated layer per output."""
-
-    def __init__(self, in_channels: int, made: dict[str, int], code: int) -> None:
-        super().__init__()
-        self.heads = nn.ModuleDict({name: ModulatedConv(in_channels, n, code, norm=False) for name, n in made.items()})
-
-    def forward(self, x: Tensor, w: Tensor) -> dict[str, Tensor]:
-        return {name: at_least_float32(head(x, w)) for name, head in self.heads.items()}
-
-
 class Level(nn.Module):
     """Upsampled features concatenated with ray features, and their contribution to each output."""
 
@@ -126,7 +116,7 @@ class Level(nn.Module):
         if not self.first:
             self.conv2 = ModulatedConv(channels, channels, code)
             self.bias_act2 = BiasedLeakyReLU(channels)
-        self.head = Heads(channels, made, code)
+        self.head = Heads({name: ModulatedConv(channels, n, code, norm=False) for name, n in made.items()})
 
     def coarser(self, angle: Tensor) -> Tensor:
         """Angles of the previous level, from filtered sines and cosines to avoid the discontinuity at +-pi."""

@@ -58,9 +58,7 @@ class Attention(nn.Module):
         self.heads = shared(channels, head_channels, f"heads of {head_channels}")
         self.norm = norm(channels)
         self.qkv = nn.Conv1d(channels, 3 * channels, 1)
-        self.proj_out = nn.Conv1d(channels, channels, 1)
-        nn.init.zeros_(self.proj_out.weight)
-        nn.init.zeros_(self.proj_out.bias)  # type: ignore[arg-type]
+        self.proj_out = zero_initialised(nn.Conv1d(channels, channels, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         flat = self.norm(x).flatten(2)
