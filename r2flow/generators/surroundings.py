@@ -98,16 +98,13 @@ class RowFeatures(nn.Embedding):
         """Whether all rows of elevations (B, H) have a learned vector, (B,) bool."""
         return ((elevations[..., None] - self.elevations.to(elevations)).abs().amin(-1) < SAME).all(1)
 
-    def forward(  # type: ignore[override]
-        self, elevations: Tensor, steps: Tensor, known: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, elevations: Tensor, steps: Tensor, known: Tensor) -> Tensor:  # type: ignore[override]
         """Row features, (B, `FEATURES`, H, 1), from elevations in radians, (B, H), and `steps` of `Surroundings.of`.
 
-        `known`, (B,) bool, tells which scans use the vectors learned per row; None: all.
+        `known`, (B,) bool, tells which scans use the vectors learned per row.
         """
-        same = self.known(elevations)
         nearest = (elevations[..., None] - self.elevations.to(elevations)).abs().argmin(-1)
-        number = (nearest + 1) * (same if known is None else same & known)[:, None]
+        number = (nearest + 1) * (self.known(elevations) & known)[:, None]
         sizes = (steps / 0.007).log()[:, None].expand(*elevations.shape, 2)
         each = torch.cat([super().forward(number), STEEP * elevations[..., None], sizes], -1)
         return each.movedim(-1, 1)[..., None]

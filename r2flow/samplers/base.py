@@ -166,12 +166,7 @@ class OnGrid(Sampler):
     def times(self, t_0: float = 0.0, t_1: float = 1.0, fewer: int = 0) -> Tensor:
         """Time grid from t_0 to t_1, (steps - fewer + 1,) float64."""
         with torch.device("cpu"):  # even if the default device is meta
-            return build_grid(self.times_or_name, t_0, t_1, self.steps - fewer)
-
-    @property
-    def times_or_name(self) -> str | Tensor:
-        """The grid as passed to solvers."""
-        return self.grid if isinstance(self.grid, str) else torch.tensor(self.grid, dtype=torch.float64)
+            return build_grid(self.grid, t_0, t_1, self.steps - fewer)
 
 
 def _with_steps(options: dict[str, Any]) -> dict[str, Any]:

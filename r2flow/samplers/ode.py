@@ -58,7 +58,7 @@ class FixedSteps(OnGrid, ODESampler):
         return SOLVERS[self.method].cost(self.steps - final) + final  # type: ignore[union-attr]
 
     def options(self) -> dict[str, Any]:
-        return {"method": self.method, "steps": self.steps, "grid": self.times_or_name}
+        return {"method": self.method, "steps": self.steps, "grid": self.grid}
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if not self.finish or self.steps == 1:

@@ -40,7 +40,7 @@ def advance(
     v: Evaluations, x: Tensor, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits
 ) -> tuple[Solution, np.ndarray]:
     """Solve every scene of x, (B, ...), from t_0 to t_1, each with its own steps; return the times reached too."""
-    control = StepController(v.scenes, t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
+    control = StepController(len(x), t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
     results = x.clone()
     k_1 = v(control.now(x), x)
     tolerance = attainable(limits, v.precision)
@@ -51,7 +51,7 @@ def advance(
     while True:
         if control.leaving.any():
             leaving = control.leaving.nonzero()[0]
-            results[torch.from_numpy(control.places[leaving]).to(x.device)] = rows(x, leaving)
+            results[torch.from_numpy(control.scenes[leaving]).to(x.device)] = rows(x, leaving)
             remaining = (~control.leaving).nonzero()[0]
             x, k_1 = rows(x, remaining), rows(k_1, remaining)
             control.keep(remaining)

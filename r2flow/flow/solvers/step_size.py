@@ -26,17 +26,14 @@ class StepController:
     measured as a length from t_0, which makes forward and backward in time equal.
     """
 
-    def __init__(
-        self, scenes: np.ndarray, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits, eps: float
-    ) -> None:
+    def __init__(self, n: int, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits, eps: float) -> None:
         self.method, self.limits, self.nodes = method, limits, np.array(method.nodes)[:, None]
         self.t_0, self.direction = t_0, math.copysign(1.0, t_1 - t_0)
         self.length, self.t_end = abs(t_1 - t_0), t_1
         self.low, self.high = sorted((t_0, t_1))
         self.longest = limits.max_step * self.length
         self.eps = eps
-        self.scenes, self.places = scenes, np.arange(len(scenes))
-        n = len(scenes)
+        self.scenes = np.arange(n)
         self.reached, self.h, self.grow = np.zeros(n), np.full(n, self.length), np.full(n, method.grow)
         self.last_error = np.full(n, 1e-4)  # dopri5.f
         self.stiff_run, self.smooth_run = np.zeros(n, int), np.zeros(n, int)
@@ -103,7 +100,7 @@ class StepController:
         """Whether the third difference exceeds `least`, and `by` times its extrapolation from the last step, (B,)."""
         with np.errstate(invalid="ignore", over="ignore"):
             exceeds: np.ndarray = (self.roughness > least) & ~(self.roughness <= by * self.rough * self.h**4)
-        return exceeds & ~self.stiff[self.places]
+        return exceeds & ~self.stiff[self.scenes]
 
     def able(self, evaluations: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Which of these scenes have budget for one more evaluation, (N,) bool."""
@@ -128,8 +125,8 @@ class StepController:
         between the last two stages.
         """
         finite = np.isfinite(error) & np.isfinite(dk) & np.isfinite(dy)
-        self.accepted[self.places] += good
-        self.rejected[self.places] += ~good
+        self.accepted[self.scenes] += good
+        self.rejected[self.scenes] += ~good
         self._look_for_stiffness(good, dk, dy)
         tried = self.h
         self.reached = np.where(good, self.following, self.reached)
@@ -143,7 +140,7 @@ class StepController:
         self.crossing = (self.begin - self.reached <= self.shortest()) & ~spent
         self.arrived = good & (self.reached >= self.length) & ~self.crossing
         stuck = (self.h < self.shortest()) & ~good & (self.begin == np.inf)
-        handed_over = self.stiff[self.places] & self.limits.until_stiff & ~self.crossing
+        handed_over = self.stiff[self.scenes] & self.limits.until_stiff & ~self.crossing
         self.leaving = self.arrived | stuck | spent | handed_over
 
     def note_pole(self, places: np.ndarray, h: np.ndarray, share: np.ndarray, back: np.ndarray) -> None:
@@ -198,15 +195,15 @@ class StepController:
         if self.limits.until_stiff:
             self.calm_run = np.where(oscillating, 0, self.calm_run + (good & ~oscillating))
             self.oscillating_run = np.where(self.calm_run >= SMOOTH_AFTER, 0, self.oscillating_run + oscillating)
-            self.stiff[self.places] |= self.oscillating_run >= OSCILLATING_AFTER
-        self.stiff[self.places] |= self.stiff_run >= STIFF_AFTER
+            self.stiff[self.scenes] |= self.oscillating_run >= OSCILLATING_AFTER
+        self.stiff[self.scenes] |= self.stiff_run >= STIFF_AFTER
 
     def keep(self, rest: np.ndarray) -> None:
         """Keep these scenes in the batch; record convergence and time of all."""
-        self.converged[self.places] |= self.arrived
-        self.times[self.places] = self.time(self.reached)
+        self.converged[self.scenes] |= self.arrived
+        self.times[self.scenes] = self.time(self.reached)
         for name in (
-            "scenes", "places", "reached", "h", "grow", "last_error", "stiff_run", "smooth_run", "oscillating_run",
+            "scenes", "reached", "h", "grow", "last_error", "stiff_run", "smooth_run", "oscillating_run",
             "calm_run", "arrived", "leaving", "begin", "end", "resume", "crossing", "rough", "troubled",
             "factor", "decades",
         ):  # fmt: skip
