@@ -127,7 +127,7 @@ class Repaint(Posterior):
         if condition is None or not hasattr(generator, "repaint"):
             return super().__call__(generator, noise, condition, draws, progress)
         y, known = condition["image"].to(noise), condition["known"].to(noise) > 0
-        x = generator.repaint(noise, y, known, self.times(), draws, self.repeats, self.jump, progress)
+        x = generator.repaint(self, noise, y, known, draws, progress)
         return Generated.after(torch.where(known, y, x), self.evaluations())
 
 

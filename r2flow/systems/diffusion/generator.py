@@ -71,24 +71,15 @@ class Diffusion(NetworkFlow):
         clean = self.denoise(z, log_snr)
         return clean - (z - alpha * clean) / sigma
 
-    def repaint(
-        self,
-        z: Tensor,
-        image: Tensor,
-        known: Tensor,
-        times: Tensor,
-        noise: Noise,
-        repeats: int,
-        jump: int,
-        progress: Call,
-    ) -> Tensor:
-        """Sample x_1 from noise z given the known part of an image, by the published RePaint at times from 0 to 1."""
+    def repaint(self, how: Repaint, z: Tensor, image: Tensor, known: Tensor, noise: Noise, progress: Call) -> Tensor:
+        """Sample x_1 from noise z given the known part of an image, by the published RePaint."""
 
         def denoise(z: Tensor, log_snr: Tensor) -> Tensor:
             progress()
             return self.denoise(z, log_snr)
 
-        *_, z = repaint(denoise, z, image, known, self.schedule(1 - times).to(z), noise, repeats, jump)
+        log_snrs = self.schedule(1 - how.times()).to(z)
+        *_, z = repaint(denoise, z, image, known, log_snrs, noise, how.repeats, how.jump)
         return z if self.clip is None else z.clamp(-self.clip, self.clip)
 
 
