@@ -1,6 +1,7 @@
 """`r2flow report`: solvers, curvature, backbones, completion, the paper's tables; and `r2flow compare`."""
 
 import logging
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -52,7 +53,6 @@ def curvature(
     """Measure the straightness s(t) of trained flows; plot paths of the most curved pixels (the paper's figure 8)."""
     from r2flow.generators import as_flow
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.model.sampling import batches
     from r2flow.progress import Bar
     from r2flow.reports.curvature import curvature_page, measure_paths
     from r2flow.reports.pages import prepare_folder
@@ -62,7 +62,7 @@ def curvature(
     for checkpoint in loaded.values():
         as_flow(checkpoint.generator, "curvature")
     prepare_folder(out)
-    with Bar("measuring", len(loaded) * batches(draw.num, draw.batch_size) * 2 * steps, "evaluations") as advance:
+    with Bar("measuring", len(loaded) * math.ceil(draw.num / draw.batch_size) * 2 * steps, "evaluations") as advance:
         flows = [
             measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, progress=advance)
             for label, checkpoint in loaded.items()

@@ -28,7 +28,7 @@ from r2flow.lidar.sensor_files import named_sensor
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.space import build_space
 from r2flow.model.completion import complete
-from r2flow.model.published import FORMATS, inert, plain
+from r2flow.model.published import BACKBONE, FORMATS, inert, plain
 from r2flow.model.sampling import sample
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
@@ -37,7 +37,6 @@ from r2flow.samplers import build_sampler
 
 FOLDER = "checkpoints"
 PREFIX = "generator."  # of the generator's weights in a LightningModule
-BACKBONE = "backbone."  # of a flow's network in the generator
 COMPILED = "_orig_mod."  # in the names of the weights after torch.compile
 NOTES = "r2flow"  # key of the JSON metadata in a .safetensors
 SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors

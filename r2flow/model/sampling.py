@@ -1,6 +1,5 @@
 """Sampling: scan i depends on (seed, i) alone, up to the network's rounding in different batches."""
 
-import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -116,11 +115,6 @@ def draw(
     if region is not None and evaluated is not None:
         images = region.place(region.crop(evaluated.place(images)))
     return Samples(images, numbers[0], generated.evaluations.cpu(), generated.converged.cpu(), seconds)
-
-
-def batches(num: int, batch_size: int) -> int:
-    """Number of batches in `sample`."""
-    return math.ceil(num / batch_size)
 
 
 def evaluated_region(generator: Generator, region: Region) -> Region:

@@ -1,6 +1,7 @@
 """Generated scans as files and pictures."""
 
 import logging
+import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,7 @@ from r2flow.generators.base import Precision
 from r2flow.lidar.projection import write_scan
 from r2flow.lidar.region import Region
 from r2flow.model.checkpoint import FOLDER, Checkpoint, weights_hash
-from r2flow.model.sampling import batches, draw
+from r2flow.model.sampling import draw
 from r2flow.progress import Bar, track
 from r2flow.reports.view import most_images, write_page
 from r2flow.store import MANIFEST, FileStore, read_manifest
@@ -66,7 +67,7 @@ def write_samples(
     store = FileStore(out, "samples", recipe_of(checkpoint, seed, sampler, **part), endings)
     stale = _stale(store, replace)
     shown: list[np.ndarray] = []
-    with ScanBar("sampling", num, batches(num, batch_size) * (sampler.evaluations(generator) or 0)) as bar:
+    with ScanBar("sampling", num, math.ceil(num / batch_size) * (sampler.evaluations(generator) or 0)) as bar:
         for first in range(0, num, batch_size):
             numbers = range(first, min(first + batch_size, num))
             if first < pictures or stale or store.missing(numbers):
