@@ -27,12 +27,11 @@ class ADMUNet(UNet):
     The bottleneck also has attention. For the options see `UNet`.
     """
 
-    def build_levels(
-        self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
-    ) -> None:
+    def build_levels(self, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions) -> None:
         """Build `down_blocks`, `mid_blocks`, `up_blocks` and the last norm and convolution."""
         deepest = self.levels - 1
-        width, skips = base_channels, [base_channels]
+        width, *widths = widths
+        skips = [width]
         self.down_blocks = nn.ModuleList()
         for level, (out, count) in enumerate(zip(widths, counts, strict=True)):
             for _ in range(count):

@@ -217,18 +217,16 @@ class UNet(Backbone, ABC):
         width = time_channels or 4 * base_channels
         self.time_embedding = time_embedding(base_channels, width)
         self.in_conv = RingConv2d(self.in_channels + extra, base_channels, ring)
-        widths = [base_channels * multiplier for multiplier in multipliers]
-        self.build_levels(base_channels, widths, counts, num_heads, BlockOptions(width, ring, dropout, groups, eps))
+        widths = [base_channels * multiplier for multiplier in (1, *multipliers)]
+        self.build_levels(widths, counts, num_heads, BlockOptions(width, ring, dropout, groups, eps))
         if self.second_time:
             self.interval_embedding = time_embedding(base_channels, width, bias=False)
             zero_initialised(self.interval_embedding[-1])
         self.follow_rays()
 
     @abstractmethod
-    def build_levels(
-        self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
-    ) -> None:
-        """Build all layers after the first convolution, whose output has base_channels."""
+    def build_levels(self, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions) -> None:
+        """Build all layers after the first convolution, whose output has widths[0]; a level has the next width."""
 
     def follow_rays(self) -> None:
         if self.coords_encoding is not None:

@@ -1,6 +1,7 @@
 """Efficient U-Net: residual blocks at each resolution, downsampling first and upsampling last (Saharia 2022)."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -24,18 +25,15 @@ class EfficientUNet(UNet):
     For the options see `UNet`.
     """
 
-    def build_levels(
-        self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
-    ) -> None:
+    def build_levels(self, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions) -> None:
         """Build `d_block1`, `u_block1`, `d_block2`, ... and the last convolution."""
-        for level, (width, count) in enumerate(zip(widths, counts, strict=True), start=1):
-            above = widths[level - 2] if level > 1 else base_channels
+        for level, ((above, width), count) in enumerate(zip(pairwise(widths), counts, strict=True), start=1):
             deepest = level == self.levels
             attention = heads if deepest else None
             self.add_module(f"d_block{level}", Level(above, width, count, options, attention, down=level > 1))
             channels = width if deepest else 2 * width  # with the skip
             self.add_module(f"u_block{level}", Level(channels, above, count, options, attention, up=level > 1))
-        self.out_conv = zero_initialised(RingConv2d(base_channels, self.out_channels, options.ring))
+        self.out_conv = zero_initialised(RingConv2d(widths[0], self.out_channels, options.ring))
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         condition = self.condition(self.time_embedding, t, s)
@@ -64,27 +62,24 @@ class Level(nn.Module):
         up: bool = False,
     ) -> None:
         super().__init__()
-        self.downsample = self.upsample = self.self_attn_block = None
+        self.downsample = nn.Sequential()
         if down:
             convolve = RingConv2d(channels, out_channels, options.ring)
             self.downsample = nn.Sequential(convolve, Resample(FILTER, up=False, ring=options.ring))
             channels = out_channels
         inputs = [channels, *[out_channels] * (count - 1)]
         self.residual_blocks = nn.ModuleList([SkippedBlock(width, out_channels, options) for width in inputs])
-        if heads is not None:
-            self.self_attn_block = SelfAttention(out_channels, heads, options)
+        self.self_attn_block = nn.Identity() if heads is None else SelfAttention(out_channels, heads, options)
+        self.upsample = nn.Sequential()
         if up:
             convolve = RingConv2d(out_channels, out_channels, options.ring)
             self.upsample = nn.Sequential(Resample(FILTER, up=True, ring=options.ring), convolve)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        if self.downsample is not None:
-            x = self.downsample(x)
+        x = self.downsample(x)
         for block in self.residual_blocks:
             x = block(x, condition)
-        if self.self_attn_block is not None:
-            x = self.self_attn_block(x)
-        return x if self.upsample is None else self.upsample(x)
+        return self.upsample(self.self_attn_block(x))
 
 
 class SkippedBlock(ResidualBlock):

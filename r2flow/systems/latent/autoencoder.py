@@ -101,8 +101,9 @@ class Level(nn.Module):
     ) -> None:
         super().__init__()
         self.block = nn.ModuleList(ResidualBlock(*pair, shape) for pair in pairwise(widths))
-        self.attn = nn.ModuleList(Attention(width) for width in widths[1:] if attends)
+        self.attn = nn.ModuleList(Attention(width) if attends else nn.Identity() for width in widths[1:])
         last = widths[-1]
+        self.downsample = self.upsample = nn.Sequential()
         if down is not None:
             self.downsample = nn.Sequential(OrderedDict(conv=CircularConv2d(last, last, *DOWN[down], stride=down)))
         if up is not None:
@@ -110,13 +111,9 @@ class Level(nn.Module):
             self.upsample = nn.Sequential(OrderedDict(enlarge=enlarge, conv=CircularConv2d(last, last, *UP[up])))
 
     def forward(self, x: Tensor) -> Tensor:
-        for index, block in enumerate(self.block):
-            x = block(x)
-            if len(self.attn):
-                x = self.attn[index](x)
-        for name in ("downsample", "upsample"):
-            x = getattr(self, name)(x) if hasattr(self, name) else x
-        return x
+        for block, attention in zip(self.block, self.attn, strict=True):
+            x = attention(block(x))
+        return self.upsample(self.downsample(x))
 
 
 class Encoder(nn.Module):
