@@ -114,7 +114,8 @@ def measure(
     unsolved = generated.source.unsolved if isinstance(generated.source, SampledScans) else 0
     unsolved = int(summed(torch.tensor(unsolved)))
     elevations = generated.sensor.elevations
-    described = {
+    described: dict[str, Any] = {
+        "name": protocol.name, "points": {"real": WORDS[protocol.real], "generated": WORDS[protocol.generated]},
         "sensor": generated.sensor.name, "elevations": [max(elevations), min(elevations)],
         "image": list(generated.sensor.shape),
     }  # fmt: skip
@@ -133,7 +134,7 @@ def measure(
             "real": real[name].scans, "real_chosen": real[name].chosen, "real_empty": real[name].empty,
             "generated": len(generated), "generated_empty": empty,
         }  # fmt: skip
-        settings: dict[str, Any] = {**protocol.describe(), **asdict(metric.protocol), **described, "sizes": sizes}
+        settings = {**described, **asdict(metric.protocol), "sizes": sizes}
         intervals: dict[str, tuple[float, float]] = {}
         if draws and not metric.resamples:
             remarks.append(f"{name} has no bootstrap interval.")

@@ -7,7 +7,7 @@ y and z, and in the choice of real scans from larger sets. Masks, histograms and
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from r2flow.data.opening import SOURCES
 from r2flow.data.sets import ScanSet, fixed_choice
@@ -37,10 +37,6 @@ class Rules:
     convention: Convention | None
     choose: Callable[[ScanSet, int], Sequence[int]]
     chosen: str
-
-    def describe(self) -> dict[str, Any]:
-        """Entries for the protocol of a result."""
-        return {"name": self.name, "points": {"real": WORDS[self.real], "generated": WORDS[self.generated]}}
 
     def rays(self, real: bool) -> Rays:
         """Rays of points that are not measured."""
