@@ -107,12 +107,10 @@ def open_scans(
     check(reading is None or (sensor is None and size is None), "give a reading, or a sensor and a size, not both.")
     reading = reading or reading_for([label], sensor=sensor, size=size)
     if file is None:
-        columns = None if reading.columns is None else list(reading.columns)
+        columns = reading.columns and list(reading.columns)
         options = replace(options, split=split, scenes=num or SCENES, reading={"columns": columns})
-        if options.name == SIMULATED:
-            seed, options = int(options.folder), replace(options, root=None)
-            return ScanSet(label, open_source(options, reading, seed), reading.sensor)
-        return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
+        seed = int(options.folder) if options.name == SIMULATED else 0
+        return ScanSet(label, open_source(options, reading, seed), reading.sensor).limited(num)
     image = read_range_image(file)
     if image is not None:  # points can be projected for any sensor
         refuse_other_samples(file.parent, reading.sensor)
@@ -200,8 +198,13 @@ def reading_for(
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
     name = parse(specs[0])[0].name if specs else FOLDER
     reading = _reading_of(model) if model else stored or Reading(SENSORS[SOURCES[name].sensor])
+    given: dict[str, Any] = {
+        "projection": projection, "convention": convention, "reflectance_scale": reflectance_scale,
+        "columns": columns and tuple(columns),
+    }  # fmt: skip
+    reading = replace(reading, **{key: value for key, value in given.items() if value is not None})
     if specs and not (model or stored or sensor):
-        sensor = _detected(specs[0], reading if columns is None else replace(reading, columns=tuple(columns)))
+        sensor = _detected(specs[0], reading)
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and not chosen.same_image(model.sensor):
         expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
@@ -211,15 +214,12 @@ def reading_for(
         options, _ = parse(spec)
         if options.name == FOLDER:
             refuse_other_samples(Path(options.folder), reading.sensor)
-    if reflectance_scale is None and estimate_scale and stored is None and name == FOLDER:
-        reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
-    elif reflectance_scale is None and specs:
-        reflectance_scale = scale_of(parse(specs[0])[0], reading.sensor.reflectance_scale)
-    requested = {
-        "projection": projection, "convention": convention, "reflectance_scale": reflectance_scale,
-        "columns": None if columns is None else tuple(columns),
-    }  # fmt: skip
-    return replace(reading, **{key: value for key, value in requested.items() if value is not None})  # type: ignore[arg-type]
+    if reflectance_scale is not None or not specs:
+        return reading
+    scale = reading.sensor.reflectance_scale
+    if not estimate_scale or stored or name != FOLDER:
+        scale = scale_of(parse(specs[0])[0], scale)
+    return replace(reading, reflectance_scale=scale)
 
 
 def _detected(spec: str, reading: Reading) -> str | None:
