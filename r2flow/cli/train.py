@@ -9,7 +9,6 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import DeviceOption, PrecisionOption, SamplerOptions, choose_device, grouped
-from r2flow.registry import check_options
 
 
 @app.command(
@@ -64,7 +63,6 @@ def pairs(
         "sampler": {"name": "adams3", **how.given}, "precision": precision, "num": num, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed, "knots": knots,
     }  # fmt: skip
-    check_options("the options of pairs", PairOptions, options)
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape
     )
