@@ -79,14 +79,10 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
     """
     for leftover in Path(run, FOLDER).glob(".*.part"):  # of killed writers
         leftover.unlink(missing_ok=True)
-    old = read_config(run)
-    if old is None:
-        write_config(run, config)
-        return None
-    differing, resumable = contradictions(old, config), _readable(run, RESUMED)
-    newest, last = next(resumable, None), None
-    if newest is not None:
-        if differing:
+    old, resumable, last = read_config(run), _readable(run, RESUMED), None
+    newest = next(resumable, None) if old else None
+    if old and newest:
+        if differing := contradictions(old, config):
             raise InputError(_another_config(run, differing))
         last = _fitting(run, chain([newest], resumable), state)
         samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]

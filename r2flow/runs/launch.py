@@ -42,8 +42,6 @@ from r2flow.signals import LATER, Stopped, listening, stop_at_once
 
 log = logging.getLogger("r2flow")
 
-Task = Callable[[DictConfig], None]
-
 
 class JobEnded(RuntimeError):
     """A job of a sweep ended before its run was finished; arguments: exit code and folder."""
@@ -147,7 +145,7 @@ def _checked_arguments(arguments: list[str]) -> list[str]:
     return [*(text for text in arguments if text not in overrides), *as_hydra_takes(overrides)]
 
 
-def _run_hydra(arguments: Sequence[str], job: Task) -> None:
+def _run_hydra(arguments: Sequence[str], job: Callable[[DictConfig], None]) -> None:
     """Run Hydra's main with these arguments; jobs see the process's original `sys.argv`."""
     original = sys.argv
 
