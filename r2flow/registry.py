@@ -99,6 +99,7 @@ class Registry(Mapping[str, T]):
         return f"Registry({self.kind}: {', '.join(self)})"
 
     def add(self, name: str, entry: T) -> None:
+        """Add an entry."""
         if name in self._entries:
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
         self._entries[name] = entry

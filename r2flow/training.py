@@ -55,6 +55,7 @@ EXPECTED_WARNINGS = (
     ".*smaller than the logging interval.*",
     "Checkpoint directory .* exists and is not empty.*",
     ".*isinstance.treespec, LeafSpec.*",
+    "You passed in a .val_dataloader. but have no .validation_step.*",
     "The dirpath has changed from.*",
     "Using ModelCheckpoint with manual optimization.*",
 )
