@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.solvers.solution import selected
@@ -107,8 +107,7 @@ class JumpTimes:
         if not self.steps or min(self.steps) < 1:
             raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
         _ = self.velocities, self.times  # refuse an unknown density or grid early
-        if self.diagonal + self.ends > 1:
-            raise InputError(f"diagonal + ends must be at most 1; found {self.diagonal} and {self.ends}.")
+        check(self.diagonal + self.ends <= 1, f"diagonal + ends must be at most 1; found {self.diagonal}, {self.ends}.")
 
     @cached_property
     def velocities(self) -> Callable[[Tensor], Tensor]:

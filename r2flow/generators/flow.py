@@ -14,7 +14,7 @@ from r2flow.generators.base import Condition, Generator
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.samplers import MMPS, FixedSteps, ODESampler, Progress, Sampler
+from r2flow.samplers import MMPS, FixedSteps, ODESampler, Sampler
 
 USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # default of a new flow
 
@@ -48,14 +48,12 @@ class Flow(Generator):
         t_1: float = 1.0,
         *,
         sampler: Sampler | None = None,
-        condition: Condition | None = None,
-        progress: Progress = None,
         **options: Any,
     ) -> Solution:
-        """Solve the ODE from x at t_0, (B, ...), to t_1; see `r2flow.flow.solvers.solve` for the options."""
+        """Solve the ODE from x at t_0, (B, ...), to t_1; for the options see `r2flow.flow.solvers.solve`."""
         how = sampler or self.sampler
         how.check(self)
-        return how.solve(self, x.to(self.device), t_0, t_1, condition, progress, **options)
+        return how.solve(self, x.to(self.device), t_0, t_1, **options)
 
 
 class NetworkFlow(Flow):

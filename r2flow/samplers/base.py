@@ -157,8 +157,8 @@ class OnGrid(Sampler):
     def __post_init__(self) -> None:
         if isinstance(self.grid, list | tuple):
             object.__setattr__(self, "grid", tuple(float(t) for t in self.grid))
-            if len(self.grid) != self.steps + 1:
-                raise InputError(f"the time grid has {len(self.grid) - 1} steps, found steps={self.steps}.")
+            steps = len(self.grid) - 1
+            check(steps == self.steps, f"the time grid has {steps} steps, found steps={self.steps}.")
             finish = getattr(self, "finish", 0) and self.steps > 1
             check(not finish, "a grid of times has its own last step: give finish=0.")
         self.times()

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from r2flow.data.augment import Augmentation
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.generators import Generator
 from r2flow.registry import Registry, lazy
 from r2flow.samplers import build_sampler
@@ -46,8 +46,7 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     """
     run_options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"]}
     for name, where in (("batch_size", "data.batch_size"), ("seed", "seed")):
-        if name in config["stage"]:
-            raise InputError(f"stage.{name} is the run's: leave it out, and give {where}.")
+        check(name not in config["stage"], f"stage.{name} is the run's: leave it out, and give {where}.")
     options = {**config["stage"], **run_options}
     options.pop("init", None)  # the generator has its weights already
     stage: Stage = STAGES.build(options, generator)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import check
 from r2flow.flow.solvers.adaptive import attainable
 from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Spent, finite
 
@@ -35,8 +35,7 @@ class TorchDiffEqMethod:
 
     def __post_init__(self) -> None:
         names = torchdiffeq_methods()
-        if self.name not in names:
-            raise InputError(f"torchdiffeq has no method {self.name!r} here; it has: {', '.join(sorted(names))}.")
+        check(self.name in names, f"torchdiffeq has no method {self.name!r} here; it has: {', '.join(sorted(names))}.")
 
     @property
     def adapts(self) -> bool:

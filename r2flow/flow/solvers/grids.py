@@ -29,8 +29,7 @@ def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
         p = float(text)
     except ValueError:
         p = math.nan
-    if kind != "power" or not 1 <= p <= 10:
-        raise InputError(f"a time grid is uniform or power:P with P from 1 to 10; found {name!r}.")
+    check(kind == "power" and 1 <= p <= 10, f"a time grid is uniform or power:P with P from 1 to 10; found {name!r}.")
     return lambda t_0, t_1, steps: power(t_0, t_1, steps, p)
 
 
