@@ -172,6 +172,8 @@ class ScanDataModule(L.LightningDataModule):
         trainer = self.trainer
         assert trainer is not None
         rank, ranks, accumulated = trainer.global_rank, trainer.world_size, trainer.accumulate_grad_batches
+        self.check_run(ranks, accumulated)  # also for a Trainer that `build` did not make
+        check(trainer.max_steps >= 1, "trainer.max_steps must be at least 1: it is the length of a run.")
         images = trainer.max_steps * self.batch_size
         sampler = RunSampler(self._order(self.training_source), self.batch_size // accumulated, images, rank, ranks)
         sampler.first_batch = trainer.global_step * accumulated
