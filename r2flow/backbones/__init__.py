@@ -30,8 +30,12 @@ def build_backbone(
 
     `in_channels` includes the channels of a condition; `out_channels` None means as many.
     """
-    common = {"in_channels": in_channels, "out_channels": out_channels, "second_time": second_time}
-    return BACKBONES.build({**options, **common}, rays)
+    arguments: dict[str, Any] = {"in_channels": in_channels}
+    if out_channels is not None:
+        arguments["out_channels"] = out_channels
+    if second_time:
+        arguments["second_time"] = True
+    return BACKBONES.build({**options, **arguments}, rays)
 
 
 def configurations() -> Registry[dict[str, Any]]:
