@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import lightning as L
 import torch
@@ -81,13 +81,13 @@ class TrainerRanges:
     max_epochs: Annotated[int, Bound("other than 0", lambda n: n != 0)] | None
     max_time: str | Mapping[str, Any] | None
     num_sanity_val_steps: Annotated[int, Bound("of at least -1", lambda n: n >= -1)] | None
-    overfit_batches: Annotated[float, Bound("0 (data.scenes or data.drives choose few scans)", lambda n: n == 0)]
+    overfit_batches: Annotated[float, Bound("equal to 0 (data.scenes, data.drives choose few scans)", lambda n: n == 0)]
     limit_train_batches: Annotated[None, Bound("(trainer.max_steps is the length of a run)", lambda n: True)]
     val_check_interval: Positive | str | Mapping[str, Any] | None
     check_val_every_n_epoch: Annotated[
         None, Bound("(a run is one epoch: give trainer.val_check_interval)", lambda n: True)
     ]
-    use_distributed_sampler: Annotated[bool, Bound("false (each device is given its own scans)", lambda n: not n)]
+    use_distributed_sampler: Annotated[Literal[False], Bound("(each device is given its own scans)", lambda n: True)]
     log_every_n_steps: Count
     accumulate_grad_batches: Count
     gradient_clip_val: NonNegative | None
