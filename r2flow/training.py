@@ -58,6 +58,7 @@ EXPECTED_WARNINGS = (
     "You passed in a .val_dataloader. but have no .validation_step.*",
     "The dirpath has changed from.*",
     "Using ModelCheckpoint with manual optimization.*",
+    "Be aware that when using .ckpt_path.*",  # a callback's options may change
 )
 
 

@@ -188,12 +188,18 @@ def test_damaged_checkpoints_of_later_steps_are_set_aside(train: Run, copied: Pa
 
 
 @pytest.mark.parametrize(("before", "keep", "options"), [(20, 1, []), (3, 2, ["callbacks.requeue=null"])])
-def test_a_run_resumes_with_fewer_checkpoints(train: Run, tmp_path: Path, before: int, keep: int, options: list[str]):
+def test_a_run_resumes_with_fewer_checkpoints(
+    train: Run, tmp_path: Path, before: int, keep: int, options: list[str], recwarn: pytest.WarningsRecorder
+):
     command, run = ["run_dir=run", "trainer.max_steps=8", "samples.num=0", *options], tmp_path / "run"
     train(*command, f"callbacks.checkpoint.keep={before}")
     checkpoints_of(run)[0].unlink()
     train(*command, f"callbacks.checkpoint.keep={keep}")
     assert [step_of(path) for path in checkpoints_of(run)] == [8, 6][:keep]
+    checkpoints_of(run)[0].unlink()
+    train(*command, "callbacks.checkpoint.every=1")
+    assert [step_of(path) for path in checkpoints_of(run)][:2] == [8, 7]
+    assert not [one for one in recwarn if "ckpt_path" in str(one.message)]
 
 
 def test_a_moved_run_goes_on(train: Run, alone: tuple[Path, str], copied: Path):
