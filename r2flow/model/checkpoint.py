@@ -303,7 +303,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
     """Read weights and config of an r2flow `.safetensors`, in the layout of the other checkpoints."""
     weights, metadata = read_tensors(path)
     notes = parse_json(metadata.get(NOTES, "{}"))
-    if notes.pop("digest", None) != _digest(notes, weights):
+    if not isinstance(notes, dict) or notes.pop("digest", None) != _digest(notes, weights):
         raise InputError(f"{path} is not of r2flow, or damaged: its checksum differs. Use another checkpoint.")
     config, step = notes["config"], int(notes["step"])
     check_tree(config)
