@@ -130,7 +130,7 @@ class Exported(NamedTuple):
 def export(
     checkpoint: Checkpoint, path: str | Path, sampler: Sampler | str | None = None, network: bool = False
 ) -> Exported:
-    """Write a flow as a `.pt2` (torch.export) or an `.onnx`.
+    """Write a rectified flow or a flow map as a `.pt2` (torch.export) or an `.onnx`.
 
     The input is `noise` (B, C, H, W). The outputs are `scan`, range in metres and reflectance, (B, 2 or 1, H, W), 0
     without a return, and `points` in metres, (B, 3, H, W), the origin without a return; float32. A `.pt2` unrolls all
@@ -142,12 +142,13 @@ def export(
         network: Export v(t, x) alone: `t` (B,) and `x` (B, C, H, W) to `v`; for a flow map also `s` (B,).
 
     Raises:
-        InputError: an unknown suffix, a generator that is not a flow, a sampler that cannot be exported, a missing
-            package, or a network that torch cannot export.
+        InputError: an unknown suffix, another generator, a sampler that cannot be exported, a missing package, or a
+            network that torch cannot export.
     """
     path, flow = Path(path), checkpoint.generator
     if not isinstance(flow, RectifiedFlow):
-        raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
+        kind = type(flow).__name__
+        raise InputError(f"only rectified flows and flow maps can be exported, and {checkpoint.path} holds a {kind}.")
     write, flow = FORMATS[path.suffix.removeprefix(".")], deepcopy(flow)  # which tracing moves and changes
     how = sampler if isinstance(sampler, Sampler) else flow.choose(sampler)
     own = type(flow).velocity is not RectifiedFlow.velocity
