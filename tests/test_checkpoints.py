@@ -131,11 +131,15 @@ def test_entries_of_another_kind_are_refused_in_one_line(saved, changed: dict):
     assert len(str(refused.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("kind", [torch.int8, torch.complex64, "sparse"])
+@pytest.mark.parametrize("kind", [torch.int8, torch.complex64, "sparse", math.nan, -math.inf])
 def test_weights_that_are_no_plain_numbers_are_refused(saved, kind):
     path, averaged = saved
     name = max(averaged, key=lambda one: averaged[one].numel())
-    value = averaged[name].to_sparse() if kind == "sparse" else averaged[name].to(kind)
+    value = averaged[name].to_sparse() if kind == "sparse" else averaged[name].clone()
+    if isinstance(kind, float):
+        value.view(-1)[-1] = kind
+    elif kind != "sparse":
+        value = value.to(kind)
     torch.save({**torch.load(path, weights_only=True), "state_dict": {**averaged, name: value}}, path)
     with pytest.raises(InputError, match=name.removeprefix("generator.")):
         load_checkpoint(path)

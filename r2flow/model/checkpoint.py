@@ -341,7 +341,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
 
 
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    """Check all names, shapes and types before loading."""
+    """Check all names, shapes, types and values before loading."""
     expected = model.state_dict()
     missing, surplus = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
     problems = [f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"]
@@ -358,3 +358,6 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
         ]
     if problems:
         raise InputError(f"its weights do not fit its config: {problems[0]}.")
+    sums = {name: value.sum(dtype=torch.float64) for name, value in weights.items()}  # faster than isfinite().all()
+    broken = next((name for name, total in sums.items() if not total.isfinite()), None)
+    check(broken is None, f"'{broken}' has values that are NaN or infinite. Use another checkpoint.")
