@@ -211,6 +211,11 @@ def test_a_scan_that_is_not_solved_is_flagged_and_said(tmp_path, caplog):
     assert torch.equal(drawn.images[::2], others.images[::2])
     write_samples(flow(Lost()), tmp_path, 3, 0, build_sampler("euler", steps=4), pictures=0, batch_size=3)
     assert "not solved, so no scans of this flow: 1" in caplog.text
+    caplog.clear()
+    flow(Lost()).sample(4, steps=4, batch_size=2)  # the second of each batch is lost
+    flow(Lost()).complete(torch.zeros(2, 2, 8, 64), num=2, batch_size=2)
+    said = [record.getMessage().partition("flow: ")[2].partition(";")[0] for record in caplog.records]
+    assert said == ["1", "3", "1 of the answers to scan 0", "1 of the answers to scan 1"]
 
 
 def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
-from r2flow.model.sampling import HasGenerator, Samples, draw
+from r2flow.model.sampling import HasGenerator, Samples, draw, warn_unsolved
 from r2flow.samplers import Transport, build_sampler, parse_sampler
 
 ANSWER = 2**32  # offset of the noise number between answers: answer 0 to scan i has the noise of sample i
@@ -74,7 +74,7 @@ def complete(
     progress: Progress = None,
     **changes: Any,
 ) -> Iterator[Completed]:
-    """Complete partial scans, one after another. Known rays are returned bit for bit.
+    """Complete partial scans, one after another, and warn of what is not solved. Known rays are returned bit for bit.
 
     A fully known scan costs no evaluation. A fully unknown scan is sampled as by `r2flow.model.sampling.sample`: answer
     0 to scan i is sample i of the seed.
@@ -126,11 +126,13 @@ def complete(
         answers = torch.cat([part.images for part in parts])
         shared = min(answers.shape[1], image.shape[0])
         answers[:, :shared] = torch.where(measured, image[:shared], answers[:, :shared])
+        converged = torch.cat([part.converged for part in parts])
+        warn_unsolved(converged, of=f" of the answers to scan {first + i}")
         yield Completed(
             answers * (answers[:, :1] > 0),
             first + i,
             torch.cat([part.evaluations for part in parts]),
-            torch.cat([part.converged for part in parts]),
+            converged,
             sum(part.seconds for part in parts),
         )
 

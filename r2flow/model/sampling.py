@@ -1,5 +1,6 @@
 """Sampling: scan i depends on (seed, i) alone, up to the network's rounding in different batches."""
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from r2flow.generators import Condition, Generator, Sampler
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
+
+log = logging.getLogger(__name__)
 
 
 class HasGenerator(Protocol):
@@ -56,7 +59,7 @@ def sample(
     progress: Progress = None,
     **changes: Any,
 ) -> Iterator[Samples]:
-    """Draw scans 0 to num - 1 of a seed, batch by batch.
+    """Draw scans 0 to num - 1 of a seed, batch by batch, and warn of those that are not solved.
 
     Args:
         source: A checkpoint or its generator.
@@ -82,7 +85,9 @@ def sample(
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
         batch_condition = condition and {name: value[first : numbers.stop] for name, value in condition.items()}
-        yield draw(generator, numbers, seed, chosen, batch_condition, region, precision, progress)
+        drawn = draw(generator, numbers, seed, chosen, batch_condition, region, precision, progress)
+        warn_unsolved(drawn.converged, first)
+        yield drawn
 
 
 @torch.no_grad()
@@ -115,6 +120,17 @@ def draw(
     if region is not None and evaluated is not None:
         images = region.place(region.crop(evaluated.place(images)))
     return Samples(images, numbers[0], generated.evaluations.cpu(), generated.converged.cpu(), seconds)
+
+
+def warn_unsolved(converged: Tensor, first: int = 0, of: str = "") -> None:
+    """Warn about unconverged scans; `first` is the number of the first scan, `of` says of what."""
+    lost = [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]
+    if lost:
+        log.warning(
+            "not solved, so no scans of this flow: %s%s; try another solver, or for a velocity that is singular at t = "
+            "1 a last step before it: --sampler adams3:finish=0.001.",
+            ", ".join(lost), of,
+        )  # fmt: skip
 
 
 def evaluated_region(generator: Generator, region: Region) -> Region:

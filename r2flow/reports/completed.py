@@ -27,7 +27,7 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.models import DEFAULT, DENSIFY
 from r2flow.progress import track
-from r2flow.reports.outputs import ScanBar, recipe_of, warn_unsolved
+from r2flow.reports.outputs import ScanBar, recipe_of
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
 from r2flow.store import Store, read_manifest
@@ -93,7 +93,6 @@ def write_completed(
             )  # fmt: skip
             if not done:  # the first answer shows that the settings are valid
                 store.write_manifest(inputs={**before, **inputs})
-            warn_unsolved(completed.converged)
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed, whole if job.mask else None)
             _write(checkpoint, scan, out, files[scan.name], given, completed)

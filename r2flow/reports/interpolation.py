@@ -13,7 +13,8 @@ from r2flow.generators import Sampler
 from r2flow.inversion import TIGHT, Real, interpolate_scans, round_trip
 from r2flow.lidar.projection import image_to_points, write_scan
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.outputs import ScanBar, warn_unsolved
+from r2flow.model.sampling import warn_unsolved
+from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import (
     draw_birds_eye,

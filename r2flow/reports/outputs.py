@@ -21,7 +21,7 @@ from r2flow.generators.base import Precision
 from r2flow.lidar.projection import write_scan
 from r2flow.lidar.region import Region
 from r2flow.model.checkpoint import FOLDER, Checkpoint, weights_hash
-from r2flow.model.sampling import draw
+from r2flow.model.sampling import draw, warn_unsolved
 from r2flow.progress import Bar, track
 from r2flow.reports.view import most_images, write_page
 from r2flow.store import MANIFEST, FileStore, read_manifest
@@ -100,17 +100,6 @@ def _chosen(checkpoint: Checkpoint, formats: Sequence[str] | None) -> Sequence[s
             "bin centres, closer to the returns (docs/data.md, Projection)"
         )
     return formats
-
-
-def warn_unsolved(converged: Tensor, first: int = 0) -> None:
-    """Warn about unconverged scans; `first` is the number of the first scan."""
-    lost = [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]
-    if lost:
-        log.warning(
-            "not solved, so no scans of this flow: %s; try another solver, or for a velocity that is singular at t = 1 "
-            "a last step before it: --sampler adams3:finish=0.001.",
-            ", ".join(lost),
-        )
 
 
 def _stale(store: FileStore, replace: bool) -> list[Path]:

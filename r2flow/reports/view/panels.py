@@ -25,7 +25,7 @@ from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
-from r2flow.reports.outputs import ScanBar, warn_unsolved
+from r2flow.reports.outputs import ScanBar
 from r2flow.reports.view import write_page
 from r2flow.samplers import OnGrid
 
@@ -120,8 +120,6 @@ def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: 
     with ScanBar("sampling", num * len(samplers), evaluations) as bar:
         for sampler in samplers:
             batches = list(sample(flow, num, seed, sampler=sampler, progress=bar.evaluated))
-            for batch in batches:
-                warn_unsolved(batch.converged, batch.first)
             sets.append(torch.cat([batch.images for batch in batches]).nan_to_num(0.0).numpy())
             bar.set(num * len(sets))
     rays, label = flow.sensor.rays(), f"{label}, seed {seed}"
