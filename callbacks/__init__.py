@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, GradientAccumulationScheduler, LearningRateMonitor, ModelCheckpoint
 
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import FOLDER
@@ -50,6 +50,8 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
             check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
             callback = entry.constructor(*given, **wanted[name])
             built += callback if isinstance(callback, list) else [callback]
+    if any(isinstance(callback, GradientAccumulationScheduler) for callback in built):  # the loader needs one number
+        raise InputError("leave the GradientAccumulationScheduler out, and give trainer.accumulate_grad_batches.")
     if config["loggers"]:
         built.append(LearningRateMonitor("step"))
     return built

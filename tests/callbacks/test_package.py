@@ -3,8 +3,10 @@ import sys
 
 import lightning as L
 import pytest
+from lightning.pytorch.callbacks import GradientAccumulationScheduler
 
 from r2flow.callbacks import CALLBACKS, build_callbacks
+from r2flow.errors import InputError
 from r2flow.runs.composing import compose
 from tests.conftest import ROOT
 
@@ -27,3 +29,11 @@ def test_a_class_alone_is_a_callback_of_the_table(monkeypatch):
     CALLBACKS.add("say", Say)
     built = build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.say.every=2"]))
     assert [one.every for one in built if isinstance(one, Say)] == [2]
+
+
+def test_a_number_of_parts_that_changes_is_refused(monkeypatch):
+    """The loader reads it once: images would repeat, in batches of another size."""
+    monkeypatch.setattr(CALLBACKS, "_entries", dict(CALLBACKS._entries))
+    CALLBACKS.add("parts", GradientAccumulationScheduler)
+    with pytest.raises(InputError, match=r"give trainer\.accumulate_grad_batches"):
+        build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.parts.scheduling={0: 1, 2: 2}"]))
