@@ -12,9 +12,10 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from r2flow.data.loader import Further
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator
+from r2flow.model.checkpoint import COMPILED
 from r2flow.noise import seed_torch
 from r2flow.processes import average_gradients
 from r2flow.registry import Count, Natural, NonNegative, Portion
@@ -89,6 +90,10 @@ class Stage(L.LightningModule):
             raise InputError(f"stage={name} learns from scans, not from data=pairs; give stage=reflow.")
         if not self.several_sensors and any(part.get("sensor") for part in data.get("parts") or ()):
             raise InputError(f"stage={name} learns from scans of one sensor: leave sensor out of data.parts.")
+
+    def on_train_start(self) -> None:
+        wrapped = any(COMPILED in name for name, _ in self.generator.named_parameters())
+        check(not wrapped, "torch.compile(module) renames the weights in checkpoints: use module.compile() instead.")
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout uses torch's global generator: seeding it by position makes a resumed run draw the same numbers.

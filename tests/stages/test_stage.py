@@ -8,6 +8,7 @@ from lightning.pytorch.plugins import MixedPrecision
 from torch import nn
 from torch.utils.data import DataLoader
 
+from r2flow.errors import InputError
 from r2flow.generators import Generated, Generator
 from r2flow.stages import Stage
 from r2flow.stages.base import SingleLoss
@@ -100,6 +101,15 @@ class Slope(Stage):
 
     def training_step(self, batch, batch_idx):
         self.take_step(self.own_optimizers()[0], self.slope * self.generator.layer.bias.sum())
+
+
+def test_a_wrapped_network_is_refused_and_one_compiled_in_place_trains(tmp_path):
+    compiled, wrapped = Automatic(), Automatic()
+    compiled.generator.layer.compile(backend="eager")
+    assert fitted(compiled, tmp_path).state_dict().keys() == wrapped.state_dict().keys()
+    wrapped.generator.layer = torch.compile(wrapped.generator.layer)
+    with pytest.raises(InputError, match=r"use module\.compile"):
+        fitted(wrapped, tmp_path)
 
 
 @pytest.mark.parametrize("slope", [0.02, 0.5])
