@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Self
 
 import torch
@@ -239,7 +240,8 @@ class TransferFlow(Flow):
         """Losses over the hidden rays: negative log-likelihood of log r and of a return, mean |error| of reflectance.
 
         x_1, (B, C, H, W), are crops that do not span a full turn, t their times, (B,); `steps` are those of
-        `Surroundings.of`, `rows` the output of `RowFeatures`.
+        `Surroundings.of`, `rows` the output of `RowFeatures`. In eval mode, each loss is the mean over the scans' own
+        losses, whatever the batch.
         """
         about = Surroundings.of(self.space, condition, ring=False, steps=steps)
         known = condition[KNOWN]
@@ -250,15 +252,16 @@ class TransferFlow(Flow):
         returned, hidden = metres[:, :1] > 0, condition[KNOWN][:, :1] < 1
         log_r = torch.where(returned, metres[:, :1], 1.0).log()
         mask = (returned & hidden).float()
+        mean = partial(_mean_over, dims=(0, 1, 2, 3) if self.training else (1, 2, 3))
         losses = {
-            "range": -_mean_over(answers.log_density(log_r), mask),
-            "return": _mean_over(
+            "range": -mean(answers.log_density(log_r), mask),
+            "return": mean(
                 F.binary_cross_entropy_with_logits(answers.returns, returned.float(), reduction="none"), hidden.float()
             ),
         }
         if self.space.encoding.reflectance:
             errors = (answers.strengths - metres[:, 1:2]).abs()
-            losses["reflectance"] = _mean_over((answers.logits.detach().exp() * errors).sum(1, keepdim=True), mask)
+            losses["reflectance"] = mean((answers.logits.detach().exp() * errors).sum(1, keepdim=True), mask)
         return losses
 
 
@@ -312,5 +315,5 @@ def _within_reach(known: Tensor) -> Tensor:
     return torch.stack(reach)[:, None, :, None]
 
 
-def _mean_over(values: Tensor, weight: Tensor) -> Tensor:
-    return (values * weight).sum() / weight.sum().clamp(min=1)
+def _mean_over(values: Tensor, weight: Tensor, dims: tuple[int, ...]) -> Tensor:
+    return ((values * weight).sum(dims) / weight.sum(dims).clamp(min=1)).mean()

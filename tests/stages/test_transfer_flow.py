@@ -304,6 +304,10 @@ def test_what_it_learns_from_lowers_the_loss(scans):
     batch = {name: torch.stack([part[name] for part in one]) for name in one[0]}
     batch |= {"x_0": torch.randn(x_1.shape), "k": torch.arange(3)}
     u, by = torch.tensor([0.2, 0.6, 0.9]), torch.optim.Adam(learner.parameters(), 1e-2)
+    learner.eval()  # in validation the scans count alike in any batch
+    alone = [learner.regression_loss({n: v[[i]] for n, v in batch.items()}, u[[i]]).item() for i in range(3)]
+    assert learner.regression_loss(batch, u).item() == pytest.approx(sum(alone) / 3, rel=1e-5)
+    learner.train()
     losses = []
     for _ in range(30):
         loss = learner.regression_loss(batch, u)
