@@ -22,6 +22,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint, read_checkpoint
 from r2flow.model.published import inert
 from r2flow.noise import Draws
+from r2flow.reports.training import read_curves
 from r2flow.samplers import build_sampler
 from r2flow.systems.gan import dcgan, losses, style_gan
 from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, affine, coloured, transformed
@@ -29,7 +30,7 @@ from r2flow.systems.gan.dcgan import DustyV1, VanillaGan
 from r2flow.systems.gan.layers import logistic, straight_through_mask
 from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
 from r2flow.systems.gan.style_gan import DustyV2
-from r2flow.training import compose
+from r2flow.training import build, compose, fit
 from tests.conftest import ROOT, Trap
 from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
 
@@ -374,6 +375,21 @@ def test_a_generator_with_a_mask_needs_draws():
     made = generator(noise, draws=Draws(0, range(2)), sampler=build_sampler("direct", truncation=0.7))
     assert made.evaluations.tolist() == [1, 1]
     assert float(made.x.abs().max()) <= 1
+
+
+def test_each_row_of_the_log_has_the_augmentation_of_its_step_and_the_last_penalty(tmp_path: Path):
+    run = build(compose([
+        "experiment=dusty2", "size=small", *TINY, "trainer.max_steps=5", "trainer.log_every_n_steps=1", "loggers=[csv]",
+        f"run_dir={tmp_path}", "callbacks.pictures=null", "samples.num=0",
+    ]))  # fmt: skip
+    stage: Any = run.stage
+    expected: list[float] = []
+    stage.on_train_batch_end = lambda *_: expected.append(float(stage.augment.p))
+    fit(run)
+    curves = read_curves(tmp_path, ("train/augmented", "train/last_r1"))
+    assert curves["train/augmented"][1].tolist() == pytest.approx(expected)
+    assert len(set(expected)) == 3  # in five steps it moves after every second
+    assert [len(set(each)) for each in curves["train/last_r1"]] == [4, 2]
 
 
 @pytest.mark.slow

@@ -27,7 +27,8 @@ class LearnGan(Stage):
 
     All that D sees is warmed up (`r2flow.systems.gan.losses.Warmup`) and augmented (`AdaptiveAugment`). Both learn by
     Adam at a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is
-    r1 r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's.
+    r1 r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's. The log has the probability of
+    augmentation after each step (`train/augmented`) and R1 when it was last measured (`train/last_r1`).
 
     Args:
         discriminator: Name and options, as `{name: style_gan, base_channels: 32}`.
@@ -95,9 +96,10 @@ class LearnGan(Stage):
         if self.r1 and step % self.r1_every == 0:
             penalty = self.penalty(real, images, BatchDraws(self.seed, batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
-            self.log("train/r1", penalty, sync_dist=True)
-        if self.augment is not None and self.augment.every and step % self.augment.every == 0:
-            self.augment.move()
+            self.log("train/last_r1", penalty, sync_dist=True)  # Lightning repeats it until the next one
+        if self.augment is not None:
+            if self.augment.every and step % self.augment.every == 0:
+                self.augment.move()
             self.log("train/augmented", self.augment.p)
         self.log("train/loss", loss, prog_bar=True, sync_dist=True)
         self.log("train/discriminator", wrong, prog_bar=True, sync_dist=True)
