@@ -91,7 +91,9 @@ def prepare(
     if levels is not None:
         kept = f"reflectance as n/{levels}, " + (f"at most {error:.2g} off" if error else "exactly")
     skipped = f"; {left_out} scans left out" if left_out else ""
+    there = shards - round(made.tasks[0].completed)
     of = f"{scans} scan{'s' * (scans != 1)} in {shards} shard{'s' * (shards != 1)}"
+    of += f" ({there} were there already)" if there else ""
     print(f"{out}: {of}, {size / 2**20:.1f} MiB; range within {range_error * 1e3:.2f} mm, {kept}{skipped}")
 
 

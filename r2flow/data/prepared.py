@@ -25,7 +25,7 @@ from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, Codes, find_levels, fits, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, lacks_reflectance, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, read_manifest
 
@@ -77,7 +77,7 @@ def plan_files(
         "revision": PROJECTION, "layout": layout, "scans": len(names), "names": checksum(names),
         "reading": reading.described(), "levels": levels, "shard_scans": shard_scans,
     }  # fmt: skip
-    return Plan(recipe, named, ScanFiles(paths, reading))
+    return Plan(recipe, named, ScanFiles(paths, reading, root))
 
 
 def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
@@ -123,7 +123,11 @@ def _make_shard(store: Store, source: ScanSource, skip: bool, shard: int) -> Non
             codes = tensors[name][row] = coder.encode(image[i])
             errors[i] = max(errors[i], float(np.abs(coder.values[codes] - image[i]).max()))
     kept = {name: codes[: len(numbers) - len(left_out)] for name, codes in tensors.items()}
-    store.write(shard, kept, {"left_out": left_out, "errors": errors})
+    store.write(shard, kept, {"left_out": left_out, "errors": errors, "files": _files(source, numbers)})
+
+
+def _files(source: ScanSource, numbers: Sequence[int]) -> str:
+    return source.subset(numbers).contents[:16]
 
 
 def prepare(
@@ -136,15 +140,24 @@ def prepare(
 ) -> list[dict[str, Any]]:
     """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves out unusable scans.
 
-    The headers of the shards have the numbers of the scans left out, and maximum errors of range and reflectance.
+    The headers of the shards have the numbers of the scans left out, maximum errors of range and reflectance, and a
+    digest of the files (`ScanFiles.contents`): shards of files that have changed since are refused.
     `checked` and `made` are called with each shard.
     """
     store = plan.store(folder)
     if not store.check() or store.missing(plan.shards):
         store.begin(drives=[[drive.name, drive.scans] for drive in plan.drives])
     store.mend(plan.shards, checked)
+    missing, parts = store.missing(plan.shards), enumerate(shards_of(plan.recipe))
+    found = {shard: _files(plan.source, numbers) for shard, numbers in parts if shard not in missing}
+    others = [store.files(n)[0].name for n, files in found.items() if store.head(n).get("files", files) != files]
+    check(
+        not others,
+        f"{store.folder} holds scans of other files: {at_most_three(others)}. Give another folder by {store.option}, "
+        "or remove these to make them again.",
+    )
     work = partial(_make_shard, store, plan.source, on_bad_scan == "skip")
-    store.make(store.missing(plan.shards), work, workers, made)
+    store.make(missing, work, workers, made)
     notes = [store.head(shard) for shard in plan.shards]
     if sum(len(note["left_out"]) for note in notes) == plan.recipe["scans"]:
         raise InputError(f"all {plan.recipe['scans']} scans were left out as unusable; remove {store.folder}.")

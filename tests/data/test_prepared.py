@@ -248,6 +248,25 @@ def test_another_recipe_is_refused_in_the_same_folder(clouds: Path, tmp_path: Pa
     assert files(tmp_path) == before
 
 
+def test_other_files_of_the_same_names_are_refused_and_a_mended_one_is_taken(clouds: Path, tmp_path: Path):
+    root, out = Path(shutil.copytree(clouds, tmp_path / "scans")), tmp_path / "out"
+    bad, whole = root / "drive0" / "000004.bin", files(make(tmp_path / "whole", plan_of(clouds)))
+    bad.write_bytes(b"")
+    with pytest.raises(InputError, match="holds no points"):
+        make(out, plan_of(root))
+    shutil.copy(clouds / "drive0" / "000004.bin", bad)
+    assert files(make(out, plan_of(root))) == whole
+    write_cloud(bad, 99)  # of equal size
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"out holds scans of other files: scans-000001.safetensors\. Give"):
+            make(out, plan_of(root))
+        (out / "scans-000002.safetensors").unlink(missing_ok=True)  # then as if killed
+    (out / "scans-000001.safetensors").unlink()
+    assert [name for name, content in files(make(out, plan_of(root))).items() if content != whole[name]] == [
+        "scans-000001.safetensors"
+    ]
+
+
 def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch):
     make(tmp_path, plan_of(clouds))
     refused = Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
@@ -368,6 +387,8 @@ def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
     said = r2flow.said(*typed, "--workers", 1)
     assert f"{out}: 6 scans in 2 shards, 0.0 MiB; range within" in said
     assert "reflectance as n/256, exactly" in said
+    (out / "scans-000001.safetensors").unlink()
+    assert "6 scans in 2 shards (1 were there already), 0.0 MiB" in r2flow.said(*typed, "--workers", 1)
     source = prepared_in(out)
     assert len(source) == 6
     raw = read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))
