@@ -110,10 +110,12 @@ class ScanDataModule(L.LightningDataModule):
                 held.append(source.subset(last))
         else:
             training, held = whole, [self._open(other, first_scene)]
-            shared = held[0].places() & set().union(*(source.places() for source in whole))
-            if shared:
+        if other is not None or len(whole) > 1:
+            trained, validated = (set().union(*(source.places() for source in side)) for side in (training, held))
+            if shared := trained & validated:
                 log.warning(
-                    "data.validation.data holds %d scans that are trained on, as %s: give it its own split or drives",
+                    "%s holds %d scans that are trained on, as %s: give each set its own split or drives",
+                    "data.validation.data" if other else "a held-out block of data.parts",
                     len(shared), min(shared),
                 )  # fmt: skip
         validation = _joined(held)

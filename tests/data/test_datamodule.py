@@ -173,6 +173,16 @@ def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_pat
     assert "holds 1 scans that are trained on" in caplog.messages[-1]
 
 
+def test_a_part_that_trains_on_what_another_holds_out_is_said(numbered: Path, tmp_path: Path, caplog):
+    folder_of(tmp_path / "other", 20, 2)  # the last of them held out
+    parts = [{"name": "folder", "root": str(root)} for root in (numbered, tmp_path / "other")]
+    for link, scan, said in (("0", "000000", ""), ("00", "000011", "held-out block of data.parts holds 1 scans that")):
+        (tmp_path / "other" / f"{link}.bin").symlink_to(numbered / f"{scan}.bin")
+        module(name="mixed", parts=parts)
+        assert said in caplog.text
+        assert bool(said) == bool(caplog.text)
+
+
 def test_validation_is_never_augmented(numbered: Path):
     options = {"name": "folder", "root": str(numbered), "validation": {"share": 0.5}}
     plain = next(iter(module(**options).val_dataloader()))
