@@ -39,6 +39,7 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
     """
     if any(key_of(text) == "stage.init" for text in given):
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
+    in_files = any(re.match(r"data=(?!simulated|mixed)", text) for text in given)
     links: list[Link] = []
     for name, difference in chain.items():
         groups = isinstance(difference, Mapping) and isinstance(difference.get("stage") or {}, Mapping)
@@ -49,7 +50,7 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         overrides = [
             override("stage" if key == "stage.name" else key, value)  # a choice, with its own options
             for key, value in flatten(settings)
-            if (key, value) != ("experiment", None)
+            if (key, value) != ("experiment", None) and not (in_files and key == "data.scenes")
         ]
         if any(key_of(text) == "plugins" for text in overrides):
             raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")

@@ -236,6 +236,17 @@ def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path, tmp_path: Path, monkeypatch):
+    ran: list[list[str]] = []
+    monkeypatch.setattr("r2flow.runs.chain.run_process", lambda command: ran.append(command) or 2)
+    command = ["experiment=r2flow", "size=small", "data=folder", f"data.root={scans}", "trainer.accelerator=cpu"]
+    assert "chain.rf1: scans in files are no" in in_process(tmp_path, [*command, "data.scenes=5"], check=False).refusal
+    in_process(tmp_path, command, check=False)
+    assert len(ran) == 1  # of both
+    (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=simulated"])
+    assert link.overrides[:2] == ("data.scenes=9", "data=simulated")
+
+
 def test_what_is_given_to_one_link_wins_over_what_is_given_to_all():
     given = ["chain.rf1.trainer.max_steps=5", "trainer.max_steps=9", "+chain.rf2.seed=2"]
     first, second = links_of({"rf1": {"trainer": {"max_steps": 5}}, "rf2": {"init": "rf1", "seed": 2}}, "runs", given)
