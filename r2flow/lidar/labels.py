@@ -38,7 +38,8 @@ def labels_beside(scan: str | Path) -> Path | None:
     """The label file of a scan: `labels/000000.label` for `velodyne/000000.bin`, or `000000.label` next to it."""
     scan = Path(scan)
     name = f"{scan.stem}.label"
-    for path in (scan.parent.parent / "labels" / name, scan.with_name(name)):
+    labels = scan.parent.parent / "labels" if scan.parent.name == "velodyne" else scan.parent
+    for path in (labels / name, scan.with_name(name)):
         if path.exists() or path.is_symlink():  # returns broken links, too: reading them raises
             return path
     return None

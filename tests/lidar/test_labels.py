@@ -50,6 +50,11 @@ def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Pa
     np.testing.assert_array_equal(read_labels(beside, scan), IDS)
 
 
+def test_labels_are_not_those_of_completed_scans_next_to_the_folder(scan: Path, label: Path):
+    assert labels_beside(scan) == label
+    assert labels_beside(scan.parent.parent / "dense" / scan.name) is None
+
+
 def test_each_pixel_has_the_label_of_its_nearest_return(scan: Path, label: Path):
     image, labels = read_labelled_scan(scan, Reading(SENSOR, reflectance=True))
     r = np.linalg.norm(XYZ, axis=1)
