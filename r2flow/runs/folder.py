@@ -110,7 +110,8 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
 
 def _another_config(run: str | Path, differing: list[str]) -> str:
     length = all(text.startswith("trainer.max_steps=") for text in differing)
-    more_steps = f", stage.init={run} name=OTHER to learn on from its weights" if length else ""
+    last = checkpoints_of(run)[0]  # not the folder: the run may not be finished
+    more_steps = f", stage.init={last} name=OTHER to learn on from its weights" if length else ""
     return (
         f"{run} holds a run of another config: {at_most_three(differing)}. "
         f"Give the same command to resume it{more_steps}, or name=OTHER for a new one."
