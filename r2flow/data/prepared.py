@@ -147,17 +147,19 @@ def prepare(
     store = plan.store(folder)
     if not store.check() or store.missing(plan.shards):
         store.begin(drives=[[drive.name, drive.scans] for drive in plan.drives])
-    store.mend(plan.shards, checked)
-    missing, parts = store.missing(plan.shards), enumerate(shards_of(plan.recipe))
-    found = {shard: _files(plan.source, numbers) for shard, numbers in parts if shard not in missing}
-    others = [store.files(n)[0].name for n, files in found.items() if store.head(n).get("files", files) != files]
-    check(
-        not others,
-        f"{store.folder} holds scans of other files: {at_most_three(others)}. Give another folder by {store.option}, "
-        "or remove these to make them again.",
-    )
+    parts = shards_of(plan.recipe)
+
+    def look(shard: int) -> None:
+        file = store.files(shard)[0]
+        check(
+            not file.exists() or store.head(shard)["files"] == _files(plan.source, parts[shard]),
+            f"{file} holds scans of other files. Give another folder by {store.option}, or remove it to make it again.",
+        )
+        checked(shard)
+
+    store.mend(plan.shards, look)
     work = partial(_make_shard, store, plan.source, on_bad_scan == "skip")
-    store.make(missing, work, workers, made)
+    store.make(store.missing(plan.shards), work, workers, made)
     notes = [store.head(shard) for shard in plan.shards]
     if sum(len(note["left_out"]) for note in notes) == plan.recipe["scans"]:
         raise InputError(f"all {plan.recipe['scans']} scans were left out as unusable; remove {store.folder}.")

@@ -52,7 +52,11 @@ def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Pa
 
 def test_labels_are_not_those_of_completed_scans_next_to_the_folder(scan: Path, label: Path):
     assert labels_beside(scan) == label
-    assert labels_beside(scan.parent.parent / "dense" / scan.name) is None
+    dense = scan.parent.parent / "dense"
+    dense.mkdir()
+    assert labels_beside(dense / scan.name) == label
+    (dense / "manifest.json").touch()
+    assert labels_beside(dense / scan.name) is None
 
 
 def test_each_pixel_has_the_label_of_its_nearest_return(scan: Path, label: Path):
