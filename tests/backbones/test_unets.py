@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from r2flow.backbones import BACKBONES, build_backbone
-from r2flow.backbones.convolutions import Resample, SinusoidalTime
+from r2flow.backbones.convolutions import Resample
 from r2flow.errors import InputError
 from r2flow.registry import check_options
 from tests.reference import backbone_outputs, load_case
@@ -27,11 +27,6 @@ def test_resampling_is_the_references(shared):
         torch.testing.assert_close(resample.kernel, case["kernel"], rtol=0, atol=0)
         torch.testing.assert_close(resample(units["h"]), case["out"], rtol=0, atol=1e-5)
     assert len(cases) == 6
-
-
-def test_time_features_are_the_references(shared):
-    units = load_case(shared, "units_encodings.pt")
-    torch.testing.assert_close(SinusoidalTime(64)(units["sin_t"]), units["sin64"], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("window", [(1, 1), (1, 3, 3, 1)])
