@@ -25,13 +25,6 @@ def module(encoding: Encoding | None = None, **options) -> ScanDataModule:
     return data
 
 
-def test_scans_too_many_for_memory_are_read_when_needed(numbered: Path):
-    lazy = module(name="folder", root=str(numbered), memory_gib=0)
-    kept = module(name="folder", root=str(numbered))
-    assert lazy.training_source.paths  # a source of files
-    np.testing.assert_array_equal(lazy.training_source[3], kept.training_source[3])
-
-
 def test_validation_batches_are_the_same_every_time(numbered: Path):
     data = module(name="folder", root=str(numbered), validation={"share": 0.5}, batch_size=4)
     assert numbers(data.training_source) == list(range(6))

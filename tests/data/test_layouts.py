@@ -80,18 +80,6 @@ def test_a_missing_or_empty_root_says_what_was_looked_for(layout: str, tmp_path:
         find_drives(layout, tmp_path)
 
 
-def test_the_real_layouts(shared: Path):
-    real = shared / "real"
-    assert len(find_drives("kitti_360", real / "kitti360", "test")[0].scans) == 15
-    with pytest.raises(InputError, match="of its train split"):
-        find_drives("kitti_360", real / "kitti360", "train")
-    assert [len(d.scans) for d in find_drives("kitti_raw", real / "raw")] == [20, 11]
-    assert names(find_drives("odometry", real / "odometry")) == ["00", "08"]
-    assert sum(len(d.scans) for d in find_drives("folder", real / "other_sensors")) == 6
-    assert [len(d.scans) for d in find_drives("object", real / "object", "train")] == [3]
-    assert len(find_drives("nuscenes", real / "other_sensors" / "nuscenes_hdl32e")[0].scans) == 1
-
-
 def test_a_split_that_holds_nothing_says_what_there_is_and_how_to_take_it(tmp_path: Path):
     for drive in ("08", "11", "12"):
         write_scan(tmp_path / "sequences" / drive / "velodyne" / "000000.bin", 1)

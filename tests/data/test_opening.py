@@ -54,12 +54,6 @@ class TestNames:
         assert numbers(open_scans(numbered, READING)) == list(range(12))
         assert open_scans(numbered, READING).spread(3).source.names == ["000002.bin", "000006.bin", "000010.bin"]
 
-    def test_one_file_of_each_scan_is_taken(self, tmp_path: Path):
-        write_scan(tmp_path / "a.bin", 1)
-        write_image(tmp_path / "a.npy", 2)
-        write_scan(tmp_path / "b.bin", 3)
-        assert open_scans(tmp_path, READING).source.names == ["a.npy", "b.bin"]
-
     def test_a_usual_sensor_is_the_data_set_s(self):
         assert reading_for(["nuscenes:x"]) == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)
         assert reading_for(["kitti_raw:x"]) == Reading(SENSORS["hdl64e"])
