@@ -40,8 +40,9 @@ NAMES = ("time", "z", "x", "y", "ring", "intensity")
         {"delimiter": " ", "header": "X Y Z Intensity", "comments": "//"},
         {"delimiter": ",", "header": '"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","intensity"', "comments": ""},
         {"delimiter": " ", "header": "a scan of mine\nof today", "comments": "# "},
+        {"delimiter": " ", "header": "here are x y z in metres", "comments": "# "},
     ],
-    ids=["spaces", "commas", "tabs", "semicolons", "units", "CloudCompare", "VeloView", "comments"],
+    ids=["spaces", "commas", "tabs", "semicolons", "units", "CloudCompare", "VeloView", "comments", "a sentence"],
 )
 def test_columns_of_text(tmp_path: Path, ending: str, options: dict):
     path = tmp_path / f"a.{ending}"
@@ -278,9 +279,4 @@ def test_a_comment_with_a_name_for_each_number_names_the_columns(tmp_path: Path,
     columns = {"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2], "intensity": INTENSITY}
     table = np.column_stack([columns.get(name, np.full(len(XYZ), 0.5)) for name in words.strip("#").split()])
     np.savetxt(tmp_path / "a.txt", table, fmt="%.3f", header=words)
-    same(read_points(tmp_path / "a.txt"))
-
-
-def test_a_comment_that_only_speaks_of_columns_names_none(tmp_path: Path):
-    np.savetxt(tmp_path / "a.txt", TABLE, fmt="%.3f", header="here are x y z in metres")
     same(read_points(tmp_path / "a.txt"))

@@ -45,13 +45,6 @@ def test_points_to_image_to_points(sensor, projection):
     np.testing.assert_array_equal(project(xyz, reflectance, sensor.name, projection), again)
 
 
-def test_azimuth_starts_behind_on_the_left_and_falls():
-    points = np.array([point(10, -1, a) for a in (179.9, 90, 0, -90, -179.9)])
-    image = project(points, np.arange(1, 6) / 10, HDL64E)
-    columns = {round(float(image[1, h, w]) * 10): w for h, w in np.argwhere(image[0] > 0)}
-    assert columns == {1: 0, 2: 256, 3: 512, 4: 768, 5: 1023}
-
-
 def test_a_pixel_keeps_the_nearest_return_in_any_order():
     points = np.array([point(r, -5, 20) for r in (30, 12, 50)])
     for order in ([0, 1, 2], [1, 0, 2], [2, 0, 1]):

@@ -39,16 +39,6 @@ def expect_rows(points, reflectance=REFLECTANCE, ring=None):
 # --- what each format says, by hand ---
 
 
-def test_kitti_rows_are_four_little_endian_floats(tmp_path):
-    path = saved(tmp_path, "a.bin", b"".join(struct.pack("<4f", *row[:4]) for row in ROWS))
-    expect_rows(read_points(path))
-
-
-def test_nuscenes_rows_are_five_floats_and_the_last_is_the_ring(tmp_path):
-    path = saved(tmp_path, "a.pcd.bin", b"".join(struct.pack("<5f", *row) for row in ROWS))
-    expect_rows(read_points(path), ring=RING)
-
-
 def test_pcd_ascii_in_any_order_and_case_with_other_fields(tmp_path):
     text = pcd_header("label Z Remission X ring y", "2 4 8 4 2 4", "U F F F U F", "ascii")
     text += "".join(f"9 {z} {i} {x} {ring} {y}\n" for x, y, z, i, ring in ROWS)
@@ -64,15 +54,6 @@ def test_pcd_binary_of_mixed_types_with_a_field_of_several_numbers(tmp_path):
     rows = [struct.pack("<3Bdff2BB3fb", 7, 7, 7, x, y, z, 7, 7, int(i * 2), 9, 9, 9, ring) for x, y, z, i, ring in ROWS]
     points = read_points(saved(tmp_path, "a.pcd", header.encode() + b"".join(rows)))
     expect_rows(points, reflectance=[1, 0, 2], ring=RING)  # as stored, not rescaled
-
-
-def test_pcd_compressed_is_stored_field_by_field(tmp_path):
-    columns = [struct.pack("<3f", *(row[k] for row in ROWS)) for k in (1, 0, 2, 3)]
-    plain = b"".join(columns)
-    packed = b"".join(bytes([len(column) - 1]) + column for column in columns)  # literals only
-    body = struct.pack("<II", len(packed), len(plain)) + packed
-    header = pcd_header("y x z i", "4 4 4 4", "F F F F", "binary_compressed")
-    expect_rows(read_points(saved(tmp_path, "a.pcd", header.encode() + body)))
 
 
 def test_pcd_without_count_and_points_lines_and_without_reflectance(tmp_path):

@@ -32,13 +32,6 @@ def test_rays_are_the_middles_of_their_bins(sensor):
     assert (a.diff(dim=1) < 0).all()
 
 
-def test_the_reference_s_rays_are_bin_corners(shared):
-    # el = 3 - 28 h / H, az = 180 - 360 w / W degrees (facts of the reference), and its tensor itself.
-    reference = torch.load(shared / "oracle" / "units_encodings.pt", weights_only=False)["hdl_16x64"][0]
-    rays = SENSORS["hdl64e"].resized(16, 64).rays("reference")
-    torch.testing.assert_close(rays, reference, rtol=0, atol=1e-6)
-
-
 def test_resizing_keeps_the_field_of_view(sensor):
     height = sensor.shape[0]
     for rows in (height // 2, height, height * 2, height + 3):
