@@ -1,6 +1,5 @@
 """A small sensor, scans of it, and a network that needs no weights."""
 
-from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
 
@@ -58,17 +57,12 @@ def one_of_each_class() -> list[str]:
         return list({type(build()): name for name, build in METRICS.items()}.values())
 
 
-def random_scans(n: int, seed: int = 0, scale: float = 40.0, sensor: Sensor = SMALL) -> Scans:
+def scans_of(n: int, seed: int = 0, scale: float = 40.0, sensor: Sensor = SMALL) -> Scans:
     """Random scans, (n, 2, H, W): as far as `scale` metres, decided by a seed."""
     g = torch.Generator().manual_seed(seed)
     r = 4 + scale * torch.rand(n, 1, *sensor.shape, generator=g) * torch.rand(n, 1, 1, 1, generator=g)
     r = r * (torch.rand(n, 1, *sensor.shape, generator=g) < 0.8)
     return Scans(torch.cat([r, torch.rand(r.shape, generator=g) * (r > 0)], 1), sensor)
-
-
-@pytest.fixture
-def scans_of() -> Callable[..., Scans]:
-    return random_scans
 
 
 def measured(metric: ScanMetric, real: Scans, generated: Scans) -> ScanMetric:

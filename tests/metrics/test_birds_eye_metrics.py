@@ -11,7 +11,7 @@ from r2flow.metrics import jsd_mmd, lidm
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.jsd_mmd import JSD, MMD, MMDUnbiased
 from r2flow.metrics.lidm import JSDLiDM, MMDLiDM
-from tests.metrics.conftest import given, measured
+from tests.metrics.conftest import given, measured, scans_of
 
 
 def test_reference_figures(shared):
@@ -53,7 +53,7 @@ def cells(points, size, depth=(1.0, 56.0)):
     return {tuple(cell) for cell in np.floor(inside[:, :2] / np.float32(size)).astype(int).tolist()}
 
 
-def test_jsd_of_the_other_toolbox_counts_scans_that_hold_a_cell(scans_of):
+def test_jsd_of_the_other_toolbox_counts_scans_that_hold_a_cell():
     def shares(scans):
         held = [cells(p.numpy(), 0.05) for p in scans.points]
         every = set().union(*held)
@@ -70,7 +70,7 @@ def test_jsd_of_the_other_toolbox_counts_scans_that_hold_a_cell(scans_of):
     assert measured(JSDLiDM(), real, generated).compute()["jsd_lidm"] == pytest.approx(math.sqrt(divergence), rel=1e-9)
 
 
-def test_mmd_of_the_other_toolbox_is_the_mean_distance_to_the_best_match(scans_of, monkeypatch):
+def test_mmd_of_the_other_toolbox_is_the_mean_distance_to_the_best_match(monkeypatch):
     monkeypatch.setattr(lidm, "BLOCK", 2)
     real, generated = scans_of(5, 1), scans_of(3, 2)
 

@@ -10,14 +10,14 @@ from r2flow.metrics import METRICS
 from r2flow.metrics.bootstrap import bootstrap
 from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
-from tests.metrics.conftest import measured, one_of_each_class
+from tests.metrics.conftest import measured, one_of_each_class, scans_of
 
 EXACT = ["frechet_handcrafted", "jsd", "mmd"]  # where a scan of weight 2 is one that is there twice
 
 
 @pytest.mark.parametrize("name", EXACT)
 @pytest.mark.parametrize("many", [False, True])
-def test_a_weight_is_how_often_a_scan_is_there(name, many, scans_of, summary):
+def test_a_weight_is_how_often_a_scan_is_there(name, many, summary):
     sets = {"real": scans_of(15 if many else 5, 1), "generated": scans_of(14 if many else 6, 2)}
     draw = np.random.default_rng(0)
     copies = {side: torch.from_numpy(draw.integers(0, 3, (2, len(scans)))) for side, scans in sets.items()}
@@ -62,7 +62,7 @@ def test_intervals_are_as_wide_as_statistics_say_near_equal_sets_too(apart):
     assert np.mean(variances) == pytest.approx(4 * apart**2 * s + 2 * 32 * s**2, rel=0.2)
 
 
-def test_every_metric_has_an_interval_around_its_figure_or_says_that_it_has_none(scans_of, summary, coarse):
+def test_every_metric_has_an_interval_around_its_figure_or_says_that_it_has_none(summary, coarse):
     for name in one_of_each_class():
         metric = measured(METRICS[name](keep=True), scans_of(20, 1), scans_of(20, 2, scale=25))
         found = bootstrap(metric, draws=20)
@@ -90,7 +90,7 @@ def test_the_interval_of_a_negative_figure_lies_around_it():
     assert (low, high) == pytest.approx((middle - 1.96 * sigma, middle + 1.96 * sigma), abs=0.25 * sigma)
 
 
-def test_draws_depend_on_the_seed_only(scans_of):
+def test_draws_depend_on_the_seed_only():
     def intervals(**options):
         metric = measured(METRICS["jsd"](keep=True), scans_of(9, 1), scans_of(9, 2))
         return bootstrap(metric, draws=26, **options)
@@ -101,7 +101,7 @@ def test_draws_depend_on_the_seed_only(scans_of):
     assert intervals() != intervals(seed=1)
 
 
-def test_what_cannot_be_resampled_is_refused(scans_of):
+def test_what_cannot_be_resampled_is_refused():
     with pytest.raises(AssertionError, match="found 3"):
         bootstrap(METRICS["jsd"](keep=True), draws=3)
     metric = METRICS["mmd"]()

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from r2flow.metrics.frechet import FrechetDistance, add_moments, frechet_distance, merge_moments, moments
-from tests.metrics.conftest import measured
+from tests.metrics.conftest import measured, scans_of
 
 
 def zeros(d):
@@ -76,7 +76,7 @@ def test_float32_features_far_from_zero_lose_nothing():
         np.testing.assert_allclose(found.covariance, expected, rtol=0, atol=1e-10 * expected.max())
 
 
-def test_fewer_scans_than_dimensions_is_exact_and_said(scans_of, summary):
+def test_fewer_scans_than_dimensions_is_exact_and_said(summary):
     real, generated = scans_of(4, 1), scans_of(5, 2)
     metric = measured(FrechetDistance(summary), real, generated)
     # tr (S_1 S_2)^(1/2) is the nuclear norm of the centred features' product: no covariance is made.

@@ -20,7 +20,7 @@ from r2flow.metrics.extractors.handcrafted import (
     HandcraftedRange,
 )
 from r2flow.metrics.scans import Scans
-from tests.metrics.conftest import random_scans
+from tests.metrics.conftest import scans_of
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 BOTH, RANGE = Handcrafted(), HandcraftedRange()
@@ -77,7 +77,7 @@ def test_one_wall_before_another_has_two_edges_in_every_row():
 
 
 def test_a_turn_changes_the_sectors_alone_and_a_mirror_image_sides_and_signs():
-    some = random_scans(3, sensor=SENSOR)
+    some = scans_of(3, sensor=SENSOR)
     own = by_name(BOTH.features(some))
     turned = by_name(BOTH.features(Scans(some.images.roll(SENSOR.columns // SECTORS, -1), SENSOR)))
     any_turn = by_name(BOTH.features(Scans(some.images.roll(5, -1), SENSOR)))
@@ -101,7 +101,7 @@ def test_a_turn_changes_the_sectors_alone_and_a_mirror_image_sides_and_signs():
 @pytest.mark.parametrize("sensor", ["vlp16", "os1_64"])
 def test_any_sensor_and_size_with_and_without_reflectance(sensor, shape):
     resized = SENSORS[sensor].resized(*shape)
-    some = random_scans(2, sensor=resized)
+    some = scans_of(2, sensor=resized)
     assert BOTH.features(some).shape == (2, BOTH.dim)
     assert BOTH.features(some).isfinite().all()
     of_range = RANGE.features(Scans(some.images[:, :1], resized))
@@ -114,5 +114,5 @@ def test_a_scan_of_one_return_and_the_same_scan_among_many_have_features():
     one = torch.zeros(*SENSOR.shape)
     one[3, 7] = 12.0
     assert BOTH.features(scans(one)).isfinite().all()
-    many = random_scans(40, sensor=SENSORS["hdl64e"].resized(64, 256))  # more than are computed at once
+    many = scans_of(40, sensor=SENSORS["hdl64e"].resized(64, 256))  # more than are computed at once
     torch.testing.assert_close(BOTH.features(many)[17:18], BOTH.features(Scans(many.images[17:18], many.sensor)))

@@ -15,7 +15,7 @@ from r2flow.errors import InputError
 from r2flow.metrics import METRICS
 from r2flow.metrics.base import SIDES
 from r2flow.metrics.scans import Scans
-from tests.metrics.conftest import SMALL, one_of_each_class
+from tests.metrics.conftest import SMALL, one_of_each_class, scans_of
 
 REAL, GENERATED = 12, 9
 ORDERED = ("auc", "auc_range")  # whose folds are blocks of scans
@@ -29,7 +29,7 @@ def build(request, summary):
 
 
 @pytest.fixture
-def sets(scans_of):
+def sets():
     return {"real": scans_of(REAL, 1), "generated": scans_of(GENERATED, 2, scale=30)}
 
 

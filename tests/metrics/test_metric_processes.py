@@ -14,14 +14,14 @@ from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.frechet import FrechetDistance
 from r2flow.metrics.manifold import Manifold
 from r2flow.metrics.scans import Scans
-from tests.metrics.conftest import random_scans
+from tests.metrics.conftest import scans_of
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 PLAIN = ("jsd", "mmd", "jsd_lidm", "mmd_lidm")
 
 
 def images(seed, n):
-    made = random_scans(n, seed, sensor=SENSOR).images
+    made = scans_of(n, seed, sensor=SENSOR).images
     made[1] = 0  # an empty scan
     return made
 
