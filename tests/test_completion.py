@@ -152,16 +152,9 @@ def test_a_model_of_another_sensor_is_not_saved_as_that_of_training(tmp_path):
         network().through("vlp16").save(tmp_path / "moved.safetensors")
 
 
-class Noise(Generator):
-    """No flow."""
-
-    def __init__(self) -> None:
-        super().__init__(network().generator.space, (4,))
-
-
 def test_a_generator_that_cannot_complete_is_refused():
-    with pytest.raises(InputError, match="a Noise cannot complete a scan: that needs a flow of range images"):
-        completing(Noise())
+    with pytest.raises(InputError, match="a Generator cannot complete a scan: that needs a flow of range images"):
+        completing(Generator(network().generator.space, (4,)))
 
 
 def test_a_flow_without_a_condition_says_what_completes_with_it():

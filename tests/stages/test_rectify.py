@@ -70,12 +70,8 @@ def fitted(stage: Rectify, batch: Callable[[int], dict[str, torch.Tensor]], step
     return stage
 
 
-@pytest.fixture(scope="module")
-def trained() -> Rectify:
-    return fitted(Rectify(affine()), independent, 1500)
-
-
-def test_the_velocity_is_the_conditional_mean(trained):
+def test_the_velocity_is_the_conditional_mean():
+    trained = fitted(Rectify(affine()), independent, 1500)
     # E[x_1 - x_0 | x_t] of jointly Gaussian variables: cov / var times the deviation, plus the mean.
     for t in (0.25, 0.5, 0.75):
         x = torch.tensor([-0.5, 0.5, 1.0]).reshape(3, 1, 1, 1)
