@@ -137,12 +137,6 @@ def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
     torch.testing.assert_close(twice, expected, rtol=0, atol=1e-5)
 
 
-def test_it_can_also_be_solved_as_the_flow_that_it_is(grown):
-    x_0 = Draws(0, range(2)).start(grown.noise_shape)
-    how = build_sampler("adams3", steps=4)
-    assert torch.equal(grown(x_0, sampler=how).x, parent()(x_0, sampler=how).x)
-
-
 OWN = build_sampler("adams3", steps=16, grid="power:1.75")
 
 
