@@ -40,28 +40,6 @@ def numbered(shape: tuple[int, ...]):
     return lambda j: randn(*shape, seed=100 + j)
 
 
-# The problem
-
-
-def test_the_dense_gaussian_moves_with_its_velocity():
-    prior, x_0, h = gaussian(), randn(3, WIDTH), 1e-6
-    for t in (0.2, 0.7):
-        central = (prior.solution(x_0, t + h) - prior.solution(x_0, t - h)) / (2 * h)
-        torch.testing.assert_close(central, prior(torch.tensor(t), prior.solution(x_0, t)), rtol=1e-6, atol=1e-6)
-
-
-def test_the_posterior_of_a_known_part_is_that_of_the_precision_matrix():
-    prior = gaussian()
-    y = randn(int(ROWS.sum()))
-    found = prior.posterior(torch.eye(WIDTH).double()[ROWS], y, 0.0)
-    precision = torch.linalg.inv(ring())
-    inner, across = precision[~ROWS][:, ~ROWS], precision[~ROWS][:, ROWS]
-    mean = 0.3 - torch.linalg.solve(inner, across @ (y - 0.3))
-    torch.testing.assert_close(found.means[0][~ROWS], mean)
-    torch.testing.assert_close(found.covariances[0][~ROWS][:, ~ROWS], torch.linalg.inv(inner))
-    torch.testing.assert_close(found.means[0][ROWS], y)
-
-
 # What is measured
 
 
