@@ -272,13 +272,6 @@ def test_what_makes_whole_images_alone_makes_the_region_that_is_all():
         next(sample(gan, 1, region=region((16, 32), rows=(0, 7))))
 
 
-def test_a_model_of_range_alone_draws_range_alone():
-    alone = network(reflectance=False)
-    (ranges,) = sample(alone, 1, steps=2)
-    assert ranges.images.shape == (1, 1, 8, 64)
-    assert alone.generator.backbone.in_channels == 1
-
-
 def test_numeric_times_decide_the_number_of_steps():
     own = build_sampler("euler", grid=(0.0, 0.3, 1.0))
     assert own.steps == 2
