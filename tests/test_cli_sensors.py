@@ -68,15 +68,6 @@ def test_points_of_another_frame_are_warned_of(r2flow, tmp_path: Path):
     assert "not found, 1.73 m assumed" in said  # a round room without a floor
 
 
-def test_files_that_count_rings_from_other_numbers_are_warned_of(r2flow, tmp_path: Path):
-    xyz, ring = image_to_points(np.full((1, 8, 128), 2.5, np.float32), MINE)[0], np.arange(8).repeat(128)
-    for first, warned in ((0, False), (1, True)):
-        for name, shift in (("0", 0), ("1", 0), ("2", first)):
-            write_points(tmp_path / f"{name}.ply", xyz, ring=ring + shift)
-        code, _, error = r2flow("sensor", tmp_path)
-        assert (code, "do all files count rings from the same number" in error) == (0, warned)
-
-
 def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, tmp_path: Path):
     given, out = write_scans(tmp_path / "scans", SENSORS["pandar64"], 2, 1), tmp_path / "out"
     for verb in (

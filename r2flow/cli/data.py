@@ -110,7 +110,6 @@ def sensor(
     Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py (sensor=mine).
     """
     from r2flow.data.sources import spread, warn_of_frame
-    from r2flow.lidar.beams import RINGS, SAME
     from r2flow.lidar.estimation import estimate_sensor, nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
     from r2flow.lidar.sensor_files import ENDINGS, write_sensor
@@ -143,8 +142,6 @@ def sensor(
     ]
     print_table(rows, ("", ""))
     warn_of_frame(paths[0], points)
-    if beams.order == RINGS and (beams.elevations[:-1] - beams.elevations[1:]).min() < SAME:
-        log.warning("two beams have the same elevation: do all files count rings from the same number?")
     if out is not None:
         write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
         print(out)

@@ -152,7 +152,7 @@ def prepare(
     def look(shard: int) -> None:
         file = store.files(shard)[0]
         check(
-            not file.exists() or store.head(shard)["files"] == _files(plan.source, parts[shard]),
+            not file.exists() or store.head(shard).get("files") == _files(plan.source, parts[shard]),
             f"{file} holds scans of other files. Give another folder by {store.option}, or remove it to make it again.",
         )
         checked(shard)

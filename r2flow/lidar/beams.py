@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -47,7 +46,6 @@ class Beams:
         return np.concatenate([np.abs(elevations_of(s.xyz) - self.elevations[row])[row >= 0] for s, row in pairs])
 
 
-@lru_cache(maxsize=1)  # for further questions about the same scans
 def find_beams(*scans: Points) -> Beams:
     """Find beams by ring numbers, else by the order of the points, else by their elevations only."""
     beams = _beams([scan.with_lost_rays() for scan in scans])

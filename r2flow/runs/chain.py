@@ -39,7 +39,6 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
     """
     if any(key_of(text) == "stage.init" for text in given):
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
-    in_files = any(re.match(r"data=(?!simulated|mixed)", text) for text in given)
     links: list[Link] = []
     for name, difference in chain.items():
         groups = isinstance(difference, Mapping) and isinstance(difference.get("stage") or {}, Mapping)
@@ -47,25 +46,28 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
             raise InputError(f"chain.{name}: a link has a folder's name and groups of keys; found {difference!r}.")
         settings = dict(difference)
         parent = settings.pop("init", None)
-        overrides = [
+        own = [
             override("stage" if key == "stage.name" else key, value)  # a choice, with its own options
             for key, value in flatten(settings)
-            if (key, value) != ("experiment", None) and not (in_files and key == "data.scenes")
+            if (key, value) != ("experiment", None)
         ]
-        if any(key_of(text) == "plugins" for text in overrides):
+        if any(key_of(text) == "plugins" for text in own):
             raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")
         if parent is not None:
             if parent not in [link.name for link in links]:
                 raise InputError(f"chain.{name}.init={parent}: no link of that name comes before it.")
-            overrides.append(override("stage.init", str(Path(folder, parent))))
+            own.append(override("stage.init", str(Path(folder, parent))))
         reads_scans = parent is None and (settings.get("stage") or {}).get("init") is None
         concerning = ("all", "scans" if reads_scans else "pairs")
-        overrides += [text for text in given if rule(key_of(text)).links in concerning]
+        overrides = [text for text in given if rule(key_of(text)).links in concerning]
         # Overrides given for this link alone come last: they replace the link's own keys.
         alone = [text.lstrip("+") for text in given if text.lstrip("+").startswith(f"chain.{name}.")]
         overrides += [key for text in alone if not (key := text.removeprefix(f"chain.{name}.")).startswith("init=")]
+        sets = [text for text in (*own, *overrides) if key_of(text) == "data"]
+        if sets and not re.match("data='?(simulated|mixed)", sets[-1]):  # scans in files are no scenes
+            own = [text for text in own if key_of(text) != "data.scenes"]
         run_dir = Path(folder, name)
-        links.append(Link(name, run_dir, (*overrides, override("run_dir", str(run_dir))), parent))
+        links.append(Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent))
     return links
 
 

@@ -110,7 +110,7 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
 
 def _another_config(run: str | Path, differing: list[str]) -> str:
     length = all(text.startswith("trainer.max_steps=") for text in differing)
-    last = checkpoints_of(run)[0]  # not the folder: the run may not be finished
+    last = next((path for path, _ in _readable(run)), run)  # not the folder: the run may not be finished
     more_steps = f", stage.init={last} name=OTHER to learn on from its weights" if length else ""
     return (
         f"{run} holds a run of another config: {at_most_three(differing)}. "

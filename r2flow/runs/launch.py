@@ -281,12 +281,12 @@ def _check_links(links: Sequence[Any]) -> None:
 
     folders, configs = _config_folders(), dict[str, Any]()
     for link in links:
+        config, parent = compose(link.overrides, folders), None
+        if link.parent is not None:
+            before = configs[link.parent]
+            steps = before["trainer"]["max_steps"]
+            parent = Parent(before, Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt"), steps)
         try:
-            config, parent = compose(link.overrides, folders), None
-            if link.parent is not None:
-                before = configs[link.parent]
-                steps = before["trainer"]["max_steps"]
-                parent = Parent(before, Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt"), steps)
             configs[link.name] = check(config, link.overrides, parent)
         except InputError as error:
             raise InputError(f"chain.{link.name}: {error} For another link alone: +chain.LINK.KEY=VALUE.") from None

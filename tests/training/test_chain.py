@@ -245,6 +245,10 @@ def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path
     assert len(ran) == 1  # of both
     (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=simulated"])
     assert link.overrides[:2] == ("data.scenes=9", "data=simulated")
+    chain = {"rf1": {"data": {"scenes": 8}}, "rf2": {"init": "rf1", "data": {"scenes": 9}}}
+    files, child = links_of(chain, "runs", ["data=folder"])  # which a child does not read
+    assert "data.scenes=8" not in files.overrides
+    assert "data.scenes=9" in child.overrides
 
 
 def test_what_is_given_to_one_link_wins_over_what_is_given_to_all():
