@@ -114,7 +114,8 @@ class Store:
         (path,) = self.files(item)
         if path.is_symlink() and not path.exists():
             path.unlink()
-        write_file(path, save(dict(tensors), metadata={"r2flow": json.dumps(note)}))
+        stored = {name: np.asarray(value, order="C") for name, value in tensors.items()}
+        write_file(path, save(stored, metadata={"r2flow": json.dumps(note)}))
 
     def read(self, item: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Read tensors and notes of an item and verify its checksum.

@@ -13,7 +13,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.space import build_space
-from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from r2flow.model.checkpoint import Checkpoint, check_weights, load_checkpoint, save_checkpoint
 from r2flow.model.published import published_config
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.conftest import CONFIG, Trap, small_disk
@@ -216,6 +216,12 @@ print([name for name in heavy if name in sys.modules])
     assert done.stdout.strip() == "[]"
 
 
+def test_a_buffer_may_be_infinite_as_the_mask_of_an_attention_is():
+    network = torch.nn.Linear(1, 1)
+    network.register_buffer("mask", torch.tensor(-math.inf))
+    check_weights(network, network.state_dict())
+
+
 def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
     config = {key: CONFIG[key] for key in ("sensor", "encoding", "backbone")}
     mine = Checkpoint(build_generator(config).eval(), config)
@@ -228,4 +234,8 @@ def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
     for half in (False, True):
         save_checkpoint(mine, tmp_path / "compiled.safetensors", half)
         assert load_checkpoint(tmp_path / "compiled.safetensors").generator.state_dict().keys() == names
+    with torch.no_grad():
+        max(mine.generator.parameters(), key=torch.Tensor.numel).fill_(1e5)
+    with pytest.raises(InputError, match="float16"):
+        save_checkpoint(mine, tmp_path / "compiled.safetensors", half=True)
     assert repr(loaded) == "Checkpoint(mine, rectified_flow, 8x64 hdl64e, step 0)"

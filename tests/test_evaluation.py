@@ -20,7 +20,7 @@ from r2flow.evaluation.comparing import with_equal_panels
 from r2flow.evaluation.measuring import MetricResult, Work, gather_real, measure, real_rule
 from r2flow.evaluation.references import reference_sets
 from r2flow.evaluation.sets import sampled_set
-from r2flow.evaluation.statistics import FORMAT, Cache, key_of
+from r2flow.evaluation.statistics import FORMAT, Cache, Statistics, key_of
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -95,6 +95,17 @@ class TestCache:
             path.write_bytes(path.read_bytes()[:100])
         assert figures(there, other, cache) == expected
         assert "are damaged" in caplog.text
+
+    def test_a_transposed_state_is_kept_and_another_recipe_gathered_again(self, tmp_path):
+        cache, state = Cache(tmp_path), torch.arange(6.0).view(2, 3).T
+        cache.write("key", Statistics({"x": state}, 1, 0))
+        kept = cache.read("key")
+        assert kept is not None
+        assert torch.equal(kept.states["x"], state)
+        (path,) = tmp_path.glob("*/*.safetensors")
+        recipe = cache._store("key").digest.encode()
+        path.write_bytes(path.read_bytes().replace(recipe, recipe[::-1]))
+        assert cache.read("key") is None
 
     def test_sampled_scans_are_never_kept(self, tmp_path):
         gather_real({"jsd": JSD()}, sampled_set(flow(), "flow", 2), Work(), Cache(tmp_path / "cache"))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from r2flow.data.sets import ScanSet
+from r2flow.errors import InputError
 from r2flow.files import cache_folder
 from r2flow.metrics.base import ScanMetric
 from r2flow.store import Damaged, Store, checksum
@@ -44,7 +45,7 @@ class Cache:
             states, notes = self._store(key).read(0)
         except FileNotFoundError:
             return None
-        except Damaged as error:
+        except (Damaged, InputError) as error:
             log.warning("statistics in %s are damaged (%s): recomputing them.", self.folder, error)
             return None
         return Statistics({name: torch.from_numpy(value) for name, value in states.items()}, **notes)

@@ -333,6 +333,8 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     if half:
         large = [n.replace(COMPILED, "") for n, value in parameters if value.ndim > 1 and value.numel() > SMALL]
         weights |= {n: weights[n].half() for n in large}
+        finite = all(weights[n].isfinite().all() for n in large)
+        check(finite, f"{path}: weights beyond 65504 do not fit into float16: save them without half.")
     plugins = [Path(name).name for name in checkpoint.config.get("plugins") or ()]
     config = learned(checkpoint.config) | ({"plugins": plugins} if plugins else {})
     notes = {"config": config, "step": checkpoint.step, **checkpoint.generator.drawing()}
@@ -358,6 +360,6 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
         ]
     if problems:
         raise InputError(f"its weights do not fit its config: {problems[0]}.")
-    sums = {name: value.sum(dtype=torch.float64) for name, value in weights.items()}  # faster than isfinite().all()
-    broken = next((name for name, total in sums.items() if not total.isfinite()), None)
+    learned = (name for name, _ in model.named_parameters())  # buffers may be infinite, as the mask of an attention
+    broken = next((n for n in learned if not weights[n].sum(dtype=torch.float64).isfinite()), None)  # faster than all()
     check(broken is None, f"'{broken}' has values that are NaN or infinite. Use another checkpoint.")

@@ -58,6 +58,7 @@ def page(
     """
     arrays = [np.asarray(scan, dtype=np.float32) for scan in images]
     stacks = [array.reshape(-1, *array.shape[-3:]) for array in arrays]
+    assert all(stack.shape[1] in (1, 2) for stack in stacks)
     count, pixels = sum(map(len, stacks)), sum(stack[:, 0].size for stack in stacks)
     if not 0 < pixels <= MOST:
         raise InputError(
