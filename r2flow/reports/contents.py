@@ -15,7 +15,6 @@ def describe(path: str | Path) -> dict[str, Any]:
     rows, columns = loaded.sensor.shape
     model = name_of(loaded.path)
     about = {"model": model, "draws": MODELS[model].about, "licence": MODELS[model].licence} if model else {}
-    broken = [name for name, value in loaded.generator.state_dict().items() if not value.isfinite().all()]
     return {
         **about,
         "path": str(loaded.path),
@@ -26,7 +25,6 @@ def describe(path: str | Path) -> dict[str, Any]:
         "generator": (loaded.config.get("generator") or {}).get("name", "rectified_flow"),
         "backbone": (loaded.config["backbone"] or {}).get("name"),
         "parameters": sum(p.numel() for p in loaded.generator.parameters()),
-        **({"not finite": ", ".join(broken)} if broken else {}),
         "image": [loaded.encoding.channels, rows, columns],
         "sensor": loaded.sensor.name,
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],
