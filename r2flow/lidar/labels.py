@@ -37,9 +37,9 @@ LAYOUT = "labels of little-endian uint32, one a point"
 def labels_beside(scan: str | Path) -> Path | None:
     """The label file of a scan: `labels/000000.label` for `velodyne/000000.bin`, or `000000.label` next to it."""
     scan = Path(scan)
-    beside = scan.with_suffix(".label")
+    file = scan.with_suffix(".label")
     made = scan.with_name("manifest.json").exists()  # by r2flow: completed scans are not the labelled ones
-    for path in (beside,) if made else (scan.parent.parent / "labels" / beside.name, beside):
+    for path in (file,) if made else (scan.parent.parent / "labels" / file.name, file):
         if path.exists() or path.is_symlink():  # returns broken links, too: reading them raises
             return path
     return None

@@ -120,7 +120,7 @@ class ScanMetric(Metric):
     def figures(self) -> tuple[dict[str, float], list[str]]:
         """Compute values by name, and remarks, from the states; default: `resampled` with weights 1."""
         if any(self.count(side) < self.fewest for side in SIDES):
-            return {self.name: float("nan")}, [f"{self.name} needs {self.fewest} scans of each set."]
+            return {self.name: float("nan")}, [f"{self.name} needs {self.fewest} or more scans of each set."]
         weights: dict[Side, Tensor] = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
         return {name: float(value) for name, value in self.resampled(weights).items()}, []
 

@@ -360,6 +360,6 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
         ]
     if problems:
         raise InputError(f"its weights do not fit its config: {problems[0]}.")
-    learned = (name for name, _ in model.named_parameters())  # buffers may be infinite, as the mask of an attention
-    broken = next((n for n in learned if not weights[n].sum(dtype=torch.float64).isfinite()), None)  # faster than all()
+    names = (name for name, _ in model.named_parameters())  # buffers may be infinite, as the mask of an attention
+    broken = next((n for n in names if not weights[n].sum(dtype=torch.float64).isfinite()), None)  # faster than all()
     check(broken is None, f"'{broken}' has values that are NaN or infinite. Use another checkpoint.")

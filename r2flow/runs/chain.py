@@ -64,7 +64,7 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         alone = [text.lstrip("+") for text in given if text.lstrip("+").startswith(f"chain.{name}.")]
         overrides += [key for text in alone if not (key := text.removeprefix(f"chain.{name}.")).startswith("init=")]
         sets = [text for text in (*own, *overrides) if key_of(text) == "data"]
-        if sets and not re.match("data='?(simulated|mixed)", sets[-1]):  # scans in files are no scenes
+        if sets and not re.match("data='?(simulated|mixed)", sets[-1]):  # scans in files are not simulated scenes
             own = [text for text in own if key_of(text) != "data.scenes"]
         run_dir = Path(folder, name)
         links.append(Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent))
