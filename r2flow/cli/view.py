@@ -8,16 +8,13 @@ from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, choose_device, grouped, numbers
 from r2flow.errors import InputError, check
-
-if TYPE_CHECKING:
-    from r2flow.reports.view.panels import Panel
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +45,7 @@ def show(
     panels = (
         panel for spec in scans for panel in scan_panels(spec, how.reading([spec], estimate_scale=True), most, labels)
     )
-    for caption, (image,), rays, classes in panels:
+    for caption, (image,), rays, classes, _ in panels:
         file = Path(caption)
         names.append(next(s for n in count(1) if (s := file.stem if n == 1 else f"{file.stem}_{n}") not in names))
         path = out / f"{names[-1]}.{format}"
@@ -95,7 +92,8 @@ def view(
     """
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.reports.view.panels import in_turn, sample_panels, scan_panels, way_panels, write_panels
+    from r2flow.reports.view import Panel, write_page
+    from r2flow.reports.view.panels import in_turn, sample_panels, scan_panels, way_panels
 
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out must be a file that ends in .html, found {out}.")
@@ -109,22 +107,18 @@ def view(
     counts = numbers("steps", steps) if steps else []
     check(not times or len(counts) <= 1, f"--times takes one number of --steps, found {steps}.")
     panels: list[Panel] = []
-    frames: list[str] = []
     for spec in what:
         if spec not in models:
             new = list(scan_panels(spec, how.reading([spec], estimate_scale=True), num or SCANS))
-            if sequence and len(new) > 1:
-                combined, frames = in_turn(new, spec)
-                new = [combined]
+            new = [in_turn(new, spec)] if sequence and len(new) > 1 else new
         elif times:
             model = load_checkpoint(spec, choose_device(device))
-            new, frames = way_panels(model, spec, num or SAMPLES, seed, counts[0] if counts else None, times)
+            new = way_panels(model, spec, num or SAMPLES, seed, counts[0] if counts else None, times)
         else:
             new = sample_panels(load_checkpoint(spec, choose_device(device)), spec, num or SAMPLES, seed, counts)
-            frames = [f"sample {number}" for number in range(num or SAMPLES)] if counts else []
         panels += new
     title = ", ".join(Path(spec).name or spec for spec in what)
-    path = write_panels(out or Path(mkdtemp(prefix="r2flow-"), "view.html"), panels, frames, title)
+    path = write_page(out or Path(mkdtemp(prefix="r2flow-"), "view.html"), panels, title)
     print(path)
     if out is None:
         open_browser(path)

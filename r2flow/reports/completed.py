@@ -29,7 +29,7 @@ from r2flow.models import DEFAULT, DENSIFY
 from r2flow.progress import track
 from r2flow.reports.outputs import ScanBar, recipe_of
 from r2flow.reports.pictures import completed_figure, save_figure
-from r2flow.reports.view import write_page
+from r2flow.reports.view import Panel, write_page
 from r2flow.store import Store, read_manifest
 
 SHOWN = 4  # answers on a page
@@ -217,8 +217,7 @@ def _draw(
     shown = completed.images.numpy()[:SHOWN]
     answers = [(f"answer {number}" if len(shown) > 1 else "answer", image) for number, image in enumerate(shown)]
     first, *_ = named = [("what is known", given.image), *answers, *whole]
-    names, images = zip(*named, strict=True)
-    write_page(out / f"{scan.name}.html", images, rays, names, title=scan.name)
+    write_page(out / f"{scan.name}.html", [Panel(name, image[None], rays) for name, image in named], scan.name)
     spread = completed.spread.numpy() if len(completed.images) > 1 else None
     unknown = given.state == Ray.UNKNOWN
     linear = [("linear interpolation", interpolated(given.image, ~unknown))] if truth else []

@@ -23,8 +23,7 @@ from r2flow.reports.pictures import (
     draw_reflectance,
 )
 from r2flow.reports.tables import table
-from r2flow.reports.view import most_images
-from r2flow.reports.view.panels import Panel, write_panels
+from r2flow.reports.view import Panel, most_images, write_page
 
 MOST = 8  # maximum number of frames in the figure, evenly spaced
 # Rows: points, then images.
@@ -72,8 +71,8 @@ def interpolation(
     first, last = (Panel(f"real: {name}", image[None], rays) for name, image in zip(names, pair.numpy(), strict=True))
     chosen = spread(len(images), most_images(images.shape) - 2)
     captions = [f"w = {weights[i]:.2f}" for i in chosen]
-    panels = [first, Panel("between", images[chosen], rays), last]
-    write_panels(Path(out, "interpolation.html"), panels, captions, "Interpolation")
+    panels = [first, Panel("between", images[chosen], rays, None, captions), last]
+    write_page(Path(out, "interpolation.html"), panels, "Interpolation")
     figures = {"interpolation": interpolation_figure(pair.numpy(), images, weights, rays, names)}
     return Page("interpolation", "Interpolation", text, rows, figures, device=str(checkpoint.generator.device))
 

@@ -23,7 +23,7 @@ from r2flow.lidar.region import Region
 from r2flow.model.checkpoint import FOLDER, Checkpoint, weights_hash
 from r2flow.model.sampling import draw, warn_unsolved
 from r2flow.progress import Bar, track
-from r2flow.reports.view import most_images, write_page
+from r2flow.reports.view import Panel, most_images, write_page
 from r2flow.store import MANIFEST, FileStore, read_manifest
 
 log = logging.getLogger(__name__)
@@ -149,9 +149,9 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str
     for index, image in track(list(enumerate(images)), "drawing", "pages", least=3):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     save_figure(contact_sheet(images[:8], rays), out / "samples.png")
-    images = images[: most_images(rays.shape)]
-    captions = [f"sample {number}" for number in range(len(images))]
-    write_page(out / "samples.html", images, rays, captions, title=title)
+    fitting = images[: most_images(rays.shape)]
+    panels = [Panel(f"sample {number}", image[None], rays) for number, image in enumerate(fitting)]
+    write_page(out / "samples.html", panels, title)
 
 
 def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:

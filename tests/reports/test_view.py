@@ -15,7 +15,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import Draws
-from r2flow.reports.view import MOST, page
+from r2flow.reports.view import MOST, Panel, page
 from r2flow.simulator import simulate
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
@@ -59,6 +59,10 @@ def images(count: int, channels: int = 2, seed: int = 0) -> np.ndarray:
     return np.concatenate([r, rng.random(r.shape) * (r > 0)], 1)[:, :channels].astype(np.float32)
 
 
+def page_of(*images: np.ndarray, rays: torch.Tensor = RAYS) -> str:
+    return page([Panel("scan", image[None], rays) for image in images])
+
+
 def unpacked(data: dict, number: int, frame: int = 0) -> list[np.ndarray]:
     """Range in metres, reflectance and class number of one image, by the format's description alone."""
     one = data["scans"][number]
@@ -74,7 +78,7 @@ def unpacked(data: dict, number: int, frame: int = 0) -> list[np.ndarray]:
 def test_what_is_unpacked_is_the_scan(farthest):
     given = images(2)
     given[1, 0, 3, 5] = farthest
-    data = Parsed(page(given, RAYS)).data
+    data = Parsed(page_of(*given)).data
     for number, image in enumerate(given):
         r, reflectance = unpacked(data, number)
         assert np.abs(r - image[0]).max() <= max(0.002, farthest / 65535 / 2) + 1e-5
@@ -88,7 +92,7 @@ def test_what_is_unpacked_is_the_scan(farthest):
 def test_rays_of_no_grid_are_kept_pixel_by_pixel():
     bent = RAYS.clone()
     bent[1] += 0.01 * torch.arange(8.0)[:, None]
-    (rays,) = Parsed(page(images(1), bent)).data["rays"]
+    (rays,) = Parsed(page_of(*images(1), rays=bent)).data["rays"]
     kept = np.frombuffer(base64.b64decode(rays["pixels"]), "<f4").reshape(2, 8, 32)
     np.testing.assert_array_equal(kept, bent.numpy())
 
@@ -96,14 +100,15 @@ def test_rays_of_no_grid_are_kept_pixel_by_pixel():
 def test_values_that_are_no_numbers_are_no_returns():
     image = images(1)[0]
     image[0, 0, :3] = np.nan, np.inf, -1
-    r, _ = unpacked(Parsed(page([image], RAYS)).data, 0)
+    r, _ = unpacked(Parsed(page_of(image)).data, 0)
     assert (r[0, :3] == 0).all()
 
 
 def test_labels_have_their_names_and_colours():
     ids = np.full(SENSOR.shape, 40)
     ids[:2], ids[7] = 10, 0
-    data = Parsed(page(images(2, 1), RAYS, labels=[ids, None])).data
+    panels = [Panel("scan", image[None], RAYS, of) for image, of in zip(images(2, 1), (ids[None], None), strict=True)]
+    data = Parsed(page(panels)).data
     assert [one["labels"] for one in data["scans"]] == [True, False]
     assert data["shown"] == {"reflectance": False, "label": True}
     _, numbers = unpacked(data, 0)
@@ -114,14 +119,14 @@ def test_labels_have_their_names_and_colours():
 
 def test_a_usual_scan_takes_about_130_kb():
     made = simulate(SENSORS["hdl64e"], 0, 0)
-    empty, one = (len(page([image], SENSORS["hdl64e"].rays())) for image in (0 * made.image, made.image))
+    empty, one = (len(page_of(image, rays=SENSORS["hdl64e"].rays())) for image in (0 * made.image, made.image))
     assert one - empty < 140_000
     assert empty < 70_000
 
 
 def test_no_text_is_read_as_html():
-    text = page(images(1)[None], RAYS, [ATTACK], frames=[ATTACK], labels=[np.full(SENSOR.shape, 600)], title=ATTACK)
-    parsed = Parsed(text)
+    labels = np.full((1, *SENSOR.shape), 600)
+    parsed = Parsed(page([Panel(ATTACK, images(1), RAYS, labels, [ATTACK])], ATTACK))
     assert [attributes.get("type") for attributes, _ in parsed.all("script")] == ["application/json", "module"]
     assert not parsed.all("img")
     assert parsed.data["scans"][0]["caption"] == parsed.data["frames"][0] == ATTACK
@@ -129,7 +134,7 @@ def test_no_text_is_read_as_html():
 
 
 def test_the_page_allows_its_own_script_alone_and_loads_nothing():
-    text = page(images(1), RAYS)
+    text = page_of(*images(1))
     parsed = Parsed(text)
     (policy,) = (a["content"] for a, _ in parsed.all("meta") if "http-equiv" in a)
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
@@ -143,9 +148,9 @@ def test_the_page_allows_its_own_script_alone_and_loads_nothing():
 
 
 def test_what_does_not_fit_is_refused():
-    for images in ([], [np.broadcast_to(np.float32(0), (MOST // 256 + 1, 1, 8, 32))]):
+    for panels in ([], [Panel("scan", np.broadcast_to(np.float32(0), (MOST // 256 + 1, 1, 8, 32)), RAYS)]):
         with pytest.raises(InputError, match="found (0|65537) images"):
-            page(images, RAYS)
+            page(panels)
 
 
 class TestTheVerb:

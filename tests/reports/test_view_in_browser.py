@@ -10,7 +10,7 @@ from matplotlib import colormaps
 
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.view import page
+from r2flow.reports.view import Panel, page
 
 pytestmark = pytest.mark.browser
 
@@ -25,6 +25,10 @@ def lone(scale: float = 1.0) -> np.ndarray:
     for (row, column), r in PIXELS.items():
         image[:, row, column] = scale * r, 0.5
     return image
+
+
+def panel(*images: np.ndarray, caption: str = "scan", labels: np.ndarray | None = None, frames=()) -> Panel:
+    return Panel(caption, np.stack(images), RAYS, labels, frames)
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +46,12 @@ def chromium():
 
 @pytest.fixture
 def opened(chromium, tmp_path):
-    """Opens the page of some arguments; no error of its own, no request but for itself."""
+    """Opens the page of some panels; no error of its own, no request but for itself."""
     contexts, errors, requests = [], [], []
 
-    def open(*arguments, size=DESKTOP, **options):
+    def open(*panels, size=DESKTOP):
         path = tmp_path / "page.html"
-        path.write_text(page(*arguments, **options), encoding="utf-8")
+        path.write_text(page(panels), encoding="utf-8")
         contexts.append(chromium.new_context(viewport=size, color_scheme="dark"))
         shown = contexts[-1].new_page()
         shown.on("pageerror", lambda error: errors.append(str(error)))
@@ -121,7 +125,7 @@ def colour_of_range(r: float) -> np.ndarray:
 
 @pytest.mark.parametrize("keys", [[], ["ArrowLeft"] * 4 + ["ArrowUp"] * 2, ["t"]], ids=["first", "turned", "above"])
 def test_points_are_drawn_where_the_camera_sees_them_in_the_colour_of_their_range(opened, keys):
-    shown = opened([lone()], RAYS)
+    shown = opened(panel(lone()))
     colour_by(shown, "range")
     for key in keys:
         shown.keyboard.press(key)
@@ -143,7 +147,7 @@ def test_points_are_drawn_where_the_camera_sees_them_in_the_colour_of_their_rang
 def test_the_image_below_is_the_range_image(opened):
     image = np.random.default_rng(0).uniform(2, 80, (1, *SENSOR.shape)).astype(np.float32)
     image[0, :, ::3] = 0
-    shown = opened([image], RAYS)
+    shown = opened(panel(image))
     colour_by(shown, "range")
     box, pixels = shown.locator(".image").bounding_box(), screen(shown)
     for row in range(16):
@@ -156,7 +160,7 @@ def test_the_image_below_is_the_range_image(opened):
 
 
 def test_mouse_and_keys_move_the_camera(opened):
-    shown = opened([lone()], RAYS)
+    shown = opened(panel(lone()))
     first, box = camera_of(shown), shown.locator(".points").bounding_box()
     x, y = box["x"] + 300, box["y"] + 200
     shown.mouse.move(x, y)
@@ -186,7 +190,7 @@ def test_mouse_and_keys_move_the_camera(opened):
 
 
 def test_the_cursor_finds_the_point_and_back(opened):
-    shown = opened([lone(), lone(0.8)], RAYS, ["a", "b"])
+    shown = opened(panel(lone(), caption="a"), panel(lone(0.8), caption="b"))
     first, second = shown.locator(".points").all()
     strip = shown.locator(".image").first.bounding_box()
     for (row, column), r in PIXELS.items():
@@ -205,7 +209,7 @@ def test_the_cursor_finds_the_point_and_back(opened):
 
 
 def test_the_slider_goes_through_the_frames(opened):
-    shown = opened([np.stack([lone(), lone(0.5)]), lone()], RAYS, ["two", "one"], frames=["t = 0", "t = 1"])
+    shown = opened(panel(lone(), lone(0.5), frames=["t = 0", "t = 1"]), panel(lone()))
     strips = [one.bounding_box() for one in shown.locator(".image").all()]
     assert shown.locator("#frame-name").inner_text() == "t = 0"
     shown.keyboard.press(".")
@@ -216,10 +220,10 @@ def test_the_slider_goes_through_the_frames(opened):
 
 
 def test_only_what_is_there_can_be_coloured(opened):
-    shown = opened([lone()[:1]], RAYS)
+    shown = opened(panel(lone()[:1]))
     assert shown.locator("#modes button").all_inner_texts() == ["range", "height"]
     assert shown.locator("#player").is_hidden()
-    shown = opened([lone()], RAYS, labels=[np.full(SENSOR.shape, 40)])
+    shown = opened(panel(lone(), labels=np.full((1, *SENSOR.shape), 40)))
     shown.get_by_role("button", name="label", exact=True).click()
     assert shown.locator("#legend").inner_text().strip() == "road"
     settle(shown)
@@ -230,7 +234,7 @@ def test_only_what_is_there_can_be_coloured(opened):
 
 @pytest.mark.parametrize(("size", "count"), [(DESKTOP, 16), (PHONE, 6)])
 def test_everything_fits_and_the_rest_is_turned_to(opened, size, count):
-    shown = opened([lone()] * 20, RAYS, size=size)
+    shown = opened(*(panel(lone(), caption=str(number)) for number in range(20)), size=size)
     boxes = [one.bounding_box() for one in shown.locator("figure, button:visible").all()]
     for box in boxes:
         assert box["x"] >= 0

@@ -1,7 +1,8 @@
 """Scans in 3-D as a self-contained HTML page: `r2flow view`.
 
-    images = flow.sample(4)
-    Path("scans.html").write_text(page(images, flow.sensor.rays()))
+    rays = flow.sensor.rays()
+    panels = [Panel(f"sample {i}", image[None], rays) for i, image in enumerate(flow.sample(4).numpy())]
+    write_page("scans.html", panels)
 
 The page stores two bytes of range and one of reflectance per pixel, compressed by zlib, and the rays once; the browser
 computes the points.
@@ -14,9 +15,10 @@ import json
 import zlib
 from collections.abc import Sequence
 from importlib.resources import files
+from itertools import repeat
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -30,63 +32,49 @@ STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at mo
 CODES = 2**16
 SCALES = ("range", "height", "reflectance")  # in the order of `view.js`
 
-Images = np.ndarray | Tensor
-Rays = np.ndarray | Tensor
+
+class Panel(NamedTuple):
+    """One scan of a page, or a sequence of scans for the slider."""
+
+    caption: str
+    images: np.ndarray  # range in metres and reflectance, (T, 2 or 1, H, W); 0 for dropped rays
+    rays: Tensor  # elevation and azimuth in radians, (2, H, W)
+    labels: np.ndarray | None = None  # semantic ids, (T, H, W)
+    frames: Sequence[str] = ()  # slider captions
 
 
-def page(
-    images: Sequence[Images] | Images,
-    rays: Rays | Sequence[Rays],
-    captions: Sequence[str] = (),
-    *,
-    frames: Sequence[str] = (),
-    labels: Sequence[np.ndarray | None] = (),
-    title: str = "r2flow",
-) -> str:
-    """One HTML page with a point cloud and a range image per scan, under a shared camera.
+def page(panels: Sequence[Panel], title: str = "r2flow") -> str:
+    """One HTML page with a point cloud and a range image per panel, under a shared camera.
 
-    Args:
-        images: Range in metres and reflectance of each scan, (2 or 1, H, W), 0 for dropped rays; or frames
-            (T, 2 or 1, H, W) for a slider. Scans may differ in size and number of frames.
-        rays: Elevation and azimuth in radians, (2, H, W), of all scans, or of each.
-        captions: Caption of each scan; default: its number.
-        frames: Slider caption of each frame.
-        labels: Semantic ids of each scan, (H, W) or (T, H, W), or None.
-
-    Returns:
-        The page, about 50 kB and 130 kB for each image of 64 x 1024. Texts in it are never read as HTML.
+    Panels may differ in size and number of frames. The page takes about 50 kB and 130 kB for each image of 64 x 1024.
+    Texts in it are never read as HTML.
     """
-    arrays = [np.asarray(scan, dtype=np.float32) for scan in images]
-    stacks = [array.reshape(-1, *array.shape[-3:]) for array in arrays]
-    assert all(stack.shape[1] in (1, 2) for stack in stacks)
-    count, pixels = sum(map(len, stacks)), sum(stack[:, 0].size for stack in stacks)
+    count, pixels = sum(len(p.images) for p in panels), sum(p.images[:, 0].size for p in panels)
     if not 0 < pixels <= MOST:
         raise InputError(
             f"a page holds 1 to 256 images of 64 x 1024 (33 MB), or {MOST:,} pixels; found {count} images with "
             f"{pixels:,}. Take fewer scans or frames (--num)."
         )
-    shared = isinstance(rays, np.ndarray | Tensor)
-    each_rays = [np.asarray(angles, dtype=np.float64) for angles in ([rays] * len(stacks) if shared else rays)]
-    each_labels = [None if ids is None else np.asarray(ids) for ids in labels or [None] * len(stacks)]
-    each_caption = captions or range(len(stacks))
     sensors: dict[bytes, tuple[int, dict[str, Any]]] = {}
-    labelled = [ids[ids > 0] for ids in each_labels if ids is not None]
+    labelled = [p.labels[p.labels > 0] for p in panels if p.labels is not None]
     classes = class_colours(np.concatenate(labelled), most=255) if labelled else {}
-    step = max(STEP, max(float(stack[:, 0].max(initial=0)) for stack in stacks) / (CODES - 1))
+    step = max(STEP, max(float(p.images[:, 0].max(initial=0)) for p in panels) / (CODES - 1))
     scans = []
-    for stack, angles, ids, caption in zip(stacks, each_rays, each_labels, each_caption, strict=True):
-        assert angles.shape == (2, *stack.shape[2:]), f"{caption}: images of {stack.shape[2:]}, rays of {angles.shape}"
+    for caption, images, rays, labels, _ in panels:
+        assert images.shape[1] in (1, 2)
+        assert rays.shape == (2, *images.shape[2:]), f"{caption}: images of {images.shape[2:]}, rays of {rays.shape}"
+        angles = np.asarray(rays, dtype=np.float64)
         number, _ = sensors.setdefault(angles.tobytes(), (len(sensors), _described(angles)))
-        numbers = None if ids is None else _numbered(ids, stack, classes)
-        packed = [packed_image(image, step, None if numbers is None else numbers[t]) for t, image in enumerate(stack)]
+        numbers = repeat(None) if labels is None else _numbered(labels, classes)
         scans.append({
-            "caption": printable(str(caption)), "rays": number, "frames": packed,
-            "reflectance": stack.shape[1] > 1, "labels": ids is not None,
+            "caption": printable(caption), "rays": number,
+            "frames": [packed_image(image, step, ids) for image, ids in zip(images, numbers, strict=False)],
+            "reflectance": images.shape[1] > 1, "labels": labels is not None,
         })  # fmt: skip
     contents = {
         "scans": scans,
         "rays": [described for _, described in sensors.values()],
-        "frames": [printable(str(frame)) for frame in frames],
+        "frames": [printable(frame) for frame in max((p.frames for p in panels), key=len)],
         "metres": step,
         "ranges": RANGES,
         "heights": HEIGHTS,
@@ -98,15 +86,15 @@ def page(
     return _filled(contents, title)
 
 
+def write_page(path: str | Path, panels: Sequence[Panel], title: str = "r2flow") -> Path:
+    """Write the `page` of panels atomically."""
+    write_file(path, page(panels, title))
+    return Path(path)
+
+
 def most_images(shape: Sequence[int]) -> int:
     """Maximum number of images (..., H, W) on a page."""
     return MOST // int(np.prod(shape[-2:]))
-
-
-def write_page(path: str | Path, *args: Any, **options: Any) -> Path:
-    """Write the `page` of these arguments atomically."""
-    write_file(path, page(*args, **options))
-    return Path(path)
 
 
 def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = None) -> str:
@@ -142,11 +130,11 @@ def _spacing(rays: np.ndarray) -> float:
     return float(np.prod(gaps) ** (1 / len(gaps))) if gaps else 0.01
 
 
-def _numbered(ids: np.ndarray, stack: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:
+def _numbered(ids: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:
     """Class number of each id, from 1, (T, H, W); 0 for ids without a class."""
     table = np.zeros(int(max(ids.max(initial=0), *classes, 0)) + 1, np.uint8)
     table[list(classes)] = np.arange(1, len(classes) + 1)
-    return np.broadcast_to(table[ids], (len(stack), *stack.shape[2:]))
+    return table[ids]
 
 
 def _filled(contents: dict[str, Any], title: str) -> str:

@@ -6,11 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from r2flow.data.opening import find_drives, open_scans, own_reading, parse
 from r2flow.data.options import FOLDER, SIMULATED
@@ -26,22 +24,8 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.reports.outputs import ScanBar
-from r2flow.reports.view import write_page
+from r2flow.reports.view import Panel, write_page
 from r2flow.samplers import OnGrid
-
-
-class Panel(NamedTuple):
-    """One scan of a page, or a sequence of scans for the slider."""
-
-    caption: str
-    images: np.ndarray  # (T, 2 or 1, H, W)
-    rays: Tensor  # (2, H, W)
-    labels: np.ndarray | None = None  # (T, H, W)
-
-
-def write_panels(path: str | Path, panels: Sequence[Panel], frames: Sequence[str] = (), title: str = "r2flow") -> Path:
-    captions, images, rays, labels = zip(*panels, strict=True) if panels else ((), (), (), ())
-    return write_page(path, images, rays, captions, frames=frames, labels=labels, title=title)
 
 
 def scans_of(path: Path) -> list[Path]:
@@ -97,16 +81,16 @@ def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray |
     return read_labelled_scan(path, replace(source.reading, on_bad_scan="error"))  # type: ignore[attr-defined]
 
 
-def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
-    """Combine panels as frames of one; returns it and the slider captions."""
-    captions, images, rays, labels = zip(*panels, strict=True)
-    for name, image, ray, label in panels[1:]:
+def in_turn(panels: Sequence[Panel], caption: str) -> Panel:
+    """Combine panels as frames of one."""
+    captions, images, rays, labels, _ = zip(*panels, strict=True)
+    for name, image, ray, label, _ in panels[1:]:
         alike = image.shape == images[0].shape and (label is None) == (labels[0] is None)
         if not alike or not torch.equal(ray, rays[0]):
             raise InputError(f"{name} and {captions[0]} differ in size, sensor, reflectance or labels: "
                              "they cannot be frames of one sequence; leave --sequence out.")  # fmt: skip
     numbers = None if labels[0] is None else np.concatenate(labels)
-    return Panel(caption, np.concatenate(images), rays[0], numbers), list(captions)
+    return Panel(caption, np.concatenate(images), rays[0], numbers, captions)
 
 
 def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: Sequence[int] = ()) -> list[Panel]:
@@ -126,13 +110,14 @@ def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: 
     if not steps:
         return [Panel(f"{label}, sample {number}", image[None], rays) for number, image in enumerate(sets[0])]
     captions = [f"{label}, {count} step{'s' * (count > 1)}" for count in steps]
-    return [Panel(caption, images, rays) for caption, images in zip(captions, sets, strict=True)]
+    frames = [f"sample {number}" for number in range(num)]
+    return [Panel(caption, images, rays, None, frames) for caption, images in zip(captions, sets, strict=True)]
 
 
 def way_panels(
     flow: Checkpoint, label: str, num: int, seed: int = 0, steps: int | None = None, times: int = 9
-) -> tuple[list[Panel], list[str]]:
-    """Decoded x_t of scans 0 to num - 1 of a seed, at `times` times from t = 0 to 1, and the slider captions.
+) -> list[Panel]:
+    """Decoded x_t of scans 0 to num - 1 of a seed, at `times` times from t = 0 to 1.
 
     The flow's ODE solver (the default one for a stochastic sampler) divides its steps evenly between the times.
     """
@@ -149,9 +134,9 @@ def way_panels(
             decoded.append(flow.encoding.decode(x.cpu()))
             bar.set(len(decoded) - 1)
     images = torch.stack(decoded, 1).nan_to_num(0.0).numpy()
-    rays, label = flow.sensor.rays(), f"{label}, seed {seed}"
-    panels = [Panel(f"{label}, sample {number}", image, rays) for number, image in enumerate(images)]
-    return panels, [f"t = {t:.3g}" for t in grid]
+    rays, frames = flow.sensor.rays(), [f"t = {t:.3g}" for t in grid]
+    captions = [f"{label}, seed {seed}, sample {number}" for number in range(num)]
+    return [Panel(caption, image, rays, None, frames) for caption, image in zip(captions, images, strict=True)]
 
 
 def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, title: str = "r2flow") -> Path:
@@ -162,4 +147,4 @@ def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, titl
         if len(chosen):
             images = chosen.source.batch(range(len(chosen))).nan_to_num(0.0).numpy()
             panels.append(Panel(f"{name}: {scans.label}", images, scans.sensor.rays()))
-    return write_panels(path, panels, title=title)
+    return write_page(path, panels, title)
