@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,9 +22,10 @@ from r2flow.cli.options import (
     choose_device,
     grouped,
     named_columns,
+    parsed,
     rows_and_columns,
 )
-from r2flow.errors import InputError, check
+from r2flow.errors import check
 
 if TYPE_CHECKING:
     from r2flow.data.partial import PartialScan
@@ -48,20 +49,15 @@ class RegionOptions:
 
         if self.sector is None and self.rows is None:
             return None
-        angles = self.sector and _pair("--sector", self.sector, ",", float, "two azimuths in degrees, such as -45,45")
-        limits = self.rows and _pair("--rows", self.rows, "-", int, "the first and the last row, such as 0-31")
-        requested = region(checkpoint.sensor.shape, angles or None, limits or None, MARGIN if angles else 0.0)
+        angles = limits = None
+        if self.sector:
+            angles = parsed("--sector", self.sector, "two azimuths in degrees, such as -45,45", ",", float, 2)
+        if self.rows:
+            limits = parsed("--rows", self.rows, "the first and the last row, such as 0-31", "-", int, 2)
+        requested = region(checkpoint.sensor.shape, angles, limits, MARGIN if angles else 0.0)
         evaluated = evaluated_region(checkpoint.generator, requested)
         print(f"generating {evaluated}, for {requested}: {evaluated.share:.0%} of the image")
         return requested
-
-
-def _pair(option: str, text: str, separator: str, kind: type, meaning: str) -> tuple[Any, Any]:
-    try:
-        first, second = (kind(part) for part in text.split(separator))
-    except ValueError:
-        raise InputError(f"{option} must be {meaning}; found {text!r}.") from None
-    return first, second
 
 
 @app.command(epilog="Example: r2flow sample street --num 16 --steps 64 --out scans")

@@ -1,9 +1,11 @@
 """Options shared by verbs, and their parsing; a verb takes a dataclass of options as one parameter."""
 
 import inspect
+import math
 import os
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import typer
 
 from r2flow.devices import choose_device as choose_device  # re-exported for verbs
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
@@ -54,14 +56,26 @@ def named_columns(text: str | None) -> tuple[str, ...] | None:
     return columns
 
 
+def parsed(
+    option: str, text: str, form: str, split: str, kind: type[int | float], count: int = 0, least: float = -math.inf
+) -> tuple[Any, ...]:
+    """Parse `count` numbers (0: any number of them) of at least `least`; `form` is the form in messages."""
+    with suppress(ValueError):
+        values = tuple(kind(part) for part in text.split(split))
+        if count in (0, len(values)) and min(values) >= least:
+            return values
+    raise InputError(f"{option} must be {form}; found {text!r}.")
+
+
 def rows_and_columns(size: str | None) -> tuple[int, int] | None:
     """Parse an image size such as 64x1024."""
-    if size is None:
-        return None
-    parts = size.lower().split("x")
-    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and int(part) > 0 for part in parts):
-        raise InputError(f"--size must be ROWSxCOLUMNS, such as 64x1024; found {size!r}.")
-    return int(parts[0]), int(parts[1])
+    form = "ROWSxCOLUMNS, such as 64x1024"
+    return None if size is None else parsed("--size", size.lower(), form, "x", int, count=2, least=1)
+
+
+def numbers(option: str, text: str) -> Sequence[int]:
+    """Parse positive whole numbers separated by commas."""
+    return parsed(f"--{option}", text, "positive numbers separated by commas", ",", int, least=1)
 
 
 def cores() -> int:
@@ -166,13 +180,3 @@ class DrawOptions:
 def separate(samplers: str) -> list[str]:
     """Split at commas, except those in a list of times."""
     return re.split(r",(?![^\[]*\])", samplers)
-
-
-def numbers(option: str, text: str) -> list[int]:
-    """Parse positive whole numbers: '4,8' to [4, 8]."""
-    try:
-        values = [int(part) for part in text.split(",")]
-    except ValueError:
-        values = [0]
-    check(min(values) > 0, f"--{option} must be positive numbers separated by commas, found {text!r}.")
-    return values

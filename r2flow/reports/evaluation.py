@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
-from r2flow.evaluation.measuring import MetricResult
 from r2flow.evaluation.references import AS_MANY, HALVES
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.pictures import draw_range
@@ -40,25 +39,17 @@ def heading(metric: str, figure: str) -> tuple[str, float]:
 
 def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     """One row per value."""
-    return [
-        {"comparison": c.name, "kind": c.kind, **row}
-        for c in comparisons
-        for result in c.measured
-        for row in _rows_of(result)
-    ]
-
-
-def _rows_of(result: MetricResult) -> list[dict[str, Any]]:
     rows = []
-    for name, value in result.figures.items():
-        title, factor = heading(result.metric, name)
-        low, high = result.intervals.get(name, (None, None))
+    for comparison, result in ((c, result) for c in comparisons for result in c.measured):
         sizes = result.protocol["sizes"]
-        rows.append({
-            "metric": result.metric, "figure": name, "value": value, "low": low, "high": high, "printed_as": title,
-            "printed": value * factor, "real": sizes["real"], "generated": sizes["generated"],
-            "remarks": "; ".join(result.remarks),
-        })  # fmt: skip
+        for name, value in result.figures.items():
+            title, factor = heading(result.metric, name)
+            low, high = result.intervals.get(name, (None, None))
+            rows.append({
+                "comparison": comparison.name, "kind": comparison.kind, "metric": result.metric, "figure": name,
+                "value": value, "low": low, "high": high, "printed_as": title, "printed": value * factor,
+                "real": sizes["real"], "generated": sizes["generated"], "remarks": "; ".join(result.remarks),
+            })  # fmt: skip
     return rows
 
 
@@ -81,24 +72,22 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     Without the panel the first distance is taken. Distances but KID are larger for fewer scans: a set is compared with
     real halves in as many scans as they have, if measured.
     """
-    measured = [m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)]
-    metric = HEADLINE if HEADLINE in measured else next(iter(measured), "")
-    values: dict[str, dict[str, tuple[float, Comparison]]] = {"judged": {}, "reference": {}, "baseline": {}}
-    for comparison in comparisons:
-        figures = [next(iter(m.figures.values())) for m in comparison.measured if m.metric == metric]
-        if figures and math.isfinite(figures[0]):
-            values[comparison.kind][comparison.name] = figures[0], comparison
-    if HALVES not in values["reference"]:
+    distances = [m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)]
+    metric = HEADLINE if HEADLINE in distances else next(iter(distances), "")
+    first = [(next(iter(m.figures.values())), c) for c in comparisons for m in c.measured if m.metric == metric]
+    near = sorted((pair for pair in first if math.isfinite(pair[0])), key=lambda pair: pair[0])
+    judged, baselines = ([pair for pair in near if pair[1].kind == kind] for kind in ("judged", "baseline"))
+    references = {c.name: (value, c) for value, c in near if c.kind == "reference"}
+    if HALVES not in references:
         return []
-    reference, halves = values["reference"][HALVES]
-    judged, baselines = (sorted(values[kind].values(), key=lambda pair: pair[0]) for kind in ("judged", "baseline"))
+    reference, halves = references[HALVES]
     best = baselines[0][0] if baselines else math.inf
     title, factor = heading(metric, metric)
     unbiased = metric.startswith(UNBIASED)
     equal = len(judged) > 1 and len({len(c.generated) for _, c in judged}) == 1
     lines = []
     for value, comparison in judged:
-        as_many = None if unbiased else values["reference"].get(f"{comparison.name}{AS_MANY}")
+        as_many = None if unbiased else references.get(f"{comparison.name}{AS_MANY}")
         compared, pair = as_many or (value, comparison)
         scans, of_half = (min(len(c.real), len(c.generated)) for c in (pair, halves))
         farther = compared > MARGIN * max(reference, 0)
@@ -234,14 +223,14 @@ def _words(values: Mapping[str, Any]) -> str:
 
 
 def _plain_comparison(comparison: Comparison) -> dict[str, Any]:
-    sets = {"real": comparison.real, "generated": comparison.generated}
+    sets, rows = {"real": comparison.real, "generated": comparison.generated}, rows_of([comparison])
     return {
         "comparison": comparison.name,
         "kind": comparison.kind,
         **{side: {"set": s.label, "scans": len(s), **s.about} for side, s in sets.items()},
         "seconds": round(comparison.seconds, 2),
         "metrics": [
-            asdict(result) | {"printed": {row["printed_as"]: row["printed"] for row in _rows_of(result)}}
+            asdict(result) | {"printed": {r["printed_as"]: r["printed"] for r in rows if r["metric"] == result.metric}}
             for result in comparison.measured
         ],
     }

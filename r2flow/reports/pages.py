@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 import r2flow
-from r2flow.errors import check, printable
+from r2flow.errors import check
 from r2flow.files import write_file
 from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row
@@ -74,19 +74,13 @@ class Page:
 def write_page(page: Page, out: str | Path) -> list[Path]:
     """Write `out/NAME.png ...`, `NAME.pdf`, `NAME.csv`, `NAME.json` and `NAME.md` atomically; returns the files."""
     out, origin = Path(out), provenance(page)
-    # Figures carry their provenance; PNG notes only support Latin-1.
-    note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
     written = [
-        save_figure(figure, out / f"{name}.{ending}", title=page.title, about=note)
+        save_figure(figure, out / f"{name}.{ending}", title=page.title, about=json.dumps(origin))
         for name, figure in page.figures.items()
         for ending in ("png", "pdf")
     ]
-    contents = {
-        "csv": _csv(page.rows, origin),
-        "json": _json(page, origin),
-        "md": _markdown(page, origin),
-    }
-    for ending, content in contents.items():
+    contents = ("csv", _csv(page.rows, origin)), ("json", _json(page, origin)), ("md", _markdown(page, origin))
+    for ending, content in contents:
         written.append(out / f"{page.name}.{ending}")
         write_file(written[-1], content)
     return written

@@ -21,7 +21,6 @@ from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.view import Panel, write_page
@@ -103,8 +102,8 @@ def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: 
     sets = []
     with ScanBar("sampling", num * len(samplers), evaluations) as bar:
         for sampler in samplers:
-            batches = list(sample(flow, num, seed, sampler=sampler, progress=bar.evaluated))
-            sets.append(torch.cat([batch.images for batch in batches]).nan_to_num(0.0).numpy())
+            images = flow.sample(num, seed, sampler=sampler, progress=bar.evaluated)
+            sets.append(images.nan_to_num(0.0).numpy())
             bar.set(num * len(sets))
     rays, label = flow.sensor.rays(), f"{label}, seed {seed}"
     if not steps:
