@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -255,21 +256,18 @@ def _samplers(
 
     fields = [options_of(SAMPLERS[parse_sampler(name)["name"]]) if name else vars(generator.sampler) for name in names]
     curve = names == [None] and len(steps) > 1  # a generator without steps (GAN) is one point of the curve
+    varied = {option for option in ("steps", "tolerance") if curve or any(option in other for other in fields)}
     chosen: list[Sampler] = []
     refused = None
-    for place, name in enumerate(names):
-        for count in steps:
-            given = SamplerOptions(name, count, tolerance).given
-            for option in ("steps", "tolerance"):
-                if option not in fields[place] and (curve or any(option in other for other in fields)):
-                    given.pop(option, None)
-            try:
-                sampler = generator.choose(**given)
-            except InputError as error:
-                refused = error
-                continue
-            if sampler not in chosen:
-                chosen.append(sampler)
+    for (name, own), count in product(zip(names, fields, strict=True), steps):
+        given = SamplerOptions(name, count, tolerance).given
+        try:
+            sampler = generator.choose(**{key: v for key, v in given.items() if key in own or key not in varied})
+        except InputError as error:
+            refused = error
+            continue
+        if sampler not in chosen:
+            chosen.append(sampler)
     if refused and not chosen and not generator.fixed:
         raise refused
     return chosen

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,28 +34,23 @@ ROUNDING = 1e-9  # smallest error distinguishable from rounding in float64
 WANTED = (0.2, 0.05, 0.01)  # target RMS errors of range, m
 
 
-class Configuration(NamedTuple):
-    """A solver at a number of steps, or at a tolerance, as options of `solve`."""
-
-    method: str
-    label: str
-    fields: dict[str, Any]
-
-
 def configurations(
     methods: Sequence[str], budgets: Sequence[int], tolerances: Sequence[float] = TOLERANCES
-) -> list[Configuration]:
-    """All fixed-step methods at numbers of steps that fit the budgets, all adaptive methods at the tolerances."""
-    chosen: list[Configuration] = []
+) -> dict[str, dict[str, Any]]:
+    """Options of `solve` by label.
+
+    All fixed-step methods at numbers of steps that fit the budgets, all adaptive methods at the tolerances.
+    """
+    chosen: dict[str, dict[str, Any]] = {}
     for method in methods:
         how = method_of(method)
         if how.adapts:
-            chosen += [Configuration(method, f"{method}, {tol:.0e}", {"tolerance": tol}) for tol in tolerances]
+            chosen |= {f"{method}, {tol:.0e}": {"method": method, "tolerance": tol} for tol in tolerances}
             continue
         start, per_step = getattr(how, "start", 0), getattr(how, "evaluations", 1)
         for count in sorted({(budget - start) // per_step for budget in budgets if budget >= start + per_step}):
-            fields = {"steps": count, "grid": usual_grid(method)}
-            chosen.append(Configuration(method, f"{method}, {count} step{'s' * (count > 1)}", fields))
+            label = f"{method}, {count} step{'s' * (count > 1)}"
+            chosen[label] = {"method": method, "steps": count, "grid": usual_grid(method)}
     return chosen
 
 
@@ -107,7 +102,7 @@ def checkpoint_subject(
 
 
 def measure(
-    subjects: Sequence[Subject], chosen: Sequence[Configuration], progress: Progress = None
+    subjects: Sequence[Subject], chosen: Mapping[str, dict[str, Any]], progress: Progress = None
 ) -> list[dict[str, Any]]:
     """Measure error, evaluations and seconds of each configuration on each subject, one row each.
 
@@ -116,34 +111,36 @@ def measure(
     """
     rows = []
     for subject in subjects:
-        seconds: list[list[float]] = [[] for _ in chosen]
-        solutions: list[list[Solution]] = [[] for _ in chosen]
+        seconds: dict[str, list[float]] = {label: [] for label in chosen}
+        solutions: dict[str, list[Solution]] = {label: [] for label in chosen}
         with torch.inference_mode():
             subject.velocity(torch.zeros((), device=subject.x_0.device), subject.x_0[:1])  # warm up
-            for repeat, (i, configuration) in product(range(REPEATS), enumerate(chosen)):
-                if repeat > 0 and sum(seconds[i]) >= PATIENCE:
+            for repeat, (label, options) in product(range(REPEATS), chosen.items()):
+                if repeat > 0 and sum(seconds[label]) >= PATIENCE:
                     continue
-                how = {"method": configuration.method, "max_evaluations": MOST_EVALUATIONS, **configuration.fields}
+                how = {"max_evaluations": MOST_EVALUATIONS, **options}
                 for x_0 in subject.x_0.split(subject.batch_size):
                     solution, taken = timed(partial(solve, subject.velocity, x_0, **how), x_0.device)
-                    seconds[i].append(taken / len(x_0))
-                    solutions[i] += [] if repeat else [solution]
+                    seconds[label].append(taken / len(x_0))
+                    solutions[label] += [] if repeat else [solution]
                 if progress is not None and repeat == 0:
                     progress()
-        rows += [_row(subject, *results) for results in zip(chosen, seconds, solutions, strict=True)]
+        for label, options in chosen.items():
+            rows.append(_row(subject, label, options, seconds[label], solutions[label]))
     return rows
 
 
 def _row(
-    subject: Subject, chosen: Configuration, seconds: list[float], solutions: Sequence[Solution]
+    subject: Subject, label: str, options: Mapping[str, Any], seconds: list[float], solutions: Sequence[Solution]
 ) -> dict[str, Any]:
     x_1 = torch.cat([solution.x for solution in solutions])
     errors = rms(x_1 - subject.x_1)
-    sampler = chosen.method.replace(TORCHDIFFEQ, f"{TORCHDIFFEQ}method=")
-    fields = [f"--{key} {v:g}" if key == "tolerance" else f"--{key} {v}" for key, v in chosen.fields.items()]
+    method = options["method"]
+    words = {"sampler": method.replace(TORCHDIFFEQ, f"{TORCHDIFFEQ}method="), **options}
     row = {
-        "problem": subject.name, "method": chosen.method, "label": chosen.label,
-        "options": " ".join([f"--sampler {sampler}", *fields]), "scans": len(errors),
+        "problem": subject.name, "method": method, "label": label,
+        "options": " ".join(f"--{key} {value}" for key, value in words.items() if key != "method"),
+        "scans": len(errors),
         "evaluations": float(torch.cat([solution.evaluations for solution in solutions]).double().mean()),
         "seconds": float(np.median(seconds)), "error": float(errors.median()), "error_worst": float(errors.max()),
         "floor": subject.floor, "length": float(rms(subject.x_1 - subject.x_0).median()),
