@@ -5,7 +5,6 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -174,7 +173,7 @@ def completion(
     from r2flow.model.completion import completing
     from r2flow.models import DENSIFY
     from r2flow.progress import Bar
-    from r2flow.reports.completion import TASKS, Way, completion_page, completion_rows, measured_by, pictured
+    from r2flow.reports.completion import TASKS, completion_page, completion_rows, measured_by, pictured
     from r2flow.reports.pages import prepare_folder
 
     loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or [DENSIFY]}
@@ -185,15 +184,17 @@ def completion(
         if sensor or size or other:
             loaded[name] = model.through(named_sensor(sensor or other or model.sensor, rows_and_columns(size)))
         check(own in (None, loaded[name].sensor), f"{name} is a model of another sensor or size: report it apart.")
-    ways = [
-        Way(name, model, completing(model.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
+    chosen = [
+        (name, model, completing(model.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
         for name, model in loaded.items()
         for sampler in (separate(samplers) if samplers else [None])
     ]
-    first, names = ways[0].checkpoint, [way.name for way in ways]
-    ways = [
-        replace(way, model=f"{way.model} ({way.sampler.text})") if names.count(way.name) > 1 else way for way in ways
-    ]
+    names = [f"{name}, {sampler}" for name, _, sampler in chosen]
+    ways = {
+        short if names.count(short) == 1 else f"{name} ({sampler.text}), {sampler}": (model, sampler)
+        for short, (name, model, sampler) in zip(names, chosen, strict=True)
+    }
+    first = next(iter(loaded.values()))
     masks = re.split(r"\s*,\s*(?=[a-z]+:)|\s+", tasks.strip()) if tasks else list(TASKS)
     for task in masks:
         measured_by(task, first.sensor, 0)
@@ -202,7 +203,7 @@ def completion(
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
     check(truths, f"{real}: no scan has a return, so there is nothing to hide.")
     prepare_folder(out)
-    cost = sum(way.sampler.evaluations(way.checkpoint.generator) or 0 for way in ways) * len(masks)
+    cost = sum(sampler.evaluations(model.generator) or 0 for model, sampler in ways.values()) * len(masks)
     with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
         shown = list(completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, progress=advance))
     figure = pictured(truths[0], shown, first.sensor)

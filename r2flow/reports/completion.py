@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,19 +31,6 @@ COLUMNS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Way:
-    """A model, its name in tables, and its sampler."""
-
-    model: str
-    checkpoint: Checkpoint
-    sampler: Sampler
-
-    @property
-    def name(self) -> str:
-        return f"{self.model}, {self.sampler}"
-
-
 def measured_by(task: str, sensor: Sensor, number: int) -> np.ndarray:
     """Rays of scan `number` that a mask keeps, (H, W) bool; depends only on both."""
     measured = parse_mask(task)(np.ones(sensor.shape, dtype=bool), noise.generator(0, "condition", number))
@@ -56,7 +42,7 @@ def measured_by(task: str, sensor: Sensor, number: int) -> np.ndarray:
 def completion_rows(
     truths: Sequence[np.ndarray],
     sensor: Sensor,
-    ways: Sequence[Way],
+    ways: Mapping[str, tuple[Checkpoint, Sampler]],
     tasks: Sequence[str] = TASKS,
     num: int = 8,
     seed: int = 0,
@@ -65,7 +51,7 @@ def completion_rows(
 ) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """One row per task and method, means over scans and their `num` answers, and the first answer to the first scan.
 
-    Interpolations have one answer.
+    Methods are models with samplers, by name in tables, and interpolations, which have one answer.
     """
     reference = panel(np.stack(truths), sensor)
     for task in tasks:
@@ -77,12 +63,12 @@ def completion_rows(
         cost: dict[str, tuple[float, float]] = {}
         for name, fill in INTERPOLATIONS.items():
             answers[name] = [fill(image, mask)[None] for image, mask in zip(given, masks, strict=True)]
-        for way in ways:
-            how: Any = {"sampler": way.sampler, "batch_size": batch_size, "progress": progress}
-            results = list(complete(way.checkpoint, images, state, num, seed, **how))
-            answers[way.name] = [result.images.numpy() for result in results]
+        for name, (checkpoint, sampler) in ways.items():
+            how: Any = {"sampler": sampler, "batch_size": batch_size, "progress": progress}
+            results = list(complete(checkpoint, images, state, num, seed, **how))
+            answers[name] = [result.images.numpy() for result in results]
             evaluations = float(torch.cat([result.evaluations for result in results]).float().mean())
-            cost[way.name] = evaluations, sum(result.seconds for result in results) / num / len(results)
+            cost[name] = evaluations, sum(result.seconds for result in results) / num / len(results)
         firsts = {name: [images[0] for images in of_method] for name, of_method in answers.items()}
         cases = zip(truths, zip(*firsts.values(), strict=True), masks, strict=True)
         common = means([dict(zip(answers, common_mae(x, y, ~mask), strict=True)) for x, y, mask in cases])

@@ -14,7 +14,7 @@ from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.completion import Way, completion_rows, measured_by
+from r2flow.reports.completion import completion_rows, measured_by
 from r2flow.samplers import build_sampler
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
@@ -47,7 +47,7 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
         return Generated.after(encoding.encode(torch.cat([moved, truth[:, 1:]], 1)), 7)
 
     monkeypatch.setattr(checkpoint.generator, "forward", answer)
-    ways = [Way("truth", checkpoint, build_sampler("euler", steps=7))]
+    ways = {"truth": (checkpoint, build_sampler("euler", steps=7))}
     options = {"tasks": ["rows:4"], "num": 1}
     *plain, (row, _) = completion_rows(truths, sensor, ways, **options)
     assert [one["method"] for one, _ in plain] == list(INTERPOLATIONS)
@@ -63,7 +63,7 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
 
 
 def test_interpolations_are_judged_as_any_answer(checkpoint, truths):
-    rows = {row["method"]: row for row, _ in completion_rows(truths, checkpoint.sensor, [], ["points:0.3"])}
+    rows = {row["method"]: row for row, _ in completion_rows(truths, checkpoint.sensor, {}, ["points:0.3"])}
     expected = []
     for number, truth in enumerate(truths):
         mask = measured_by("points:0.3", checkpoint.sensor, number)
@@ -123,6 +123,6 @@ def test_a_densifier_is_measured_on_the_sensor_of_the_scans(r2flow, checkpoint, 
         "--num", 1, "--tasks", "rows:2", "--out", tmp_path / "out", *given,
     )  # fmt: skip
     *_, row = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
-    at = Way("", checkpoint.through(sensor), checkpoint.generator.sampler)
-    *_, (expected, _) = completion_rows([truth], sensor, [at], ["rows:2"], 1)
+    ways = {"model": (checkpoint.through(sensor), checkpoint.generator.sampler)}
+    *_, (expected, _) = completion_rows([truth], sensor, ways, ["rows:2"], 1)
     assert row["mae_m"] == pytest.approx(expected["mae_m"])
