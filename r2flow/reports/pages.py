@@ -57,7 +57,6 @@ class Page:
         seeds: All seeds, by purpose.
         device: Device of the networks.
         more: Further lists for the JSON, by name.
-        command: Command that reproduces the page.
     """
 
     name: str
@@ -68,7 +67,6 @@ class Page:
     seeds: Mapping[str, int] = field(default_factory=dict)
     device: str = "cpu"
     more: Mapping[str, Sequence[Row]] = field(default_factory=dict)
-    command: str = field(default_factory=command)
 
 
 def write_page(page: Page, out: str | Path) -> list[Path]:
@@ -107,7 +105,7 @@ def provenance(page: Page) -> dict[str, Any]:
         machine["gpu"] = torch.cuda.get_device_name(page.device)
     return {
         "report": page.title,
-        "command": page.command,
+        "command": command(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine,
         "versions": {"r2flow": r2flow.__version__, "torch": torch.__version__, "python": platform.python_version()},
@@ -159,7 +157,7 @@ def _plain(value: Any) -> Any:
 def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
     pictures = [f"![{name.replace('_', ' ')}]({name}.png)" for name in page.figures]
     notes = [f"- {key}: {_one_line(value)}" for key, value in origin.items() if key not in ("report", "command")]
-    again = ["## Where this comes from", "Made with", f"```\n{page.command}\n```", "\n".join(notes)]
+    again = ["## Where this comes from", "Made with", f"```\n{origin['command']}\n```", "\n".join(notes)]
     return "\n\n".join([f"# {page.title}", *pictures, *page.text, *again]) + "\n"
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import r2flow
-from r2flow.reports.pages import STYLES, Page, blank_figure, write_page
+from r2flow.reports.pages import STYLES, Page, blank_figure, command, write_page
 from r2flow.reports.pictures import figure_pixels
 from r2flow.reports.tables import print_table, shown, table
 
@@ -38,7 +38,7 @@ def test_a_page_is_a_figure_a_csv_a_json_and_markdown(tmp_path):
 
 def test_every_file_says_where_it_comes_from(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["train.py", "seed=1"])
-    assert page().command == "python train.py seed=1"
+    assert command() == "python train.py seed=1"
     monkeypatch.setattr("sys.argv", ["/bin/r2flow", "report", "speed", "a b"])
     for path in write_page(page(), tmp_path):
         content = path.read_bytes().decode("latin-1")
@@ -59,7 +59,7 @@ def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
     assert content["origin"]["seeds"] == {"scenes": 3}
     assert content["origin"]["machine"]["cores"] >= 1
     text = (tmp_path / "speed.md").read_text()
-    for words in ("# How fast\n", "![speed](speed.png)", "First.", "| a\\|b, c | - |", f"```\n{page().command}\n"):
+    for words in ("# How fast\n", "![speed](speed.png)", "First.", "| a\\|b, c | - |", f"```\n{command()}\n"):
         assert words in text
 
 
