@@ -225,8 +225,6 @@ def _assembled(config: dict[str, Any], generator: Generator, asked: Sequence[str
             raise InputError(f"generator {config['generator']['name']} has its own network: leave {wrong[0]} out.")
         config["backbone"] = None
     data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
-    if data.pairs is not None:
-        data.pairs.recipe(data.encoding.shape, data.noise_shape)  # refuses values out of range
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
     data.further = stage.further

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from r2flow.data.opening import SOURCES, own_reading
-from r2flow.data.options import SourceOptions
-from r2flow.data.pairs import PairRecipe, PairStore
+from r2flow.data.options import PairOptions, SourceOptions
+from r2flow.data.pairs import PairStore
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError
@@ -62,7 +62,8 @@ def prepared(path: Path) -> bytes:
 
 def pairs(path: Path) -> bytes:
     folder = in_folder("pairs")(path)
-    store = PairStore(folder, PairRecipe("0" * 16, (2, 8, 64), 0, 0, {"name": "euler", "steps": 1}, 2, 2), 4)
+    options = PairOptions(num=4, sampler={"name": "euler", "steps": 1}, batch_size=2)
+    store = PairStore(folder, options, (2, 8, 64))
     try:
         return store.read(0)[0]["x_1"].tobytes()
     except Damaged as error:

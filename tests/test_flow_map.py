@@ -194,7 +194,7 @@ def batch_of(**further) -> dict[str, torch.Tensor]:
 def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_path: Path):
     """dx/dt = x: x_t = e^t x_0, and the mean velocity (e^s - e^t) / (s - t) x_0."""
     options = PairOptions(sampler={"name": "adams3", "steps": 64}, num=6, knots=7, batch_size=2, parent="a")
-    store = PairStore(tmp_path, options.recipe((2, 4, 8)), 6)
+    store = PairStore(tmp_path, options, (2, 4, 8))
     make_pairs(store, Field(lambda t, x: x, (2, 4, 8)))
     dataset = PairDataset(PairSource(store), 0, "training")
     batch = torch.utils.data.default_collate([dataset[k, k] for k in range(6)])
@@ -212,20 +212,21 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
     options = PairOptions(
         sampler={"name": "renoise", "steps": 2, "grid": "power:5"}, num=6, batch_size=2, seed=3, parent="a"
     )
-    store = PairStore(tmp_path, options.recipe(exact.space.shape), 6)
+    store = PairStore(tmp_path, options, exact.space.shape)
     make_pairs(store, exact)
     mean, std = exact.problem.mean, exact.problem.std
     late = 1 - 0.5**5  # where the second of two steps on power:5 begins
-    for index, (x_0, x_1) in enumerate(PairSource(store)[k] for k in range(6)):
+    for index, pair in enumerate(PairSource(store)[k] for k in range(6)):
+        x_0, x_1 = pair["x_0"], pair["x_1"]
         assert torch.equal(x_0, standard_normal(exact.noise_shape, 3, "pairs", index))
         guess = mean + std * x_0
         fresh = standard_normal(exact.noise_shape, 3, "pairs", index, 1)
         x_t = late * guess + (1 - late) * fresh
         expected = mean + std * (x_t - late * mean) / ((1 - late) ** 2 + (late * std) ** 2) ** 0.5
         torch.testing.assert_close(x_1, expected, rtol=2**-11, atol=2e-5)
-    other = PairOptions(num=6, sampler={"name": "sde"}, parent="a").recipe(exact.space.shape)
+    other = PairOptions(num=6, sampler={"name": "sde"}, parent="a")
     with pytest.raises(InputError, match="sde"):
-        make_pairs(PairStore(tmp_path / "other", other, 6), exact)
+        make_pairs(PairStore(tmp_path / "other", other, exact.space.shape), exact)
 
 
 @pytest.mark.parametrize("method", ["chord", "renoise"])

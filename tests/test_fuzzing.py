@@ -15,7 +15,8 @@ import pytest
 import torch
 import yaml
 
-from r2flow.data.pairs import PairRecipe, PairStore
+from r2flow.data.options import PairOptions
+from r2flow.data.pairs import PairStore
 from r2flow.data.reading import Reading
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import write_sensor
@@ -77,8 +78,8 @@ def write_stores(folder: Path, beside: Path) -> None:
         write_points(scans / f"{number}.bin", XYZ * [1, 1, 0.1], REFLECTANCE)
     prepare_folder(scans, beside / "prepared", SENSOR)
     keep(folder, "prepared", *(beside / "prepared").iterdir())
-    recipe = PairRecipe("0" * 16, (2, 8, 64), 0, 0, {"name": "euler", "steps": 1}, 2, 2)
-    store = PairStore(beside / "pairs", recipe, 4)
+    options = PairOptions(num=4, sampler={"name": "euler", "steps": 1}, batch_size=2)
+    store = PairStore(beside / "pairs", options, (2, 8, 64))
     store.begin()
     x_1 = DRAW.standard_normal((4, 2, 8, 64)).astype(np.float16)
     store.write(0, {"x_1": x_1, "evaluations": np.ones(4, np.int32)}, {"usable": [1] * 4})

@@ -63,10 +63,8 @@ def pairs(
         "sampler": {"name": "adams3", **how.given}, "precision": precision, "num": num, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed, "knots": knots,
     }  # fmt: skip
-    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
-        flow.encoding.shape, flow.generator.noise_shape
-    )
-    store = PairStore(out or default_folder(flow.path), recipe, num)
+    chosen = PairOptions(**pairs_of(flow, options, weights_hash(flow)))
+    store = PairStore(out or default_folder(flow.path), chosen, flow.encoding.shape, flow.generator.noise_shape)
     make_and_tell(store, flow, where, wait=False)
     if missing := store.missing_pairs():
         print(f"{store.folder}: other processes are still generating about {missing} of {num} pairs")

@@ -70,8 +70,7 @@ class ScanDataModule(L.LightningDataModule):
     def pair_store(self) -> PairStore:
         """The folder of the run's pairs, complete or not."""
         assert self.pairs is not None
-        recipe = self.pairs.recipe(self.encoding.shape, self.noise_shape)
-        return PairStore(self.options.folder, recipe, self.pairs.num)
+        return PairStore(self.options.folder, self.pairs, self.encoding.shape, self.noise_shape)
 
     def setup(self, stage: str | None = None) -> None:
         if self.training_source is not None or self.scans is not None:

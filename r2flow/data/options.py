@@ -1,11 +1,9 @@
 """Keys of a run's `data`: types, defaults and meaning."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
-from r2flow.data.pairs import PairRecipe
 from r2flow.errors import InputError
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection
@@ -98,17 +96,10 @@ class PairOptions:
     of: str | None = None  # the flow that draws the pairs; None: the flow of stage.init
     parent: str | None = None  # hash of the flow, filled in by the run
 
-    def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
-        """The recipe of the pairs for these shapes of scans and noise in model space."""
-        sampler = build_sampler(self.sampler).asdict()
+    def __post_init__(self) -> None:
+        sampler = build_sampler(self.sampler)
         if self.knots:
-            build_sampler(sampler).knot_times(self.knots)
-        size = self.batch_size * 2 * math.prod(shape) * (1 + (self.knots or 0))
-        shard_batches = max(round(self.shard_mib * 2**20 / size), 1)
-        return PairRecipe(
-            self.parent or "", shape, self.seed, self.first or 0, sampler, self.batch_size, shard_batches,
-            None if noise_shape == shape else noise_shape, self.knots or 0, self.precision,
-        )  # fmt: skip
+            sampler.knot_times(self.knots)
 
 
 @dataclass(frozen=True)

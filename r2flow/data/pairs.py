@@ -1,12 +1,12 @@
 """Reflow pairs (x_0, x_1): noise and the sample that a flow maps it to."""
 
 import copy
+import math
 import random
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,50 +16,55 @@ from torch.utils.data import Dataset
 
 from r2flow import noise
 from r2flow.data.loader import FlowDataset, Item, Permutations
+from r2flow.data.options import PairOptions
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
 from r2flow.generators import Generated, Generator, as_flow
-from r2flow.generators.base import Precision, autocast
+from r2flow.generators.base import autocast
 from r2flow.models import name_of
 from r2flow.processes import place
 from r2flow.samplers import build_sampler
 from r2flow.store import Damaged, Store
 
 
-@dataclass(frozen=True)
-class PairRecipe:
-    """All that a pair depends on, except its index: folders with equal recipes hold the same bytes."""
-
-    parent: str  # hash of the flow's weights and config
-    shape: tuple[int, int, int]  # (C, H, W) of a scan in model space
-    seed: int  # x_0 of index i is the noise of (seed, "pairs", i), which is not stored
-    first: int  # index of the first pair
-    sampler: dict[str, Any]  # name and fields of the flow's sampler
-    batch_size: int  # consecutive indices that are solved in one batch
-    shard_batches: int  # batches in a shard
-    noise_shape: tuple[int, ...] | None = None  # shape of x_0, if it differs from the scan's
-    knots: int = 0  # number of inner states stored per path
-    precision: Precision = "32-true"  # precision of the network
-
-
 class PairStore(Store):
     """A folder of pairs: shard s holds the batches [s S, (s + 1) S), batch b the indices first + [b B, (b + 1) B).
 
-    The last shard has only the batches that the first `num` pairs need; it is made again for a larger `num`.
+    A pair depends on its index and on all `options` except `num`: folders of equal options hold the same bytes. The
+    last shard has only the batches that the first `num` pairs need; it is made again for a larger `num`.
+
+    Args:
+        shape: (C, H, W) of a scan in model space.
+        noise_shape: That of x_0; None: the scan's.
     """
 
     option = "data.root=FOLDER (r2flow pairs --out FOLDER)"
 
-    def __init__(self, folder: str | Path, recipe: PairRecipe, num: int) -> None:
-        self.recipe, self.num = recipe, num
-        super().__init__(folder, "pairs", asdict(recipe))
+    def __init__(
+        self,
+        folder: str | Path,
+        options: PairOptions,
+        shape: tuple[int, int, int],
+        noise_shape: tuple[int, ...] | None = None,
+    ) -> None:
+        self.options, self.first, self.knots = options, options.first or 0, options.knots or 0
+        self.noise_shape, self.sampler = noise_shape or shape, build_sampler(options.sampler)
+        size = options.batch_size * 2 * math.prod(shape) * (1 + self.knots)
+        self.shard_batches = max(round(options.shard_mib * 2**20 / size), 1)
+        recipe = {
+            "parent": options.parent or "", "shape": shape, "seed": options.seed, "first": self.first,
+            "sampler": self.sampler.asdict(), "batch_size": options.batch_size, "shard_batches": self.shard_batches,
+            "noise_shape": None if self.noise_shape == shape else self.noise_shape, "knots": self.knots,
+            "precision": options.precision,
+        }  # fmt: skip
+        super().__init__(folder, "pairs", recipe)
         self.check()
-        self.shards = range(-(-num // (recipe.shard_batches * recipe.batch_size)))
+        self.shards = range(-(-options.num // (self.shard_batches * options.batch_size)))
 
     def batches_of(self, shard: int) -> range:
         """The batches of a shard that the first `num` pairs need."""
-        size = self.recipe.shard_batches
-        return range(shard * size, min((shard + 1) * size, -(-self.num // self.recipe.batch_size)))
+        needed = range(-(-self.options.num // self.options.batch_size))
+        return needed[shard * self.shard_batches : (shard + 1) * self.shard_batches]
 
     def has(self, item: int) -> bool:
         """Whether a shard exists and has all batches that the first `num` pairs need."""
@@ -67,16 +72,15 @@ class PairStore(Store):
             usable = self.head(item)["usable"]
         except (FileNotFoundError, Damaged):
             return False
-        return len(usable) >= len(self.batches_of(item)) * self.recipe.batch_size
+        return len(usable) >= len(self.batches_of(item)) * self.options.batch_size
 
     def missing_pairs(self) -> int:
         """Number of pairs in missing shards."""
-        return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.recipe.batch_size
+        return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.options.batch_size
 
-
-def pair_noise(recipe: PairRecipe, index: int) -> Tensor:
-    """x_0 of a pair, in the recipe's noise shape or (C, H, W), drawn from its index."""
-    return noise.standard_normal(recipe.noise_shape or recipe.shape, recipe.seed, "pairs", index)
+    def noise(self, index: int) -> Tensor:
+        """x_0 of a pair, which is not stored: the noise of (seed, "pairs", index)."""
+        return noise.standard_normal(self.noise_shape, self.options.seed, "pairs", index)
 
 
 @dataclass
@@ -97,14 +101,14 @@ def make_pairs(
 ) -> Made:
     """Make the missing or damaged pairs of a store; `wait`: await those that others are making.
 
-    x_1 is the generator's sample for x_0 = `pair_noise`, neither clamped nor snapped, in half precision. With `chord`
+    x_1 is the generator's sample for x_0 = `store.noise`, neither clamped nor snapped, in half precision. With `chord`
     or `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function
     of (seed, index, step). Batches do not depend on the process: shards are byte-identical for any number of processes.
     `progress` is called after each batch.
     """
-    if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
+    if generator.noise_shape != store.noise_shape:
         raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")
-    sampler = build_sampler(store.recipe.sampler)
+    sampler = store.sampler
     sampler.check(generator)
     if not sampler.paired:
         raise InputError(f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
@@ -114,8 +118,8 @@ def make_pairs(
         store.mend([shard])
         batches = []
         for batch in store.batches_of(shard):
-            batches.append(solve_batch(store.recipe, generator, batch))
-            made.pairs += store.recipe.batch_size
+            batches.append(solve_batch(store, generator, batch))
+            made.pairs += store.options.batch_size
             made.evaluations += int(batches[-1]["evaluations"].sum())
             made.unusable += int((~batches[-1]["usable"]).sum())
             made.seconds = time.monotonic() - start
@@ -138,23 +142,23 @@ def make_pairs(
     return made
 
 
-def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> dict[str, np.ndarray]:
+def solve_batch(store: PairStore, generator: Generator, batch: int) -> dict[str, np.ndarray]:
     """The pairs first + [b B, (b + 1) B) of batch b: x_1, evaluations, usable and, with knots, the inner states.
 
     States are float16, (B, C, H, W) and (B, K, C, H, W); pairs whose states overflow float16 are not usable.
     """
-    indices = range(recipe.first + batch * recipe.batch_size, recipe.first + (batch + 1) * recipe.batch_size)
-    x_0 = torch.stack([pair_noise(recipe, index) for index in indices]).to(generator.device)
-    sampler, states = build_sampler(recipe.sampler), {}
+    options, sampler, states = store.options, store.sampler, {}
+    indices = range(store.first + batch * options.batch_size, store.first + (batch + 1) * options.batch_size)
+    x_0 = torch.stack([store.noise(index) for index in indices]).to(generator.device)
     end: Generated | Solution
-    if recipe.knots:
-        with autocast(generator.device, recipe.precision):
-            end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=sampler, knots=recipe.knots)
+    if store.knots:
+        with autocast(generator.device, options.precision):
+            end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=sampler, knots=store.knots)
         assert end.knots is not None
         states["knots"] = end.knots
     else:
-        fresh = noise.Draws(recipe.seed, indices, "pairs") if sampler.draws else None
-        end = generator(x_0, sampler=sampler, draws=fresh, precision=recipe.precision)
+        fresh = noise.Draws(options.seed, indices, "pairs") if sampler.draws else None
+        end = generator(x_0, sampler=sampler, draws=fresh, precision=options.precision)
     states["x_1"] = end.x
     tensors, usable = {"evaluations": end.evaluations.cpu().numpy().astype(np.int32)}, end.converged.cpu().numpy()
     for name, values in states.items():
@@ -164,14 +168,20 @@ def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> dict[st
 
 
 class PairSource:
-    """The usable pairs of a store: (x_0, x_1), both (C, H, W) float32 in model space."""
+    """The usable pairs of a store, as tensors in model space.
+
+    x_0 and x_1, (C, H, W) float32; with knots also knots, (K, C, H, W), the inner states of the path, and times,
+    (K + 2,), the times of x_0, the knots and x_1.
+    """
 
     def __init__(self, store: PairStore) -> None:
         self.store = store
         if lacking := store.missing_pairs():
-            raise InputError(f"{store.folder} lacks about {lacking} of {store.num} pairs; make them: r2flow pairs RUN.")
+            num = store.options.num
+            raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
         usable = [flag for shard in store.shards for flag in store.head(shard)["usable"]]
-        self.indices = np.flatnonzero(usable[: store.num])
+        self.indices = np.flatnonzero(usable[: store.options.num])
+        self.times = {"times": store.sampler.knot_times(store.knots).float()} if store.knots else {}
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -181,52 +191,39 @@ class PairSource:
         part.indices = self.indices[np.asarray(indices, dtype=np.int64)]
         return part
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        recipe, number = self.store.recipe, int(self.indices[index])
-        return pair_noise(recipe, recipe.first + number), self._read("x_1", number)
-
-    def knots(self, index: int) -> Tensor:
-        """Inner states of the pair's path, (K, C, H, W) float32."""
-        return self._read("knots", int(self.indices[index]))
-
-    def _read(self, name: str, number: int) -> Tensor:
-        recipe = self.store.recipe
-        shard, offset = divmod(number, recipe.shard_batches * recipe.batch_size)
-        (path,) = self.store.files(shard)
+    def __getitem__(self, index: int) -> Item:
+        store, number = self.store, int(self.indices[index])
+        shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
+        (path,) = store.files(shard)
         try:
             with safe_open(path, framework="pt") as file:
-                return file.get_slice(name)[offset].float()
+                names = ("x_1", "knots") if store.knots else ("x_1",)
+                states = {name: file.get_slice(name)[offset].float() for name in names}
         except (SafetensorError, OSError) as error:
             raise InputError(
                 f"{path} was lost or damaged while it was in use ({error}). The same command makes it again."
             ) from None
+        return {"x_0": store.noise(store.first + number), **states, **self.times}
 
 
 class PairDataset(Dataset[Item]):
-    """Pairs as training items, with the keys of `FlowDataset`; u depends only on (seed, purpose, k).
+    """Pairs as training items, with the keys of `FlowDataset` and `PairSource`; u depends only on (seed, purpose, k).
 
-    Further keys with knots: knots, (K, C, H, W), the inner states of the path, and times, (K + 2,), the times of x_0,
-    the knots and x_1. Further keys with `scans`: scan, (C, H, W), a scan in model space, and noise, (*noise_shape),
-    independent of the scan.
+    Further keys with `scans`: scan, (C, H, W), a scan in model space, and noise, (*noise_shape), independent of it.
     """
 
     def __init__(self, source: PairSource, seed: int, purpose: str, scans: FlowDataset | None = None) -> None:
         self.source, self.seed, self.purpose, self.scans = source, seed, purpose, scans
-        self.order = None if scans is None else Permutations(len(scans), seed)
-        recipe = source.store.recipe
-        self.times = build_sampler(recipe.sampler).knot_times(recipe.knots).float() if recipe.knots else None
+        self.order = Permutations(0 if scans is None else len(scans), seed)
 
     def __len__(self) -> int:
         return len(self.source)
 
     def __getitem__(self, key: tuple[int, int]) -> Item:
         k, index = key
-        x_0, x_1 = self.source[index]
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
-        item = {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
-        if self.times is not None:
-            item |= {"knots": self.source.knots(index), "times": self.times}
-        if self.scans is not None and self.order is not None:
+        item = {**self.source[index], "u": u, "k": torch.tensor(k)}
+        if self.scans is not None:
             scan = self.scans[k, self.order[k]]
             item |= {"scan": scan["x_1"], "noise": scan["x_0"]}
         return item

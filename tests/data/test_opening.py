@@ -12,7 +12,7 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive, Layout, SourceKind
 from r2flow.data.opening import SOURCES, open_scans, own_reading, reading_for
 from r2flow.data.options import PairOptions
-from r2flow.data.pairs import PairSource, PairStore, make_pairs, pair_noise
+from r2flow.data.pairs import PairSource, PairStore, make_pairs
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve_reflectance
 from r2flow.data.sources import ScanSource
@@ -287,15 +287,15 @@ def test_noise_has_the_shape_that_the_module_is_told(numbered: Path, shape):
 
 
 def test_pairs_are_made_of_noise_of_their_own_shape(tmp_path: Path):
-    plain, own = (PairOptions(num=4, batch_size=4).recipe((2, 4, 8), shape) for shape in ((2, 4, 8), (5,)))
-    assert pair_noise(plain, 3).shape == (2, 4, 8)
-    assert torch.equal(pair_noise(own, 3), standard_normal((5,), 0, "pairs", 3))
-    store = PairStore(tmp_path, own, 4)
+    options = PairOptions(num=4, batch_size=4)
+    assert PairStore(tmp_path, options, (2, 4, 8)).noise(3).shape == (2, 4, 8)
+    store = PairStore(tmp_path, options, (2, 4, 8), (5,))
+    assert torch.equal(store.noise(3), standard_normal((5,), 0, "pairs", 3))
     make_pairs(store, Field(lambda t, x: torch.zeros_like(x), (5,)))
-    x_0, x_1 = PairSource(store)[2]
-    assert torch.equal(x_1, x_0.half().float())
+    pair = PairSource(store)[2]
+    assert torch.equal(pair["x_1"], pair["x_0"].half().float())
     with pytest.raises(InputError, match="holds other pairs: noise_shape"):
-        PairStore(tmp_path, plain, 4)
+        PairStore(tmp_path, options, (2, 4, 8))
 
 
 def test_a_part_of_a_part_is_not_the_same_part_of_the_whole(numbered: Path):

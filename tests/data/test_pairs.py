@@ -16,7 +16,7 @@ import torch
 
 from r2flow.cli.train import pairs
 from r2flow.data.options import PairOptions
-from r2flow.data.pairs import PairDataset, PairSource, PairStore, default_folder, make_pairs, pair_noise
+from r2flow.data.pairs import PairDataset, PairSource, PairStore, default_folder, make_pairs
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.noise import standard_normal
@@ -38,8 +38,7 @@ OPTIONS = {
 
 
 def store_in(folder: Path, **options) -> PairStore:
-    chosen = PairOptions(**{**OPTIONS, **options})
-    return PairStore(folder, chosen.recipe(SHAPE), chosen.num)
+    return PairStore(folder, PairOptions(**{**OPTIONS, **options}), SHAPE)
 
 
 grow = Field(lambda t, x: x, SHAPE)
@@ -51,7 +50,7 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
     source = PairSource(store)
     assert len(source) == 50
     for index in (0, 17, 49):
-        x_0, x_1 = source[index]
+        x_0, x_1 = source[index]["x_0"], source[index]["x_1"]
         assert torch.equal(x_0, standard_normal(SHAPE, 0, "pairs", index))
         # Half precision keeps 11 bits.
         torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)
@@ -103,13 +102,13 @@ def test_whole_shards_of_other_pairs_are_never_taken_for_damaged_ones(tmp_path: 
     assert files(tmp_path) == before
 
 
-def test_one_and_one_point_nought_are_one_tolerance():
-    one, other = (PairOptions(sampler={"name": "dopri5", "tolerance": one}).recipe(SHAPE) for one in (1, 1.0))
-    assert one == other
+def test_one_and_one_point_nought_are_one_tolerance(tmp_path: Path):
+    one, other = (store_in(tmp_path, sampler={"name": "dopri5", "tolerance": one}) for one in (1, 1.0))
+    assert one.described == other.described
 
 
 def test_how_pairs_are_drawn_is_for_their_generator_to_say(tmp_path: Path):
-    store = PairStore(tmp_path / "pairs", PairOptions(sampler={"name": "direct"}).recipe(SHAPE), 8)
+    store = store_in(tmp_path / "pairs", sampler={"name": "direct"}, num=8)
     with pytest.raises(InputError, match="direct"):  # which is of GANs
         make_pairs(store, grow)
     assert not store.folder.exists()
@@ -149,14 +148,14 @@ def test_a_shard_lost_in_use_says_how_to_go_on(tmp_path: Path):
     (tmp_path / "pairs-000001.safetensors").unlink()
     cut = tmp_path / "pairs-000002.safetensors"
     cut.write_bytes(cut.read_bytes()[:-100])
-    assert source[0][1].isfinite().all()
+    assert source[0]["x_1"].isfinite().all()
     for index in (13, 25):
         with pytest.raises(InputError, match="makes it again"):
             source[index]
 
 
 def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
-    bad = pair_noise(store_in(tmp_path).recipe, 5)
+    bad = store_in(tmp_path).noise(5)
 
     def broken(t, x):
         # The fifth scene starts where no other does, and stays there until it breaks.
@@ -167,7 +166,7 @@ def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
     assert made.unusable == 1
     source = PairSource(store_in(tmp_path, num=8))
     assert source.indices.tolist() == [0, 1, 2, 3, 4, 6, 7]
-    assert all(source[i][1].isfinite().all() for i in range(7))
+    assert all(source[i]["x_1"].isfinite().all() for i in range(7))
 
 
 def test_a_flow_that_is_broken_is_said_to_be(tmp_path: Path):
@@ -187,7 +186,7 @@ def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
     source = PairSource(store)
     dataset = PairDataset(source, seed=3, purpose="training")
     item = dataset[(70, 11)]
-    assert torch.equal(item["x_0"], pair_noise(store.recipe, 11))
+    assert torch.equal(item["x_0"], store.noise(11))
     assert item["k"] == 70
     assert 0 <= float(item["u"]) < 1
     assert float(item["u"]) != float(dataset[(71, 11)]["u"])
@@ -235,8 +234,8 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
         assert words in said
     flow = load_checkpoint(path)
     options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
-    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
-    assert len(PairSource(PairStore(folder, recipe, 10))) == 10
+    chosen = PairOptions(**pairs_of(flow, options, weights_hash(flow)))
+    assert len(PairSource(PairStore(folder, chosen, flow.encoding.shape))) == 10
     assert "pairs/s" not in r2flow.said("pairs", path, *QUICK)  # nothing was left to make
 
 

@@ -176,7 +176,7 @@ def test_pairs_of_a_flow_map_can_be_its_jumps(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     sampler = ("data.pairs.sampler.name=jump", "data.pairs.sampler.steps=4")
     run = build(compose(["experiment=reflow", "stage.init=street", "data.root=pairs", "trainer=cpu", *sampler]))
-    assert run.data.pairs.recipe(run.data.encoding.shape).sampler["name"] == "jump"
+    assert run.data.pair_store.sampler.name == "jump"
 
 
 @pytest.mark.slow
