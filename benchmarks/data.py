@@ -101,7 +101,7 @@ def measure_shards(paths: Sequence[Path], folder: Path, times: int) -> None:
     chosen.mkdir()
     for number, path in enumerate(paths):
         (chosen / f"{number:06d}.bin").symlink_to(path.resolve())
-    prepare(folder / "prepared", plan_files("folder", chosen, find_drives("folder", chosen), Reading(HDL64E)))
+    prepare(plan_files(folder / "prepared", "folder", chosen, find_drives("folder", chosen), Reading(HDL64E)))
     options = SourceOptions("prepared", str(folder / "prepared"))
     prepared = SOURCES["prepared"].open(options, Reading(HDL64E, reflectance=True))
     arrays = [folder / f"{i}.npy" for i in range(len(paths))]

@@ -255,5 +255,5 @@ def generated(tmp_path: Path) -> Path:
 
 def prepare_folder(root: Path, out: Path, sensor: Sensor, layout: str = "folder") -> Path:
     """The scans of a data set, prepared."""
-    prepare(out, plan_files(layout, root, find_drives(layout, root), Reading(sensor)))
+    prepare(plan_files(out, layout, root, find_drives(layout, root), Reading(sensor)))
     return out

@@ -80,19 +80,20 @@ def prepare(
     check(file is None, f"{scans} is one scan; give the folder of a data set.")
     options = replace(options, split=split, drives=[*drives.split(",")] if drives else None)
     drives_found = SOURCES[options.name].find_drives(options)
-    plan = plan_files(options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
-    with Bar("checking", len(plan.shards), "shards") as checked, Bar("preparing", len(plan.shards), "shards") as made:
-        notes = make(out, plan, on_bad_scan, workers or cores(), lambda shard: checked(), lambda shard: made())
-    size = sum(plan.store(out).files(shard)[0].stat().st_size for shard in plan.shards)
+    store = plan_files(out, options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
+    shards, levels = len(store.shards), store.described["levels"]
+    with Bar("checking", shards, "shards") as checked, Bar("preparing", shards, "shards") as made:
+        notes = make(store, on_bad_scan, workers or cores(), lambda shard: checked(), lambda shard: made())
+    size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)
     left_out = sum(len(note["left_out"]) for note in notes)
-    scans, shards, levels = plan.recipe["scans"] - left_out, len(plan.shards), plan.recipe["levels"]
+    usable = len(store.names) - left_out
     range_error, error = (max(note["errors"][channel] for note in notes) for channel in (0, 1))
     kept = "no reflectance in the scans"
     if levels is not None:
         kept = f"reflectance as n/{levels}, " + (f"at most {error:.2g} off" if error else "exactly")
     skipped = f"; {left_out} scans left out" if left_out else ""
     there = shards - round(made.tasks[0].completed)
-    of = f"{scans} scan{'s' * (scans != 1)} in {shards} shard{'s' * (shards != 1)}"
+    of = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"
     of += f" ({there} were there already)" if there else ""
     print(f"{out}: {of}, {size / 2**20:.1f} MiB; range within {range_error * 1e3:.2f} mm, {kept}{skipped}")
 

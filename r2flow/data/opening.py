@@ -50,16 +50,17 @@ class Prepared(SourceKind):
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
         folder, split, drives = Path(options.folder).expanduser(), options.split, options.drives
-        recipe, stored = read_prepared(folder)
-        refuse_other_images(folder, recipe, reading)
-        kind = SOURCES[recipe["layout"] if recipe["layout"] in SOURCES else FOLDER]
+        store = read_prepared(folder)
+        refuse_other_images(store, reading)
+        stored, layout = store.drives, store.described["layout"]
+        kind = SOURCES[layout if layout in SOURCES else FOLDER]
         if split is None and drives is None:
             parts = sorted({part for drive in stored if (part := kind.split_of(drive.name))})
             if len(parts) > 1:
                 log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(parts))
         spans = dict(zip(map(id, stored), spans_of(stored), strict=True))
         numbers = [number for drive in kind.chosen(stored, split, drives) for number in spans[id(drive)]]
-        scans = PreparedScans(folder, numbers, bool(reading.reflectance))
+        scans = PreparedScans(store, numbers, bool(reading.reflectance))
         check(len(scans), f"{folder} holds no usable scan of split={split!r}, drives={drives}.")
         return scans
 
@@ -67,7 +68,7 @@ class Prepared(SourceKind):
         return f"the scans in {options.folder} have no reflectance" if self.levels_of(options) is None else None
 
     def levels_of(self, options: SourceOptions) -> int | None:
-        return read_prepared(Path(options.folder).expanduser())[0]["levels"]
+        return read_prepared(Path(options.folder).expanduser()).described["levels"]
 
 
 SOURCES: Registry[SourceKind] = Registry(

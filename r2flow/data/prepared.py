@@ -7,12 +7,13 @@ A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, if the scans
 in the codes of `r2flow.data.quantise`.
 """
 
+import copy
 import hashlib
 import logging
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from safetensors import safe_open
 
 from r2flow.config import at_most_three, differences
 from r2flow.data.layouts import Drive
-from r2flow.data.quantise import OTHER_LEVELS, Codes, find_levels, fits, range_codes, reflectance_codes
+from r2flow.data.quantise import OTHER_LEVELS, find_levels, fits, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, lacks_reflectance, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError, check
@@ -32,42 +33,59 @@ from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, read_manif
 log = logging.getLogger(__name__)
 
 KIND = "scans"
-CHANNELS = ("range", "reflectance")
 SHARD_SCANS = 64  # 13 MB at 64 x 1024, held in memory until written
 PROBED = 8  # number of scans read to determine the levels of reflectance
 PROJECTION = 2  # revision; increase it when the same files give different images or codes
 
 
+class PreparedStore(Store):
+    """A folder of prepared scans.
+
+    Attributes:
+        drives: The names of the scans by drive.
+        source: The scans to prepare; None of a folder that is only read.
+        reading: How the scans became images.
+        parts: The numbers of each shard's scans.
+        codes: The codes of range and, if the scans have it, of reflectance, by the name of their tensor.
+    """
+
+    def __init__(
+        self, folder: str | Path, recipe: Mapping[str, Any], drives: list[Drive], source: ScanSource | None = None
+    ) -> None:
+        super().__init__(folder, KIND, recipe)
+        self.drives, self.source, self.reading = drives, source, Reading.of(recipe["reading"])
+        scans, levels, sensor = range(recipe["scans"]), recipe["levels"], self.reading.sensor
+        self.parts = [scans[first : first + recipe["shard_scans"]] for first in scans[:: recipe["shard_scans"]]]
+        self.codes = {"range": range_codes(sensor.min_range, sensor.max_range)}
+        if levels is not None:
+            self.codes["reflectance"] = reflectance_codes(levels)
+        self.shards = range(len(self.parts))
+
+    @cached_property
+    def names(self) -> list[str]:
+        return [name for drive in self.drives for name in drive.scans]
+
+    def sources_of(self, shard: int) -> str:
+        """Digest of the files of a shard's scans (`ScanFiles.contents`)."""
+        assert self.source is not None
+        return self.source.subset(self.parts[shard]).contents[:16]
+
+
 # Making
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The scans to prepare, by drive, and the recipe of their store."""
-
-    recipe: Mapping[str, Any]
-    drives: tuple[Drive, ...]
-    source: ScanSource
-
-    def store(self, folder: str | Path) -> Store:
-        return Store(folder, KIND, self.recipe)
-
-    @property
-    def shards(self) -> range:
-        return range(len(shards_of(self.recipe)))
-
-
 def plan_files(
+    folder: str | Path,
     layout: str,
     root: str | Path,
     drives: Sequence[Drive],
     reading: Reading,
     shard_scans: int = SHARD_SCANS,
-) -> Plan:
-    """Plan scan files in drives below a root; some scans are read to determine the levels of reflectance."""
+) -> PreparedStore:
+    """The store in `folder` of scan files in drives below a root; reads some scans for the levels of reflectance."""
     root = Path(root).expanduser()
     paths = [path for drive in drives for path in drive.scans]
-    named = tuple(Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in drives)
+    named = [Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in drives]
     reading = replace(reading, on_bad_scan="error", within_limits=True)
     warn_of_other_sensor(paths, reading, root)
     levels = _reflectance_levels(paths, reading)
@@ -77,7 +95,7 @@ def plan_files(
         "revision": PROJECTION, "layout": layout, "scans": len(names), "names": checksum(names),
         "reading": reading.described(), "levels": levels, "shard_scans": shard_scans,
     }  # fmt: skip
-    return Plan(recipe, named, ScanFiles(paths, reading, root))
+    return PreparedStore(folder, recipe, named, ScanFiles(paths, reading, root))
 
 
 def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
@@ -104,14 +122,14 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
     return levels
 
 
-def _make_shard(store: Store, source: ScanSource, skip: bool, shard: int) -> None:
-    recipe, numbers, left_out, errors = store.described, shards_of(store.described)[shard], [], [0.0, 0.0]
-    coders = dict(zip(CHANNELS, codes_of(recipe), strict=False))
-    shape = (len(numbers), *Reading.of(recipe["reading"]).sensor.shape)
-    tensors = {name: np.empty(shape, coder.dtype) for name, coder in coders.items()}
+def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
+    assert store.source is not None
+    numbers, left_out, errors = store.parts[shard], list[int](), [0.0, 0.0]
+    shape = (len(numbers), *store.reading.sensor.shape)
+    tensors = {name: np.empty(shape, coder.dtype) for name, coder in store.codes.items()}
     for number in numbers:
         try:
-            image = source[number]
+            image = store.source[number]
         except InputError as error:
             if not skip:
                 raise
@@ -119,20 +137,15 @@ def _make_shard(store: Store, source: ScanSource, skip: bool, shard: int) -> Non
             left_out.append(number)
             continue
         row = number - numbers.start - len(left_out)
-        for i, (name, coder) in enumerate(coders.items()):
+        for i, (name, coder) in enumerate(store.codes.items()):
             codes = tensors[name][row] = coder.encode(image[i])
             errors[i] = max(errors[i], float(np.abs(coder.values[codes] - image[i]).max()))
     kept = {name: codes[: len(numbers) - len(left_out)] for name, codes in tensors.items()}
-    store.write(shard, kept, {"left_out": left_out, "errors": errors, "files": _files(source, numbers)})
-
-
-def _files(source: ScanSource, numbers: Sequence[int]) -> str:
-    return source.subset(numbers).contents[:16]
+    store.write(shard, kept, {"left_out": left_out, "errors": errors, "files": store.sources_of(shard)})
 
 
 def prepare(
-    folder: str | Path,
-    plan: Plan,
+    store: PreparedStore,
     on_bad_scan: str = "error",
     workers: int = 1,
     checked: Advance = lambda shard: None,
@@ -141,68 +154,52 @@ def prepare(
     """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves out unusable scans.
 
     The headers of the shards have the numbers of the scans left out, maximum errors of range and reflectance, and a
-    digest of the files (`ScanFiles.contents`): shards of files that have changed since are refused.
-    `checked` and `made` are called with each shard.
+    digest of the files: shards of files that have changed since are refused. `checked` and `made` are called with each
+    shard.
     """
-    store = plan.store(folder)
-    if not store.check() or store.missing(plan.shards):
-        store.begin(drives=[[drive.name, drive.scans] for drive in plan.drives])
-    parts = shards_of(plan.recipe)
+    if not store.check() or store.missing(store.shards):
+        store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
 
     def look(shard: int) -> None:
         file = store.files(shard)[0]
         check(
-            not file.exists() or store.head(shard).get("files") == _files(plan.source, parts[shard]),
+            not file.exists() or store.head(shard).get("files") == store.sources_of(shard),
             f"{file} holds scans of other files. Give another folder by {store.option}, or remove it to make it again.",
         )
         checked(shard)
 
-    store.mend(plan.shards, look)
-    work = partial(_make_shard, store, plan.source, on_bad_scan == "skip")
-    store.make(store.missing(plan.shards), work, workers, made)
-    notes = [store.head(shard) for shard in plan.shards]
-    if sum(len(note["left_out"]) for note in notes) == plan.recipe["scans"]:
-        raise InputError(f"all {plan.recipe['scans']} scans were left out as unusable; remove {store.folder}.")
+    store.mend(store.shards, look)
+    store.make(store.missing(store.shards), partial(_make_shard, store, on_bad_scan == "skip"), workers, made)
+    notes = [store.head(shard) for shard in store.shards]
+    if sum(len(note["left_out"]) for note in notes) == len(store.names):
+        raise InputError(f"all {len(store.names)} scans were left out as unusable; remove {store.folder}.")
     return notes
-
-
-def shards_of(recipe: Mapping[str, Any]) -> list[range]:
-    """The numbers of each shard's scans."""
-    scans, size = range(recipe["scans"]), recipe["shard_scans"]
-    return [scans[first : first + size] for first in scans[::size]]
-
-
-def codes_of(recipe: Mapping[str, Any]) -> list[Codes]:
-    """The codes of range and, if the scans have it, of reflectance."""
-    sensor, levels = recipe["reading"]["sensor"], recipe["levels"]
-    ranges = range_codes(sensor["min_range"], sensor["max_range"])
-    return [ranges] if levels is None else [ranges, reflectance_codes(levels)]
 
 
 # Reading
 
 
-def read_prepared(folder: Path) -> tuple[dict[str, Any], list[Drive]]:
-    """The recipe of prepared scans, and their names by drive."""
+def read_prepared(folder: Path) -> PreparedStore:
+    """The prepared scans in a folder, by its manifest."""
     try:
         content = read_manifest(folder, KIND)
     except FileNotFoundError:
         raise InputError(f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare.") from None
-    return content["recipe"], [Drive(name, tuple(scans)) for name, scans in content["drives"]]
+    return PreparedStore(folder, content["recipe"], [Drive(name, tuple(scans)) for name, scans in content["drives"]])
 
 
-def refuse_other_images(folder: Path, recipe: Mapping[str, Any], reading: Reading) -> None:
+def refuse_other_images(store: PreparedStore, reading: Reading) -> None:
     """Refuse prepared scans of another sensor, size, projection or convention, as they cannot be projected again."""
     # Images do not depend on these fields; the order of the lasers determines the rows in unfolding only.
     irrelevant = {"name", "height"} if reading.projection == "unfolding" else {"name", "height", "firing"}
     images = []
-    for fields in (recipe["reading"], reading.described()):
+    for fields in (store.described["reading"], reading.described()):
         sensor = {key: value for key, value in fields["sensor"].items() if key not in irrelevant}
         images.append({**sensor, "projection": fields["projection"], "convention": fields["convention"]})
     if differing := [*differences(*images).values()]:
-        stored = Reading.of(recipe["reading"])
+        stored = store.reading
         raise InputError(
-            f"{folder} was prepared for other images (sensor {stored.sensor.name}, "
+            f"{store.folder} was prepared for other images (sensor {stored.sensor.name}, "
             f"{stored.sensor.shape[0]}x{stored.sensor.shape[1]}, {stored.projection}, {stored.convention}): "
             f"{at_most_three(differing)}. Give the run the same, or prepare the scans for it."
         )
@@ -211,24 +208,21 @@ def refuse_other_images(folder: Path, recipe: Mapping[str, Any], reading: Readin
 class PreparedScans(ScanSource):
     """A source of the prepared scans of these numbers in the data set, without those left out in preparation."""
 
-    def __init__(self, folder: Path, numbers: Sequence[int], reflectance: bool) -> None:
-        self.folder, self.reflectance = folder, reflectance
-        self.recipe, self._drives = read_prepared(folder)
-        self.store, entries = Store(folder, KIND, self.recipe), dict[int, tuple[int, int, int]]()
-        if reflectance and self.recipe["levels"] is None:
-            raise InputError(f"{folder} holds scans without reflectance. Set encoding.reflectance=false.")
-        for shard, numbers_of_shard in enumerate(shards_of(self.recipe)):
+    def __init__(self, store: PreparedStore, numbers: Sequence[int], reflectance: bool) -> None:
+        self.store, self.reflectance, entries = store, reflectance, dict[int, tuple[int, int, int]]()
+        if reflectance and "reflectance" not in store.codes:
+            raise InputError(f"{store.folder} holds scans without reflectance. Set encoding.reflectance=false.")
+        for shard, numbers_of_shard in enumerate(store.parts):
             try:
-                left_out = set(self.store.head(shard)["left_out"])
+                left_out = set(store.head(shard)["left_out"])
             except FileNotFoundError:
-                raise InputError(f"{folder} is not finished: the same r2flow prepare command resumes.") from None
+                raise InputError(f"{store.folder} is not finished: the same r2flow prepare command resumes.") from None
             except Damaged as error:
                 raise self._damaged(shard, error) from None
             rows = [number for number in numbers_of_shard if number not in left_out]
             entries |= {number: (number, shard, row) for row, number in enumerate(rows)}
         #: Rows of (number in the data set, shard, row of the shard).
         self.rows = np.array([entries[n] for n in numbers if n in entries], dtype=np.int64).reshape(-1, 3)
-        self._values = [codes.values for codes in codes_of(self.recipe)[: 1 + reflectance]]
         self._shards: dict[int, list[Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -237,27 +231,23 @@ class PreparedScans(ScanSource):
     def __len__(self) -> int:
         return len(self.rows)
 
-    @cached_property
-    def _names(self) -> list[str]:
-        return [name for drive in self._drives for name in drive.scans]
-
     @property
     def names(self) -> list[str]:
-        return [self._names[number] for number in self.rows[:, 0]]
+        return [self.store.names[number] for number in self.rows[:, 0]]
 
     def subset(self, indices: Sequence[int]) -> "PreparedScans":
-        part = object.__new__(PreparedScans)
-        part.__dict__ = {**self.__getstate__(), "rows": self.rows[np.asarray(indices, dtype=np.int64)]}
+        part = copy.copy(self)
+        part.rows = self.rows[np.asarray(indices, dtype=np.int64)]
         return part
 
     @property
     def drives(self) -> dict[str, list[int]]:  # type: ignore[override]
         place = {name: index for index, name in enumerate(self.names)}
-        drives = {d.name: [place[n] for n in d.scans if n in place] for d in self._drives}
+        drives = {d.name: [place[n] for n in d.scans if n in place] for d in self.store.drives}
         return {drive: numbers for drive, numbers in drives.items() if numbers}
 
     def about(self) -> dict[str, Any]:
-        kind = f"prepared {self.recipe['layout']}"
+        kind = f"prepared {self.store.described['layout']}"
         return {"kind": kind, "recipe": self.store.digest[:12], "reflectance": self.reflectance}
 
     def identity(self) -> dict[str, Any]:
@@ -274,21 +264,24 @@ class PreparedScans(ScanSource):
         return digest.hexdigest()
 
     def places(self) -> set[str]:
-        real = os.path.realpath(self.folder)
+        real = os.path.realpath(self.store.folder)
         return {os.path.join(real, name) for name in self.names}
 
     def __getitem__(self, index: int) -> np.ndarray:
         _, shard, row = map(int, self.rows[index])
+        codes = [*self.store.codes.items()][: 1 + self.reflectance]
         try:
             if shard not in self._shards:
                 self.store.head(shard)  # checks the file's length and recipe
                 file = safe_open(self.store.files(shard)[0], framework="numpy")
-                self._shards[shard] = [file.get_slice(name) for name in CHANNELS[: len(self._values)]]
+                self._shards[shard] = [file.get_slice(name) for name, _ in codes]
         except (Damaged, OSError) as error:
             raise self._damaged(shard, error) from None
-        codes = [image[row : row + 1][0] for image in self._shards[shard]]
+        stored = [image[row : row + 1][0] for image in self._shards[shard]]
         # No index is out of bounds; mode="clip" only skips the bounds check.
-        return np.stack([np.take(values, code, mode="clip") for values, code in zip(self._values, codes, strict=True)])
+        return np.stack(
+            [np.take(coder.values, code, mode="clip") for (_, coder), code in zip(codes, stored, strict=True)]
+        )
 
     def _damaged(self, shard: int, error: Exception) -> InputError:
         path = self.store.files(shard)[0]

@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import SOURCES, find_drives
 from r2flow.data.options import SourceOptions
-from r2flow.data.prepared import Plan, plan_files, prepare
+from r2flow.data.prepared import PreparedStore, plan_files, prepare
 from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import ScanFiles
@@ -50,12 +50,14 @@ def clouds(tmp_path_factory) -> Path:
     return root
 
 
-def plan_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", shard_scans: int = 3, **how) -> Plan:
-    return plan_files(layout, root, find_drives(layout, root), Reading(sensor, **how), shard_scans=shard_scans)
+def plan_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", shard_scans: int = 3, **how) -> PreparedStore:
+    return plan_files(
+        "unused", layout, root, find_drives(layout, root), Reading(sensor, **how), shard_scans=shard_scans
+    )
 
 
-def make(folder: Path, plan: Plan, **options) -> Path:
-    prepare(folder, plan, **options)
+def make(folder: Path, plan: PreparedStore, **options) -> Path:
+    prepare(PreparedStore(folder, plan.described, plan.drives, plan.source), **options)
     return folder
 
 
@@ -128,7 +130,7 @@ def test_the_scale_of_files_of_points_is_not_that_of_range_images(tmp_path: Path
     image = np.stack([draw.uniform(2, 70, (4, 16)), draw.integers(0, levels, (4, 16)) / levels]).astype(np.float32)
     (tmp_path / "scans").mkdir()
     np.save(tmp_path / "scans" / "1.npy", image)
-    assert plan_of(tmp_path / "scans", reflectance_scale=255.0).recipe["levels"] == levels
+    assert plan_of(tmp_path / "scans", reflectance_scale=255.0).described["levels"] == levels
     np.save(tmp_path / "scans" / "1.npy", image * np.float32([[[1]], [[0.03]]]))
     plan_of(tmp_path / "scans", reflectance_scale=255.0)
     assert caplog.text == ""  # nothing spreads them
@@ -161,9 +163,11 @@ def test_real_scans_keep_their_reflectance_to_the_bit(
 ):
     sensor = SENSORS["hdl64e"]
     plan = plan_of(shared / "real" / folder, sensor, layout)
-    few = Plan({**plan.recipe, "scans": most}, (Drive("few", plan.drives[0].scans[:most]),), plan.source)
+    few = PreparedStore(
+        tmp_path, {**plan.described, "scans": most}, [Drive("few", plan.drives[0].scans[:most])], plan.source
+    )
     prepared = prepared_in(make(tmp_path, few), sensor)
-    assert few.recipe["levels"] == (256 if layout == "kitti_360" else 100)
+    assert few.described["levels"] == (256 if layout == "kitti_360" else 100)
     raw = raw_of(shared / "real" / folder, layout=layout, sensor=sensor)
     for index in range(most):
         image, other = raw[index], prepared[index]
@@ -292,7 +296,8 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tm
         prepared_in(tmp_path / "out", SMALL)
     make(tmp_path / "out", plan, on_bad_scan="skip")
     assert caplog.text.count("left out:") == 4
-    assert [note["left_out"] for note in prepare(tmp_path / "out", plan)] == [[1], [3, 4, 5], [], []]
+    shards = PreparedStore(tmp_path / "out", plan.described, plan.drives, plan.source)
+    assert [note["left_out"] for note in prepare(shards)] == [[1], [3, 4, 5], [], []]
     prepared, raw = prepared_in(tmp_path / "out", SMALL), raw_of(clouds)
     assert prepared.names == [raw.names[i] for i in (0, 2, 6, 7, 8, 9)]  # the second shard is empty
     for index, number in enumerate((0, 2, 6, 7, 8, 9)):
@@ -364,7 +369,7 @@ def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_pat
     if damage == "folder":
         path.rmdir()
     made = []
-    prepare(tmp_path, plan, made=made.append)
+    make(tmp_path, plan, made=made.append)
     assert made == ([1, 2] if damage == "swapped" else [1])  # these alone
     assert files(tmp_path) == whole
 
