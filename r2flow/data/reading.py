@@ -1,7 +1,6 @@
 """Reading of scan files and range images as images of a sensor."""
 
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -77,37 +76,27 @@ class Projected(NamedTuple):
     pixels: np.ndarray  # pixels with a point, h W + w, (M,)
     chosen: np.ndarray  # indices of their points, (M,)
 
-    def spread(self, values: np.ndarray) -> np.ndarray:
-        """Scatter values of the pixels' points, (M, ...), to an image, (H, W, ...); 0 elsewhere."""
-        shape = self.image.shape[1:]
-        image = np.zeros((math.prod(shape), *values.shape[1:]), values.dtype)
-        image[self.pixels] = values
-        return image.reshape(*shape, *values.shape[1:])
-
 
 def read_projected(path: str | Path, reading: Reading) -> Projected:
     """Read a file of points as an image with the points of its pixels."""
+    sensor = reading.sensor
     try:
-        return _projected(path, reading)
+        points = read_points(path, reading.columns)
+        if points.dropped:
+            warn_odd(Path(path), f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped", points.dropped)
+        if reading.projection == "unfolding":
+            points = points.with_lost_rays()
+        scaled = scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None
+        with naming(path):
+            pixels, chosen, r = project_indices(points.xyz, sensor, reading.projection, reading.convention, points.ring)
+        image = scatter(sensor, pixels, [r] if scaled is None else [r, scaled[chosen]])
+        if not image[0].any():
+            raise nothing_in_view(path, points, sensor)
     except NoPointsError:
         if reading.on_bad_scan != "empty":
             raise
-    image = np.zeros((1 + bool(reading.reflectance), *reading.sensor.shape), np.float32)
-    return Projected(image, Points(np.zeros((0, 3), np.float32)), *np.zeros((2, 0), np.int64))
-
-
-def _projected(path: str | Path, reading: Reading) -> Projected:
-    points, sensor = read_points(path, reading.columns), reading.sensor
-    if points.dropped:
-        warn_odd(Path(path), f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped", points.dropped)
-    if reading.projection == "unfolding":
-        points = points.with_lost_rays()
-    scaled = scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None
-    with naming(path):
-        pixels, chosen, r = project_indices(points.xyz, sensor, reading.projection, reading.convention, points.ring)
-    image = scatter(sensor, pixels, [r] if scaled is None else [r, scaled[chosen]])
-    if not image[0].any():
-        raise nothing_in_view(path, points, sensor)
+        points, (pixels, chosen) = Points(np.zeros((0, 3), np.float32)), np.zeros((2, 0), np.int64)
+        image = np.zeros((1 + bool(reading.reflectance), *sensor.shape), np.float32)
     return Projected(image, points, pixels, chosen)
 
 
@@ -131,7 +120,7 @@ def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, 
     if file is None:
         return projected.image, None
     labels = read_labels(file, path, projected.points)[projected.chosen].astype(np.uint16)
-    return projected.image, projected.spread(labels)
+    return projected.image, scatter(reading.sensor, projected.pixels, [labels])[0].astype(np.uint16)
 
 
 def _no_reflectance(path: str | Path) -> InputError:
@@ -200,8 +189,7 @@ def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarra
 def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
     """Read points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for no return."""
     projected = read_projected(path, reading)
-    xyz = projected.spread(projected.points.xyz[projected.chosen].astype(np.float32))
-    return projected.image, np.ascontiguousarray(np.moveaxis(xyz, -1, 0))
+    return projected.image, scatter(reading.sensor, projected.pixels, projected.points.xyz[projected.chosen].T)
 
 
 @contextmanager
