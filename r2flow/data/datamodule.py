@@ -54,11 +54,11 @@ class ScanDataModule(L.LightningDataModule):
         self.validation = self.options.validation_options
         self.further: Further | None = None
         self.names: list[str] = []
-        self.opened: list[ScanSource] = []  # as found, before they are read
-        self.training_source: ScanSource | PairSource | None = None
-        self.validation_source: ScanSource | PairSource | None = None
+        self.opened: list[Mixture] = []  # as found, before they are read
+        self.training_source: Mixture | PairSource | None = None
+        self.validation_source: Mixture | PairSource | None = None
         self.pairs = self._pair_options() if self.options.name == PAIRS else None
-        self.scans: ScanSource | None = None  # next to pairs
+        self.scans: Mixture | None = None  # next to pairs
 
     def _pair_options(self) -> PairOptions:
         options = construct("data.pairs", PairOptions, self.options.pairs)
@@ -78,7 +78,7 @@ class ScanDataModule(L.LightningDataModule):
         if self.pairs is not None:
             _ = self.pair_store  # refuses other pairs in the folder early; missing pairs are made later
             if self.options.next_to_pairs is not None:
-                source = self._open(self.options.next_to_pairs)
+                source = Mixture([self._open(self.options.next_to_pairs)])
                 self.names, self.opened = list(source.names), [source]
                 self.scans = self._kept(source, "scans next to the pairs", [self.sensor])
             return
@@ -87,7 +87,7 @@ class ScanDataModule(L.LightningDataModule):
         self.training_source = self._kept(training, "training scans", self.sensors)
         self.validation_source = self._kept(held, "validation scans", self.held_out_sensors)
 
-    def sources(self) -> tuple[ScanSource, ScanSource]:
+    def sources(self) -> tuple[Mixture, Mixture]:
         """The training and the validation scans, not yet read.
 
         Without `validation.data`, each part of a mixture holds out one block.
@@ -117,19 +117,18 @@ class ScanDataModule(L.LightningDataModule):
                     "data.validation.data" if other else "a held-out block of data.parts",
                     len(shared), min(shared),
                 )  # fmt: skip
-        validation = _joined(held)
-        return _joined(training), validation.subset(spread(len(validation), self.validation.scans))
+        validation = Mixture(held)
+        return Mixture(training), validation.subset(spread(len(validation), self.validation.scans))
 
     def _open(self, options: SourceOptions, first_scene: int = 0, sensor: Sensor | None = None) -> ScanSource:
         images = {"reflectance": self.encoding.reflectance, "within_limits": True}
         reading = Reading.of({**options.chosen, **images, "sensor": (sensor or self.sensor).described()})
         return open_source(options, reading, self.seed, first_scene)
 
-    def _order(self, source: ScanSource | PairSource) -> Order:
+    def _order(self, source: Mixture | PairSource) -> Order:
         """Order of the scans: maps image k of the run to a scan."""
         weights = [part.weight for part in self.parts if part.weight is not None]
-        if len(weights) > 1:
-            assert isinstance(source, Mixture)
+        if isinstance(source, Mixture) and len(weights) > 1:
             return MixedOrder([len(part) for part in source.parts], weights, self.seed)
         return Permutations(len(source), self.seed)
 
@@ -142,9 +141,9 @@ class ScanDataModule(L.LightningDataModule):
             texts.append(f"{len(self.opened[0])} of {len(self.names)} scans, {digest}")
         return "; ".join(texts)
 
-    def _kept(self, source: ScanSource, what: str, sensors: Sequence[Sensor]) -> ScanSource:
+    def _kept(self, source: Mixture, what: str, sensors: Sequence[Sensor]) -> Mixture:
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
-        parts = list(source.parts) if isinstance(source, Mixture) else [source]
+        parts = [*source.parts]
         channels = 1 + self.encoding.reflectance
         shapes = [(len(part), channels, *sensor.shape) for part, sensor in zip(parts, sensors, strict=True)]
         size = sum(math.prod(shape) * 4 for part, shape in zip(parts, shapes, strict=True) if part.slow)
@@ -156,7 +155,7 @@ class ScanDataModule(L.LightningDataModule):
                 for number in track(range(len(part)), f"reading {what}", least=16):
                     images[number] = part[number]
                 parts[i] = InMemory(images, part.names)
-        return _joined(parts)
+        return Mixture(parts)
 
     def check_run(self, ranks: int, accumulated: int) -> None:
         """Refuse a run whose global batch cannot be divided among devices."""
@@ -190,7 +189,7 @@ class ScanDataModule(L.LightningDataModule):
             self.training_source = pairs.subset(first)
             self.validation_source = pairs.subset([last[i] for i in spread(len(last), self.validation.scans)])
 
-    def _dataset(self, source: ScanSource | PairSource, purpose: str) -> Dataset[Item]:
+    def _dataset(self, source: Mixture | PairSource, purpose: str) -> Dataset[Item]:
         if isinstance(source, PairSource):
             if self.scans is None or purpose != "training":
                 return PairDataset(source, self.seed, purpose)
@@ -223,7 +222,3 @@ class ScanDataModule(L.LightningDataModule):
             "worker_init_fn": outlive_the_signal,
             "pin_memory": torch.cuda.is_available(),
         }
-
-
-def _joined(sources: list[ScanSource]) -> ScanSource:
-    return sources[0] if len(sources) == 1 else Mixture(sources)
