@@ -4,13 +4,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lightning.pytorch.callbacks import Callback, GradientAccumulationScheduler, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, GradientAccumulationScheduler, LearningRateMonitor
 
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import FOLDER
-from r2flow.registry import Count, Registry, check_options
+from r2flow.registry import Registry, check_options
 from r2flow.runs.lineage import drawn_by
 
+from .checkpoints import Checkpoints
 from .curvature import Curvature
 from .ema import EMA, HalfLifeEMA
 from .guard import Guard
@@ -21,7 +21,7 @@ from .stopping import Stopping
 
 
 class Entry(NamedTuple):
-    """Constructor of a callback, or of a list of callbacks, and its positional arguments from a config."""
+    """Constructor of a callback, and its positional arguments from a config."""
 
     constructor: Callable[..., Any]
     given: Callable[[Mapping[str, Any]], tuple[Any, ...]] = lambda config: ()
@@ -48,39 +48,12 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
             entry = registered if isinstance(registered, Entry) else Entry(registered)  # a class, as from a plug-in
             given = entry.given(config)
             check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
-            callback = entry.constructor(*given, **wanted[name])
-            built += callback if isinstance(callback, list) else [callback]
+            built.append(entry.constructor(*given, **wanted[name]))
     if any(isinstance(callback, GradientAccumulationScheduler) for callback in built):  # the loader needs one number
         raise InputError("leave the GradientAccumulationScheduler out, and give trainer.accumulate_grad_batches.")
     if config["loggers"]:
         built.append(LearningRateMonitor("step"))
     return built
-
-
-class Newest(ModelCheckpoint):
-    """A ModelCheckpoint that can resume with a smaller `save_top_k`."""
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        super().load_state_dict(state_dict)
-        newest = sorted(self.best_k_models.items(), key=lambda item: item[1])[-self.save_top_k :]
-        self.best_k_models, self.kth_best_model_path = dict(newest), newest[0][0] if newest else ""
-
-
-def keep_checkpoints(folder: Path, every: Count = 100, keep: Count = 2) -> list[Callback]:
-    """A checkpoint every `every` steps and one at the last step; the newest `keep` remain."""
-    common: dict[str, Any] = {
-        "dirpath": folder,
-        "filename": "step-{step:08d}",
-        "auto_insert_metric_name": False,
-        "enable_version_counter": False,
-        "monitor": "step",  # the largest step counts as the best: keeps the newest
-        "mode": "max",
-    }
-    # Without save_on_train_epoch_end, the checkpoint of the last step would wait for a validation that may not happen,
-    # and one checkpoint too many would remain.
-    regular = Newest(every_n_train_steps=every, save_top_k=keep, save_on_train_epoch_end=True, **common)
-    final = Newest(every_n_epochs=1, save_on_train_epoch_end=True, save_top_k=1, **common)
-    return [regular, final]
 
 
 # In the order of execution.
@@ -93,7 +66,7 @@ CALLBACKS = Registry(
     curvature=Entry(Curvature, lambda config: (config["seed"],)),
     guard=Entry(Guard, lambda config: (config["run_dir"],)),
     requeue=Entry(Stopping, lambda config: (config["run_dir"],)),
-    checkpoint=Entry(keep_checkpoints, lambda config: (Path(config["run_dir"], FOLDER),)),
+    checkpoint=Entry(Checkpoints, lambda config: (config["run_dir"],)),
     progress=Entry(Progress),
 )
 

@@ -15,9 +15,11 @@ from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import FOLDER, checkpoints_of, step_of
+from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, outlive_parent
+
+from .checkpoints import Checkpoints
 
 log = logging.getLogger(__name__)
 
@@ -91,11 +93,9 @@ class Stopping(L.Callback):
                 if trainer.strategy.reduce_boolean_decision(self.told == number, all=False):
                     self.told = number
         if received and trainer.global_step < trainer.max_steps:
-            if trainer.checkpoint_callbacks:
-                trainer.save_checkpoint(
-                    self.run_dir / FOLDER / f"step-{trainer.global_step:08d}.ckpt", weights_only=False
-                )
-                self._leave_newest(trainer)
+            for callback in trainer.checkpoint_callbacks:
+                if isinstance(callback, Checkpoints):
+                    callback.save(trainer)
             self._training = False
             environment = getattr(trainer.strategy, "cluster_environment", None)
             if not trainer.is_global_zero and isinstance(environment, LightningEnvironment):
@@ -104,20 +104,9 @@ class Stopping(L.Callback):
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._training = False
-        self._leave_newest(trainer)
 
     def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
         self._training = False
-
-    def _leave_newest(self, trainer: L.Trainer) -> None:
-        """Set damaged checkpoints aside, and delete old ones: ModelCheckpoint does not know of those saved here."""
-        if trainer.is_global_zero:
-            keep = max((getattr(one, "save_top_k", 0) for one in trainer.checkpoint_callbacks), default=2)
-            for path in checkpoints_of(self.run_dir):
-                if step_of(path) > trainer.global_step:  # the run could not resume from it
-                    path.rename(path.with_suffix(".damaged"))
-            for old in checkpoints_of(self.run_dir)[keep:]:
-                old.unlink(missing_ok=True)
 
     def _leave(self, where: str) -> None:
         assert self.told is not None
