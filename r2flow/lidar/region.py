@@ -51,21 +51,14 @@ class Region:
         image[..., rows[:, None], columns] = part
         return image
 
-    def widened(self) -> "Region":
-        """The region with its margin."""
-        left, width = self.left - self.margin, self.width + 2 * self.margin
-        if width >= self.shape[1]:
-            left, width = 0, self.shape[1]
-        return Region(self.shape, self.top, self.height, left % self.shape[1], width)
-
-    def rounded(self, unit: tuple[int, int]) -> "Region":
-        """The smallest region that contains this one and consists of whole units (rows, columns) of the image."""
+    def widened(self, unit: tuple[int, int]) -> "Region":
+        """The smallest region of whole units (rows, columns) of the image that contains this one and its margin."""
         assert not any(size % step for size, step in zip(self.shape, unit, strict=True)), unit
         top, height = _outward(self.top, self.height, unit[0])
-        left, width = _outward(self.left, self.width, unit[1])
+        left, width = _outward(self.left - self.margin, self.width + 2 * self.margin, unit[1])
         if width >= self.shape[1]:  # both ends may lie in one unit
             left, width = 0, self.shape[1]
-        return Region(self.shape, top, height, left, width)
+        return Region(self.shape, top, height, left % self.shape[1], width)
 
     def __str__(self) -> str:
         last_row, last_column = self.top + self.height - 1, (self.left + self.width - 1) % self.shape[1]

@@ -135,6 +135,4 @@ def warn_unsolved(converged: Tensor, first: int = 0, of: str = "") -> None:
 
 def evaluated_region(generator: Generator, region: Region) -> Region:
     """The region plus its margin, rounded outward to the generator's units; the whole image for the whole image."""
-    if region.share == 1:  # valid for every generator
-        return Region(region.shape, 0, region.shape[0], 0, region.shape[1])
-    return region.widened().rounded(generator.unit)
+    return region.widened(generator.unit if region.share < 1 else (1, 1))  # every generator has the whole image

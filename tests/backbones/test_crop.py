@@ -43,7 +43,7 @@ def test_a_part_is_the_backbone_of_its_own_rays(name, part):
 @pytest.mark.parametrize("part", [*PARTS, Region(SHAPE, 0, 16, 0, 64)], ids=str)
 def test_a_part_has_its_own_rays_and_the_whole_is_as_before(name, part):
     whole = backbone(name)
-    seen = part.rounded(whole.unit)
+    seen = part.widened(whole.unit)
     with torch.no_grad():
         before = whole(T, X)
         piece = whole.cropped(seen.rows, seen.columns)

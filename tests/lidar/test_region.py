@@ -39,11 +39,11 @@ def test_cropping_and_placing_are_inverse():
 
 def test_rounding_goes_outward_to_whole_units():
     part = Region((16, 72), 3, 2, 70, 4)  # over the seam
-    outer = part.rounded((4, 8))
+    outer = part.widened((4, 8))
     assert (outer.top, outer.height, outer.left, outer.width) == (0, 8, 64, 16)
     assert set(part.columns.tolist()) <= set(outer.columns.tolist())
-    assert outer.rounded((4, 8)) == outer
-    nearly_all = Region((16, 72), 0, 16, 4, 70).rounded((4, 8))
+    assert outer.widened((4, 8)) == outer
+    nearly_all = Region((16, 72), 0, 16, 4, 70).widened((4, 8))
     assert (nearly_all.left, nearly_all.width, nearly_all.share) == (0, 72, 1)
 
 
@@ -72,7 +72,7 @@ def test_impossible_regions_are_refused(sector, rows, words):
 def test_a_margin_widens_what_is_generated_and_not_what_is_asked_for():
     shape = (8, 64)
     asked = region(shape, (-45, 45), (0, 3), margin=22.5)
-    assert asked.widened() == region(shape, (-67.5, 67.5), (0, 3))
+    assert asked.widened((1, 1)) == region(shape, (-67.5, 67.5), (0, 3))
     assert asked.crop(torch.zeros(shape)).shape == (4, 16)
-    assert region(shape, (135, -135), margin=45).widened() == region(shape, (90, -90))
-    assert region(shape, (-100, 100), margin=90).widened() == region(shape)
+    assert region(shape, (135, -135), margin=45).widened((1, 1)) == region(shape, (90, -90))
+    assert region(shape, (-100, 100), margin=90).widened((1, 1)) == region(shape)
