@@ -279,8 +279,10 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         if drawing.get("sampler"):
             few = drawing.get("few")
             generator.run_by(build_sampler(drawing["sampler"]), few and build_sampler(few), bool(drawing.get("fixed")))
-    if published is not None and converted.finish is not None:
-        converted.finish(generator, config)
+    if published is not None and converted.elevations is not None:
+        rings = torch.rad2deg(converted.elevations.double())
+        sensor = replace(generator.space.sensor, elevations=tuple(rings.tolist()))
+        generator.space = replace(generator.space, sensor=sensor, rays=sensor.rays())
     return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind)
 
 

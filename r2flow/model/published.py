@@ -4,14 +4,13 @@ An R2Flow file is a dict of cfg, weights, optimizer, lr_scheduler and num_images
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from r2flow.generators import Generator
 from r2flow.registry import Registry, lazy
 
 ARCHITECTURES = Registry(
@@ -28,7 +27,7 @@ class Published:
     weights: dict[str, Tensor]  # the generator's weights by r2flow's names
     step: int = 0  # optimiser steps taken
     sampler: Mapping[str, Any] | None = None  # published sampler, name and fields; None: the generator's default
-    finish: Callable[[Generator, Mapping[str, Any]], None] | None = None  # called with loaded generator and config
+    elevations: Tensor | None = None  # of the rows of unfolded scans in radians, (H,); None: the sensor's
 
 
 class Format(NamedTuple):
@@ -48,7 +47,8 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     weights = {BACKBONE + name: value for name, value in content["weights"].items()}
     batch = content["cfg"].get("training", {}).get("batch_size", 1)
     step = int(content.get("num_images", 0)) // max(int(batch), 1)
-    return Published(published_config(content["cfg"]), weights, step, {"name": "euler"}, follow_rings)
+    config = published_config(content["cfg"])
+    return Published(config, weights, step, {"name": "euler"}, rings_of(config, weights))
 
 
 def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -> dict[str, Any]:
@@ -96,12 +96,10 @@ def backbone_of(model: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def follow_rings(generator: Generator, config: Mapping[str, Any]) -> None:
-    """For unfolded scans, take the sensor's elevations from the weights' `coords`, (1, 2, H, W)."""
-    if config["data"]["reading"]["projection"] == "unfolding":
-        rings = torch.rad2deg(generator.state_dict()[BACKBONE + "coords"][0, 0, :, 0].double())
-        sensor = replace(generator.space.sensor, elevations=tuple(rings.tolist()))
-        generator.space = replace(generator.space, sensor=sensor)
+def rings_of(config: Mapping[str, Any], weights: Mapping[str, Tensor]) -> Tensor | None:
+    """The elevations of the rows of unfolded scans, from the weights' `coords`, (1, 2, H, W)."""
+    unfolded = config["data"]["reading"]["projection"] == "unfolding"
+    return weights[BACKBONE + "coords"][0, 0, :, 0] if unfolded else None
 
 
 class Inert:

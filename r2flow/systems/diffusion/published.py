@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.errors import InputError
-from r2flow.model.published import BACKBONE, Format, Published, follow_rings
+from r2flow.model.published import BACKBONE, Format, Published, rings_of
 from r2flow.model.published import published_config as flow_config
 
 RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
@@ -26,7 +26,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
         BACKBONE + name.removeprefix(NETWORK): value for name, value in state.items() if name.startswith(NETWORK)
     }
     sampler = {"name": "ddpm", "steps": 256}
-    return Published(config, weights, int(content.get("global_step", 0)), sampler, follow_rings)
+    return Published(config, weights, int(content.get("global_step", 0)), sampler, rings_of(config, weights))
 
 
 def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:

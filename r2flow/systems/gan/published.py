@@ -1,13 +1,9 @@
 """Published files of the vanilla GAN, DUSty v1 and v2 by the authors of DUSty v2: cfg, step, angle, G, G_ema, D, ..."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from r2flow.generators import Generator
 from r2flow.model.published import Format, Published, sensor_of
 from r2flow.systems.gan.layers import DROPPED
 
@@ -41,12 +37,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     if generator["name"] == "dusty2":
         weights["angle"] = angle
 
-    def look_along_angles(generator: Generator, config: Mapping[str, Any]) -> None:
-        elevations = torch.rad2deg(angle[0, 0].double().mean(1)).tolist()  # the mean of each row
-        sensor = replace(generator.space.sensor, elevations=tuple(elevations))
-        generator.space = replace(generator.space, sensor=sensor, rays=sensor.rays())
-
-    return Published(config, weights, step, finish=look_along_angles)
+    return Published(config, weights, step, elevations=angle[0, 0].double().mean(1))
 
 
 def _generator(model: Mapping[str, Any], out: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
