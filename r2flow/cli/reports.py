@@ -266,10 +266,11 @@ def compare(
     for title, (cells, headings) in tables(groups).items():
         print_table(cells, headings, title)
         print()
-    differ = {key for key in ("images", "stage", "data") if len({run.values[key] for run in compared} - {None}) > 1}
+    compared_keys = ("images", "stage", "loss", "data")
+    differ = {key for key in compared_keys if len({run.values[key] for run in compared} - {None}) > 1}
     if "images" in differ:
         print("the runs have seen different numbers of images: compare their curves at equal steps")
     if differ - {"images"}:
-        print("the runs have different stages or data: compare them by r2flow evaluate, not by their losses")
+        print("the runs have different stages, losses or data: compare them by r2flow evaluate, not by their losses")
     if out is not None:
         print(*write_page(compare_page(groups), out), sep="\n")

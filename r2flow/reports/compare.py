@@ -106,6 +106,7 @@ def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Cur
     stage, data = config["stage"], config["data"]
     return {
         "stage": f"{stage['name']} {stage['steps']}" if "steps" in stage else str(stage["name"]),
+        "loss": str([stage.get(key) for key in ("loss", "time")]),
         "data": data["name"] if data["name"] == "pairs" else f"{data['name']} {data.get('root') or ''}".strip(),
         "backbone": (config["backbone"] or {}).get("name"),
         "steps": step,
@@ -180,10 +181,12 @@ def rows_of(groups: Groups) -> list[dict[str, Any]]:
 
 
 def cell(row: Mapping[str, Any], column: str) -> str:
-    """Format a value: '0.243 ± 0.004' over several runs, '-' if missing."""
+    """Format a value: '0.243 ± 0.004' over several runs, '-' if missing, 'nan' if a run has diverged."""
     value, deviation = row.get(column), row.get(f"{column}_spread")
     if value is None:
         return "-"
+    if value != value:  # noqa: PLR0124
+        return "nan"
     text = f"{value:,}" if isinstance(value, int) else shown(value)
     return text if deviation is None else f"{text} ± {shown(deviation)}"
 

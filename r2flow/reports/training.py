@@ -110,13 +110,17 @@ def finish(
         single = " (single batches: too few to compare)" if tenth == 1 and name.startswith("train/") else ""
         start = f"{values[:tenth].mean():.4f} at the start, " if len(values) > 1 else ""
         print(f"{name}: {start}{values[-tenth:].mean():.4f} at step {steps[-1]}{single}")
+    during = f"; during training: {run / 'pictures'}" if (run / "pictures").is_dir() else ""
+    logged = [str(run / "loss.png")] if curves else []
+    if (run / "tensorboard").is_dir():
+        logged.append(f"tensorboard --logdir {run / 'tensorboard'}")
     print(
         f"""
 checkpoint    {path}
-pictures      {out / "samples.png"} and one page per scan next to it; during training: {run / "pictures"}
+pictures      {out / "samples.png"} and one page per scan next to it{during}
 in 3-D        {out / "samples.html"}, in a browser
 point clouds  {out / "000000.ply"} ...
-loss curve    {f"{run / 'loss.png'}; " if curves else ""}tensorboard --logdir {run / "tensorboard"}
+loss curve    {"; ".join(logged) or "not logged"}
 {what_next(run, out, config=checkpoint.config)}""",
         flush=True,
     )

@@ -134,6 +134,8 @@ def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
     assert rows[0]["n"] == 3
     make_run(tmp_path / "net-seed=3", {"seed": 3}, val=[math.inf], checkpoint=40)
     assert cell(rows_of(group_runs(read_runs([tmp_path])))[0], "val_last") == "inf"
+    make_run(tmp_path / "net-seed=4", {"seed": 4}, val=[math.nan], checkpoint=40)
+    assert cell(rows_of(group_runs(read_runs([tmp_path])))[0], "val_last") == "nan"
 
 
 def test_two_sweeps_of_one_label_are_told_apart_by_what_was_swept(tmp_path):
@@ -256,10 +258,13 @@ def test_losses_have_a_logarithmic_axis_where_it_has_labels(values, scale):
     assert figure.axes[0].get_yscale() == scale
 
 
-@pytest.mark.parametrize(("steps", "roots"), [((40, 40), "xx"), ((40, 20), "xx"), ((40, 40), "xy")])
-def test_the_verb_tells_runs_of_different_lengths_and_data(r2flow, tmp_path, steps, roots):
-    for name, step, root in zip("ab", steps, roots, strict=True):
-        make_run(tmp_path / name, {"data.root": root}, checkpoint=step)
+@pytest.mark.parametrize(
+    ("steps", "roots", "loss"),
+    [((40, 40), "xx", "mse"), ((40, 20), "xx", "mse"), ((40, 40), "xy", "mse"), ((40, 40), "xx", "absolute")],
+)
+def test_the_verb_tells_runs_of_different_lengths_losses_and_data(r2flow, tmp_path, steps, roots, loss):
+    for name, step, root, one in zip("ab", steps, roots, ("mse", loss), strict=True):
+        make_run(tmp_path / name, {"data.root": root, "stage.loss": one}, checkpoint=step)
     said = r2flow.said("compare", tmp_path / "a", tmp_path / "b")
     assert ("different numbers of images" in said) == (steps[0] != steps[1])
-    assert ("different stages or data" in said) == (roots[0] != roots[1])
+    assert ("different stages, losses or data" in said) == (roots[0] != roots[1] or loss != "mse")
