@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -92,13 +91,16 @@ def solve(
     check(max_evaluations >= 1, f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}.")
     check(0 < max_step <= 1, f"max_step is a share of the interval, above 0 and at most 1; found {max_step}.")
     x = wide(x)
+    v = Evaluations(velocity, len(x), progress)
     if t_0 == t_1 or not len(x):
-        return _at_rest(x, global_error, knots)
+        v.converged[:] = finite(x).cpu()
+        error = torch.zeros(len(x), dtype=torch.float64) if global_error else None
+        return replace(v.solution(x, torch.stack([x] * knots, 1) if knots else None), global_error=error)
     times = torch.tensor([t_0, t_1], dtype=torch.float64) if solver.adapts else build_grid(grid, t_0, t_1, steps)
     even = isinstance(solver, FixedStep) and knots > 0 and (len(times) - 1) % (knots + 1) == 0
     check(even or knots == 0, f"{knots} knots need a fixed-step method of r2flow and a multiple of {knots + 1} steps.")
     limits = Limits(tolerance, max_evaluations, max_step=max_step, knots=knots)
-    solution = solver.solve(Evaluations(velocity, len(x), progress), x, times, limits)
+    solution = solver.solve(v, x, times, limits)
     if not (global_error and solver.adapts):
         return solution
     return _with_global_error(solution, solver, velocity, x, times, limits._replace(tighter=TIGHTER), progress)
@@ -133,12 +135,3 @@ def _with_global_error(
         rms = flat((solution.x[index] - second.x).detach().double().square()).mean(1).sqrt().cpu()
         error[scenes], extra[scenes] = torch.where(second.converged, rms, math.inf), second.evaluations
     return replace(solution, evaluations=solution.evaluations + extra, global_error=error)
-
-
-def _at_rest(x: Tensor, global_error: bool, knots: int) -> Solution:
-    """The solution of an empty interval or an empty batch."""
-    return replace(
-        Solution.build(x, np.zeros(len(x)), 0, 0, False, finite(x).cpu().numpy()),
-        knots=torch.stack([x] * knots, 1) if knots else None,
-        global_error=torch.zeros(len(x), dtype=torch.float64) if global_error else None,
-    )

@@ -15,7 +15,7 @@ from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.batched import norms, powered, rows, unpowered, weighted
 from r2flow.flow.solvers.defect import Tried, inspect
 from r2flow.flow.solvers.embedded import EmbeddedMethod
-from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, finite
+from r2flow.flow.solvers.solution import Evaluations, Limits, finite
 from r2flow.flow.solvers.step_size import StepController
 
 log = logging.getLogger(__name__)
@@ -38,48 +38,45 @@ def attainable(limits: Limits, dtype: torch.dtype) -> float:
 
 def advance(
     v: Evaluations, x: Tensor, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits
-) -> tuple[Solution, np.ndarray]:
-    """Solve every scene of x, (B, ...), from t_0 to t_1, each with its own steps; return the times reached too."""
-    control = StepController(len(x), t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
+) -> tuple[Tensor, np.ndarray]:
+    """The last state of every scene of x, (B, ...), from t_0 to t_1 by its own steps, and the time reached, (B,)."""
+    control = StepController(v, t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
     results = x.clone()
     k_1 = v(control.now(x), x)
     tolerance = attainable(limits, v.precision)
     with torch.no_grad():
         scale = x.abs().mul(tolerance).add_(tolerance)
         state, slope = norms(x / scale, k_1 / scale)
-        control.start(state, slope, v.counts)
+        control.start(state, slope)
     while True:
         if control.leaving.any():
             leaving = control.leaving.nonzero()[0]
-            results[torch.from_numpy(control.scenes[leaving]).to(x.device)] = rows(x, leaving)
+            results[torch.from_numpy(v.scenes[leaving]).to(x.device)] = rows(x, leaving)
             remaining = (~control.leaving).nonzero()[0]
             x, k_1 = rows(x, remaining), rows(k_1, remaining)
             control.keep(remaining)
             if not len(remaining):
-                break
-            v.only(control.scenes)
-        x, k_1 = _step(v, control, method, x, k_1, tolerance)
-    return control.solution(results, v.counts), control.times
+                return results, control.times
+        x, k_1 = _step(control, x, k_1, tolerance)
 
 
-def _step(
-    v: Evaluations, control: StepController, method: EmbeddedMethod, x: Tensor, k_1: Tensor, tolerance: float
-) -> tuple[Tensor, Tensor]:
+def _step(control: StepController, x: Tensor, k_1: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
     """Try one step of every scene. Returns new states and velocities, unchanged for rejected steps."""
+    method = control.method
     *stages, h = torch.from_numpy(control.propose()).to(x.device, x.dtype)
     k, y = [k_1], x
     for t, row in zip(stages, method.rows, strict=True):
         previous_y, y = y, torch.addcmul(x, weighted(row, k), expand_time(h, x))
-        k.append(v(t, y))
+        k.append(control.v(t, y))
     with torch.no_grad():
         scale = torch.maximum(x.abs(), y.abs()).mul_(tolerance).add_(tolerance)
         error = weighted(method.error, k).mul_(expand_time(h, x)).div_(scale)
         powers, dk, dy, distance = norms(powered(error), k[-1] - k[-2], y - previous_y, scale)
     size = unpowered(powers)
     good = control.within(size, dk, dy, distance / tolerance)
-    good = inspect(v, control, Tried(method, x, y, k, h, scale), good)
+    good = inspect(control, Tried(method, x, y, k, h, scale), good)
     short = (good & (control.h < SHORT * control.length)).nonzero()[0]
-    control.judge(good, size, dk, dy, v.counts[control.scenes])
+    control.judge(good, size, dk, dy)
     if len(short):
         first, last, end = (rows(part.detach(), short) for part in (k[0], k[-1], y))
         displacement, length = last * expand_time(rows(h, short), last), 1 + end.abs()
@@ -91,15 +88,15 @@ def _step(
     elif good.any():
         chosen = expand_time(torch.from_numpy(good).to(x.device), x)
         x, k_1 = torch.where(chosen, y, x), torch.where(chosen, k[-1], k_1)
-    return _cross(v, control, x, k_1) if control.crossing.any() else (x, k_1)
+    return _cross(control, x, k_1) if control.crossing.any() else (x, k_1)
 
 
-def _cross(v: Evaluations, control: StepController, x: Tensor, k_1: Tensor) -> tuple[Tensor, Tensor]:
+def _cross(control: StepController, x: Tensor, k_1: Tensor) -> tuple[Tensor, Tensor]:
     """Step across jumps of the velocity, by the mean of the velocities on both sides."""
     places = control.crossing.nonzero()[0]
     t, h = torch.from_numpy(control.cross()).to(x.device, x.dtype)
     start, before, h = rows(x, places), rows(k_1, places), expand_time(h, x)
-    after = v.some(places, t, start + h * before)
+    after = control.v.some(places, t, start + h * before)
     end = start + h / 2 * (before + after)
     is_finite = finite(end) & finite(after)
     control.give_up(places[~is_finite.cpu().numpy()])

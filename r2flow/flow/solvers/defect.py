@@ -19,7 +19,6 @@ from torch import Tensor
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.batched import norms, powered, rows, unpowered, weighted
 from r2flow.flow.solvers.embedded import EmbeddedMethod
-from r2flow.flow.solvers.solution import Evaluations
 from r2flow.flow.solvers.step_size import REMEMBERED, SHRINK, StepController
 
 UNSEEN = 0.15  # longest part of the interval between two evaluations
@@ -136,7 +135,7 @@ def probes(method: EmbeddedMethod, share: float) -> list[float]:
 
 
 @torch.no_grad()
-def inspect(v: Evaluations, control: StepController, tried: Tried, good: np.ndarray) -> np.ndarray:
+def inspect(control: StepController, tried: Tried, good: np.ndarray) -> np.ndarray:
     """Which of the accepted steps remain accepted, (B,) bool; tells the controller where the others must end."""
     control.roughness = tried.roughness()
     compared, bisected = control.rougher(*COMPARED), control.rougher(*BISECTED) | control.rougher(*FROM_REST)
@@ -153,7 +152,7 @@ def inspect(v: Evaluations, control: StepController, tried: Tried, good: np.ndar
             break
         theta, step = np.array([planned[place][turn] for place in places]), tried.of(places)
         state, slope = step.at(theta)
-        v_probe = _ask(v, control, places, theta, state)
+        v_probe = _ask(control, places, theta, state)
         (sizes,) = step.changes(v_probe - slope)
         for row, place in enumerate(places):
             if not sizes[row] <= tried.method.defect:
@@ -161,13 +160,11 @@ def inspect(v: Evaluations, control: StepController, tried: Tried, good: np.ndar
                 also = {float(theta[row]): v_probe[row : row + 1]}
                 brackets[int(place)] = _Bracket.first(tried.of(np.array([place])), also)
     if brackets:
-        _locate(v, control, tried, brackets, held)
+        _locate(control, tried, brackets, held)
     return held
 
 
-def _locate(
-    v: Evaluations, control: StepController, tried: Tried, brackets: dict[int, _Bracket], held: np.ndarray
-) -> None:
+def _locate(control: StepController, tried: Tried, brackets: dict[int, _Bracket], held: np.ndarray) -> None:
     """Bisect every bracket until its jump is located or excluded; reject steps with a jump."""
     least = control.shortest() / control.h
     while brackets:
@@ -177,7 +174,7 @@ def _locate(
         trends, before, after = (
             torch.stack([getattr(bracket, name) for bracket in ordered]) for name in ("trend", "before", "after")
         )
-        v_middle = _ask(v, control, places, theta, step.at(theta)[0])
+        v_middle = _ask(control, places, theta, step.at(theta)[0])
         v_middle -= trends * expand_time(torch.from_numpy(theta).to(trends), trends)
         changes = step.changes(v_middle - before, after - v_middle)
         for row, (place, bracket) in enumerate(zip(places, ordered, strict=True)):
@@ -195,11 +192,11 @@ def _locate(
             del brackets[int(place)]
 
 
-def _ask(v: Evaluations, control: StepController, places: np.ndarray, theta: np.ndarray, x: Tensor) -> Tensor:
+def _ask(control: StepController, places: np.ndarray, theta: np.ndarray, x: Tensor) -> Tensor:
     """v of some scenes at shares theta of their steps; NaN for scenes without budget."""
-    values, able = torch.full_like(x, math.nan), control.able(v.counts, places)
+    values, able = torch.full_like(x, math.nan), control.able(places)
     if able.any():
         t = torch.from_numpy(control.time(control.reached[places] + theta * control.h[places])).to(x.device, x.dtype)
         chosen = able.nonzero()[0]
-        values[torch.from_numpy(able).to(x.device)] = v.some(places[able], rows(t, chosen), rows(x, chosen))
+        values[torch.from_numpy(able).to(x.device)] = control.v.some(places[able], rows(t, chosen), rows(x, chosen))
     return values

@@ -43,23 +43,16 @@ class ExponentialMethod:
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Solve every scene of x, (B, ...), from t_0 to t_1; stiff scenes one after another."""
         t_0, t_1 = float(times[0]), float(times[-1])
-        if self.start is None:
-            reached = np.full(len(x), t_0)
-            first = Solution.build(x, v.counts, 0, 0, False, False)
-        else:
-            first, reached = advance(v, x, t_0, t_1, self.start, limits._replace(until_stiff=True))
-        ends, converged = first.x.clone(), first.converged.numpy().copy()
-        accepted, rejected = first.accepted.numpy().copy(), first.rejected.numpy().copy()
-        stiff = first.stiff.numpy() | (self.start is None)
-        for place in (stiff & ~converged).nonzero()[0]:
+        ends, reached, left = x.clone(), np.full(len(x), t_0), np.ones(len(x), dtype=bool)
+        if self.start is not None:
+            ends, reached = advance(v, x, t_0, t_1, self.start, limits._replace(until_stiff=True))
+            left = v.stiff & ~v.converged
+        for place in left.nonzero()[0]:
             v.only(np.array([place]))
-            scene = _Scene(v, first.x[place], float(reached[place]), t_0, t_1, limits)
-            converged[place] = scene.solve()
+            scene = _Scene(v, ends[place], float(reached[place]), t_0, t_1, limits)
+            v.converged[place] = scene.solve()
             ends[place] = scene.u.view(x.shape[1:])
-            accepted[place] += scene.accepted
-            rejected[place] += scene.rejected
-        v.only(np.arange(len(x)))
-        return Solution.build(ends, v.counts, accepted, rejected, first.stiff.numpy(), converged)
+        return v.solution(ends)
 
 
 exprb43 = ExponentialMethod()
@@ -74,7 +67,6 @@ class _Scene:
         self.u, self.t = x.flatten(), t
         self.direction = math.copysign(1.0, t_1 - t_0)
         self.length, self.t_0, self.t_end = abs(t_1 - t_0), t_0, t_1
-        self.accepted = self.rejected = 0
         kind = x.device.type
         lower = torch.get_autocast_dtype(kind)
         self._of_network, self._of_steps = (
@@ -112,9 +104,9 @@ class _Scene:
                 factor = min(max(SAFETY * max(error, 1e-10) ** -0.25, SHRINK), GROW) if error < math.inf else SHRINK
                 if error <= 1:
                     break
-                self.rejected += 1
+                self.v.rejected[self.v.scenes] += 1
                 h *= min(factor, 0.8)
-            self.accepted += 1
+            self.v.accepted[self.v.scenes] += 1
             self.t = self.t_end if h == left else self.t + self.direction * h
             self.u, f, h = end, following, h * factor
         return self.t == self.t_end

@@ -56,32 +56,27 @@ class TorchDiffEqMethod:
         tolerance = attainable(limits, v.coarsest(x)) if self.adapts else limits.tolerance
         options = {} if self.adapts else {"grid_constructor": lambda field, start, span: grid}
         scenes = [_Scene(v, start, limits, self.adapts) for start in x.split(1)]
-        converged = finite(x).cpu().numpy()
-        for i in converged.nonzero()[0]:
+        v.converged[:] = finite(x).cpu()
+        for i in v.converged.nonzero()[0]:
             v.only(np.array([i]))
             try:
                 end = torchdiffeq.odeint(
                     scenes[i], scenes[i].last, grid[[0, -1]],
                     rtol=tolerance, atol=tolerance, method=self.name, options=options,
                 )[-1]  # fmt: skip
-                converged[i] = bool(end.isfinite().all())
-                scenes[i].last = end if converged[i] else scenes[i].last
+                v.converged[i] = bool(end.isfinite().all())
+                scenes[i].last = end if v.converged[i] else scenes[i].last
             except (Spent, AssertionError) as error:  # it asserts on underflowing steps, non-finite values
-                converged[i] = False
+                v.converged[i] = False
                 log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, self.name, i, error)
-        v.only(np.arange(len(x)))
-        ends = torch.cat([scene.last for scene in scenes])
-        return Solution.build(
-            ends, v.counts, [scene.steps - scene.rejected for scene in scenes], [scene.rejected for scene in scenes],
-            False, converged,
-        )  # fmt: skip
+        return v.solution(torch.cat([scene.last for scene in scenes]))
 
 
 class _Scene:
     """One scene's velocity, and the steps that torchdiffeq reports."""
 
     def __init__(self, v: Evaluations, x: Tensor, limits: Limits, adapts: bool) -> None:
-        self._v, self._limits, self.last, self.steps, self.rejected = v, limits, x, 0, 0
+        self._v, self._limits, self.last = v, limits, x
         if adapts:  # torchdiffeq warns about callbacks that a method does not call
             self.callback_reject_step = self._reject
 
@@ -90,8 +85,9 @@ class _Scene:
 
     def callback_step(self, t: Tensor, x: Tensor, h: Tensor) -> None:
         """Called before each step."""
-        self.steps += 1
+        self._v.accepted[self._v.scenes] += 1
         self.last = x if torch.isfinite(x).all() else self.last
 
     def _reject(self, t: Tensor, x: Tensor, h: Tensor) -> None:
-        self.rejected += 1
+        self._v.accepted[self._v.scenes] -= 1
+        self._v.rejected[self._v.scenes] += 1

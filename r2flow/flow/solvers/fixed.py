@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -54,8 +54,8 @@ class FixedStep:
             if knots and n and n % interval == 0:
                 inner_states.append(x)
             x, alive = stepped(x, step(inside, t.to(x), (following - t).to(x), x), alive)
-        solution = Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
-        return replace(solution, knots=torch.stack(inner_states, 1)) if knots else solution
+        v.accepted[:], v.converged[:] = len(times) - 1, alive.cpu()
+        return v.solution(x, torch.stack(inner_states, 1) if knots else None)
 
 
 def euler(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Arguments and results of all solvers."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,7 +14,6 @@ from r2flow.flow.path import expand_time
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 V = TypeVar("V", bound=Callable[..., Any])
-PerScene = np.ndarray | Sequence[int] | Sequence[bool] | int | bool
 
 
 @dataclass(frozen=True)
@@ -43,22 +42,6 @@ class Solution:
     global_error: Tensor | None = None
     knots: Tensor | None = None
 
-    @classmethod
-    def build(
-        cls,
-        x: Tensor,
-        evaluations: np.ndarray,
-        accepted: PerScene,
-        rejected: PerScene,
-        stiff: PerScene,
-        converged: PerScene,
-    ) -> "Solution":
-        """A solution from values per scene, or single values for all scenes."""
-        B = len(x)
-        counts = [torch.from_numpy(np.broadcast_to(n, B).astype(np.int64)) for n in (evaluations, accepted, rejected)]
-        flags = [torch.from_numpy(np.broadcast_to(flag, B).astype(bool)) for flag in (stiff, converged)]
-        return cls(x, *counts, *flags)
-
 
 class Limits(NamedTuple):
     """Options of a solver.
@@ -85,14 +68,14 @@ class Spent(Exception):
 
 
 class Evaluations:
-    """The velocity as called by solvers: counts evaluations per scene and returns v in the state's type.
+    """The velocity as called by solvers, in the state's type, and the record of each scene's solution.
 
     A velocity that differs between scenes has a method `select(scenes)`, which returns the velocity of these scenes,
     int64 indices into its batch. The precision is the coarsest type among those of v, of the surrounding autocast, of a
     module's parameters and of the velocity's attribute `precision`, if any.
 
     Attributes:
-        counts: Evaluations per scene of the batch, (B,).
+        counts, accepted, rejected, stiff, converged: Those of `Solution`, (B,); methods set all but the counts.
         scenes: Scenes of the current state, indices into the batch.
         precision: Precision of the last evaluation.
     """
@@ -100,7 +83,8 @@ class Evaluations:
     def __init__(self, velocity: Velocity, scenes: int, progress: Callable[[], None] | None = None) -> None:
         self._whole = self._velocity = velocity
         self._progress = progress
-        self.counts = np.zeros(scenes, dtype=np.int64)
+        self.counts, self.accepted, self.rejected = np.zeros((3, scenes), dtype=np.int64)
+        self.stiff, self.converged = np.zeros((2, scenes), dtype=bool)
         self.scenes = np.arange(scenes)
         self._own_types = _own_types(velocity)
         self.precision = torch.float64
@@ -142,6 +126,12 @@ class Evaluations:
         """Set the scenes of the current state, indices into the original batch."""
         self.scenes = scenes
         self._velocity = selected(self._whole, torch.from_numpy(scenes))
+
+    def solution(self, x: Tensor, knots: Tensor | None = None) -> Solution:
+        """The solution with these final states."""
+        counts = self.counts, self.accepted, self.rejected, self.stiff, self.converged
+        evaluations, accepted, rejected, stiff, converged = (torch.from_numpy(count) for count in counts)
+        return Solution(x, evaluations, accepted, rejected, stiff, converged, knots=knots)
 
 
 def selected(velocity: V, scenes: Tensor) -> V:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from r2flow.flow.solvers.embedded import EmbeddedMethod
-from r2flow.flow.solvers.solution import Limits, Solution
+from r2flow.flow.solvers.solution import Evaluations, Limits
 
 SHRINK = 0.2  # smallest factor between one step size and the next
 MEMORY = 0.04  # beta of the PI controller, the weight of the previous error: steadier steps at a stability limit
@@ -22,25 +22,27 @@ FAR, DECADES = 0.02, 3  # share of its size that x moves in a step; number of po
 class StepController:
     """Time, step size and step counts of every scene of a batch.
 
-    The arrays have one entry per scene still in the batch, except those that `solution` returns for all. Progress is
-    measured as a length from t_0, which makes forward and backward in time equal.
+    The arrays have one entry per scene still in the batch, `v.scenes`, except `times`, the times reached by all.
+    Progress is measured as a length from t_0, which makes forward and backward in time equal.
     """
 
-    def __init__(self, n: int, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits, eps: float) -> None:
+    def __init__(
+        self, v: Evaluations, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits, eps: float
+    ) -> None:
+        n, self.v = len(v.scenes), v
         self.method, self.limits, self.nodes = method, limits, np.array(method.nodes)[:, None]
         self.t_0, self.direction = t_0, math.copysign(1.0, t_1 - t_0)
         self.length, self.t_end = abs(t_1 - t_0), t_1
         self.low, self.high = sorted((t_0, t_1))
         self.longest = limits.max_step * self.length
         self.eps = eps
-        self.scenes = np.arange(n)
         self.reached, self.h, self.grow = np.zeros(n), np.full(n, self.length), np.full(n, method.grow)
         self.last_error = np.full(n, 1e-4)  # dopri5.f
-        self.stiff_run, self.smooth_run = np.zeros(n, int), np.zeros(n, int)
-        self.oscillating_run, self.calm_run = np.zeros(n, int), np.zeros(n, int)
+        # Steps at each of the two bounds of stability, and other steps in a row since.
+        self.bounds = np.array([[method.stability], [OSCILLATING]])
+        self.touched, self.calm = np.zeros((2, n), int), np.zeros((2, n), int)
         self.arrived, self.leaving = np.zeros(n, bool), np.zeros(n, bool)
-        self.accepted, self.rejected = np.zeros(n, int), np.zeros(n, int)
-        self.stiff, self.converged, self.times = np.zeros(n, bool), np.zeros(n, bool), np.full(n, t_0)
+        self.times = np.full(n, t_0)
         # A jump of the velocity: its bracket, as lengths from t_0, and the step size after it.
         self.begin, self.end, self.resume = np.full(n, np.inf), np.full(n, np.inf), np.zeros(n)
         self.crossing = np.zeros(n, bool)
@@ -53,7 +55,7 @@ class StepController:
         """t at a length from t_0, clipped to the interval."""
         t = self.t_0 + self.direction * np.minimum(reached, self.length)
         t = np.where(reached >= self.length, self.t_end, t)
-        return np.minimum(np.maximum(t, self.low), self.high)
+        return np.clip(t, self.low, self.high)
 
     def shortest(self) -> np.ndarray:
         """Smallest step sizes, (B,): below them the stages' times are equal in the state's type."""
@@ -63,7 +65,7 @@ class StepController:
         """Current t per scene, (B,), with the device and type of x."""
         return torch.from_numpy(self.time(self.reached)).to(x.device, x.dtype)
 
-    def start(self, state: np.ndarray, slope: np.ndarray, evaluations: np.ndarray) -> None:
+    def start(self, state: np.ndarray, slope: np.ndarray) -> None:
         """Set the first step size from the norms of x and v in tolerances; scenes with a non-finite v leave.
 
         Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, II.4, without the evaluation for the second
@@ -72,7 +74,7 @@ class StepController:
         with np.errstate(divide="ignore", invalid="ignore"):
             h = np.fmin((0.01 / slope) ** (1 / self.method.order), np.where(state < 1e-5, np.inf, state / slope))
         self.h = np.maximum(np.fmin(h, self.longest), self.shortest()).astype(np.float32).astype(np.float64)
-        self.leaving = ~np.isfinite(slope) | self._spent(evaluations)
+        self.leaving = ~np.isfinite(slope) | self._spent()
 
     def propose(self) -> np.ndarray:
         """Times of the stages and signed steps, (stages + 1, B).
@@ -100,11 +102,11 @@ class StepController:
         """Whether the third difference exceeds `least`, and `by` times its extrapolation from the last step, (B,)."""
         with np.errstate(invalid="ignore", over="ignore"):
             exceeds: np.ndarray = (self.roughness > least) & ~(self.roughness <= by * self.rough * self.h**4)
-        return exceeds & ~self.stiff[self.scenes]
+        return exceeds & ~self.v.stiff[self.v.scenes]
 
-    def able(self, evaluations: np.ndarray, places: np.ndarray) -> np.ndarray:
+    def able(self, places: np.ndarray) -> np.ndarray:
         """Which of these scenes have budget for one more evaluation, (N,) bool."""
-        return np.asarray(evaluations[self.scenes[places]] < self.limits.max_evaluations)
+        return np.asarray(self.v.counts[self.v.scenes[places]] < self.limits.max_evaluations)
 
     def shorten(self, place: int, share: float) -> None:
         """Reject a scene's step; retry with about this share of its length."""
@@ -116,17 +118,15 @@ class StepController:
         self.begin[place], self.end[place] = (self.reached[place] + share * h for share in (left, right))
         self.resume[place] = h
 
-    def judge(
-        self, good: np.ndarray, error: np.ndarray, dk: np.ndarray, dy: np.ndarray, evaluations: np.ndarray
-    ) -> None:
+    def judge(self, good: np.ndarray, error: np.ndarray, dk: np.ndarray, dy: np.ndarray) -> None:
         """Accept the good steps, reject the others, and set every scene's next step size.
 
         `error` is the norm of the local error in tolerances; `dk` and `dy` are the norms of the differences of v and x
         between the last two stages.
         """
         finite = np.isfinite(error) & np.isfinite(dk) & np.isfinite(dy)
-        self.accepted[self.scenes] += good
-        self.rejected[self.scenes] += ~good
+        self.v.accepted[self.v.scenes] += good
+        self.v.rejected[self.v.scenes] += ~good
         self._look_for_stiffness(good, dk, dy)
         tried = self.h
         self.reached = np.where(good, self.following, self.reached)
@@ -136,11 +136,11 @@ class StepController:
         self.factor = np.full_like(self.factor, np.inf)
         self.grow = np.where(good, self.method.grow, 1.0)
         self.last_error = np.where(good, np.maximum(error, 1e-4), self.last_error)
-        spent = self._spent(evaluations)
+        spent = self._spent()
         self.crossing = (self.begin - self.reached <= self.shortest()) & ~spent
         self.arrived = good & (self.reached >= self.length) & ~self.crossing
         stuck = (self.h < self.shortest()) & ~good & (self.begin == np.inf)
-        handed_over = self.stiff[self.scenes] & self.limits.until_stiff & ~self.crossing
+        handed_over = self.v.stiff[self.v.scenes] & self.limits.until_stiff & ~self.crossing
         self.leaving = self.arrived | stuck | spent | handed_over
 
     def note_pole(self, places: np.ndarray, h: np.ndarray, share: np.ndarray, back: np.ndarray) -> None:
@@ -169,8 +169,8 @@ class StepController:
         """Remove these scenes from the batch without convergence."""
         self.arrived[places], self.leaving[places] = False, True
 
-    def _spent(self, evaluations: np.ndarray) -> np.ndarray:
-        return evaluations + self.method.stages > self.limits.max_evaluations
+    def _spent(self) -> np.ndarray:
+        return self.v.counts[self.v.scenes] + self.method.stages > self.limits.max_evaluations
 
     def _factors(self, good: np.ndarray, finite: np.ndarray, error: np.ndarray) -> np.ndarray:
         """h_new / h = S err^-(1/q - 3/4 beta) err_before^beta, the PI controller of dopri5.f; 1/5 if not finite."""
@@ -187,28 +187,20 @@ class StepController:
         """Detect steps limited by stability: h |dk| / |dy|, an estimate of |h lambda|, stays at the boundary of the
         stability region (Hairer, Wanner, Solving Ordinary Differential Equations II, IV.2)."""
         with np.errstate(invalid="ignore", over="ignore"):
-            touching = good & (self.h * dk > self.method.stability * dy)
-            oscillating = good & (self.h * dk > OSCILLATING * dy)
-        self.stiff_run += touching
-        self.smooth_run = np.where(touching, 0, self.smooth_run + (good & ~touching))
-        self.stiff_run = np.where(self.smooth_run >= SMOOTH_AFTER, 0, self.stiff_run)
-        if self.limits.until_stiff:
-            self.calm_run = np.where(oscillating, 0, self.calm_run + (good & ~oscillating))
-            self.oscillating_run = np.where(self.calm_run >= SMOOTH_AFTER, 0, self.oscillating_run + oscillating)
-            self.stiff[self.scenes] |= self.oscillating_run >= OSCILLATING_AFTER
-        self.stiff[self.scenes] |= self.stiff_run >= STIFF_AFTER
+            touching = good & (self.h * dk > self.bounds * dy)
+        self.calm = np.where(touching, 0, self.calm + (good & ~touching))
+        self.touched = np.where(self.calm >= SMOOTH_AFTER, 0, self.touched + touching)
+        touched, oscillated = self.touched
+        oscillates = self.limits.until_stiff & (oscillated >= OSCILLATING_AFTER)
+        self.v.stiff[self.v.scenes] |= (touched >= STIFF_AFTER) | oscillates
 
     def keep(self, rest: np.ndarray) -> None:
         """Keep these scenes in the batch; record convergence and time of all."""
-        self.converged[self.scenes] |= self.arrived
-        self.times[self.scenes] = self.time(self.reached)
+        self.v.converged[self.v.scenes] |= self.arrived
+        self.times[self.v.scenes] = self.time(self.reached)
+        self.v.only(self.v.scenes[rest])
         for name in (
-            "scenes", "reached", "h", "grow", "last_error", "stiff_run", "smooth_run", "oscillating_run",
-            "calm_run", "arrived", "leaving", "begin", "end", "resume", "crossing", "rough", "troubled",
-            "factor", "decades",
+            "reached", "h", "grow", "last_error", "touched", "calm", "arrived", "leaving", "begin", "end",
+            "resume", "crossing", "rough", "troubled", "factor", "decades",
         ):  # fmt: skip
-            setattr(self, name, getattr(self, name)[rest])
-
-    def solution(self, x: Tensor, evaluations: np.ndarray) -> Solution:
-        """Solution of all scenes, given their final states."""
-        return Solution.build(x, evaluations, self.accepted, self.rejected, self.stiff, self.converged)
+            setattr(self, name, getattr(self, name)[..., rest])
