@@ -1,4 +1,4 @@
-"""Flows: generators by the ODE dx/dt = v(t, x), from noise at t = 0 to data at t = 1."""
+"""Flows, generators by the ODE dx/dt = v(t, x) from noise at t = 0 to data at t = 1, and flow maps."""
 
 from collections.abc import Mapping
 from copy import copy
@@ -9,12 +9,13 @@ from torch import Tensor
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
-from r2flow.flow.solvers import Solution, Velocity
+from r2flow.flow.maps import MeanVelocity
+from r2flow.flow.solvers import Solution, Velocity, solve
 from r2flow.generators.base import Condition, Generator
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.samplers import MMPS, FixedSteps, ODESampler, Sampler
+from r2flow.samplers import MMPS, FixedSteps, Jump, ODESampler, Sampler
 
 USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # default of a new flow
 
@@ -48,12 +49,15 @@ class Flow(Generator):
         t_1: float = 1.0,
         *,
         sampler: Sampler | None = None,
+        condition: Condition | None = None,
         **options: Any,
     ) -> Solution:
         """Solve the ODE from x at t_0, (B, ...), to t_1; for the options see `r2flow.flow.solvers.solve`."""
         how = sampler or self.sampler
         how.check(self)
-        return how.solve(self, x.to(self.device), t_0, t_1, **options)
+        if not isinstance(how, ODESampler):
+            raise InputError(f"sampler {how.name} does not follow the flow's paths: give a solver, such as adams3.")
+        return solve(self.field(condition), x.to(self.device), t_0, t_1, **(how.options() | options))
 
 
 class NetworkFlow(Flow):
@@ -156,6 +160,29 @@ class Conditioned:
 
     def select(self, scenes: Tensor) -> "Conditioned":
         return Conditioned(self.flow, {name: value[scenes.to(value.device)] for name, value in self.condition.items()})
+
+
+class FlowMap(RectifiedFlow):
+    """X_{t->s}(x) = x + (s - t) u(x, t, s) with u by a backbone of two times.
+
+    Samplers: those of `r2flow.samplers.maps`, and a flow's samplers with v(t, x) = u(x, t, t).
+    """
+
+    second_time: ClassVar[bool] = True
+    goes_on_as = "rectified_flow"  # a velocity loss would leave the jumps to those of the old flow
+
+    def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
+        super().__init__(space, backbone)
+        self.run_by(Jump())
+
+    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
+        """u(x, t, s), (B, C, H, W), the mean velocity from time t to time s, of shape () or (B,)."""
+        assert condition is None
+        return self.backbone(t, x, s)
+
+    def map(self, condition: Condition | None = None) -> MeanVelocity:
+        """u(t, x, s) under a condition."""
+        return self.mean_velocity if condition is None else Conditioned(self, condition)
 
 
 def ode_sampler(flow: Flow) -> Sampler:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError, check
 from r2flow.flow.solvers.grids import build_grid
-from r2flow.flow.solvers.solution import Solution, finite, wide
+from r2flow.flow.solvers.solution import finite, wide
 from r2flow.registry import Bound, check_options, options_of
 
 Condition = Mapping[str, Tensor]
@@ -104,10 +104,6 @@ class Sampler(ABC):
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}; a {kind} has none.")
         if getattr(generator, "fixed", False) and self != generator.sampler:
             raise InputError(f"this model is distilled for {generator.sampler} alone: leave sampler and steps out.")
-
-    def solve(self, *args: Any, **options: Any) -> Solution:
-        """Solve the ODE to t_1; only an `ODESampler` can."""
-        raise InputError(f"sampler {self.name} does not follow the flow's paths: give a solver, such as adams3.")
 
     def knot_times(self, knots: int) -> Tensor:
         """Times of x_0, of the inner states that a solution keeps, and of x_1, (knots + 2,) float64."""

@@ -7,33 +7,20 @@ from typing import Any
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, method_of, named_grid, solve
+from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, named_grid
 from r2flow.registry import Count, Portion, Positive
-from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Progress, Sampler
+from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Sampler
 
 
 class ODESampler(Sampler):
-    """A sampler that solves the flow's ODE, forward or backward in time."""
+    """A sampler that solves the flow's ODE (`Flow.solve`), forward or backward in time."""
 
     @abstractmethod
     def options(self) -> dict[str, Any]:
         """Options of `r2flow.flow.solvers.solve`."""
 
-    def solve(
-        self,
-        generator: Any,
-        x: Tensor,
-        t_0: float = 0.0,
-        t_1: float = 1.0,
-        condition: Given = None,
-        progress: Progress = None,
-        **options: Any,
-    ) -> Solution:
-        """Solve from x at t_0, (B, ...), to t_1; for the options see `r2flow.flow.solvers.solve`."""
-        return solve(generator.field(condition), x, t_0, t_1, progress=progress, **(self.options() | options))
-
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        end = self.solve(generator, noise, condition=condition, progress=progress)
+        end = generator.solve(noise, sampler=self, condition=condition, progress=progress)
         return Generated(end.x, end.evaluations, end.converged)
 
 
@@ -63,8 +50,9 @@ class FixedSteps(OnGrid, ODESampler):
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if not self.finish or self.steps == 1:
             return super().__call__(generator, noise, condition, draws, progress)
-        near = self.solve(generator, noise, 0.0, 1 - self.finish, condition, progress, steps=self.steps - 1)
-        last = solve(generator.field(condition), near.x, 1 - self.finish, steps=1, progress=progress)
+        how = {"sampler": self, "condition": condition, "progress": progress}
+        near = generator.solve(noise, 0.0, 1 - self.finish, steps=self.steps - 1, **how)
+        last = generator.solve(near.x, 1 - self.finish, method="euler", steps=1, grid="uniform", **how)
         return Generated(last.x, near.evaluations + last.evaluations, near.converged & last.converged)
 
     def knot_times(self, knots: int) -> Tensor:
