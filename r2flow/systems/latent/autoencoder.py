@@ -21,29 +21,30 @@ from r2flow.systems.latent.quantiser import Quantised, Quantiser
 
 GROUPS = 32
 Size = tuple[int, int]
-Margins = tuple[int, int, int, int]  # left, right, top, bottom
 
-# Stride (rows, columns) -> kernel and margins of downsampling, decoder blocks and upsampling.
-DOWN: dict[Size, tuple[Size, Margins]] = {(1, 2): ((3, 3), (0, 1, 1, 1)), (2, 2): ((3, 3), (0, 1, 0, 1))}
-BLOCK: dict[Size, tuple[Size, Margins]] = {(1, 2): ((1, 4), (1, 2, 0, 0)), (2, 2): ((3, 3), (1, 1, 1, 1))}
-UP: dict[Size, tuple[Size, Margins]] = {(1, 2): ((1, 5), (2, 2, 0, 0)), (2, 2): ((3, 3), (1, 1, 1, 1))}
-SQUARE = BLOCK[2, 2]
-FLAT = BLOCK[1, 2]
+SQUARE: Size = (3, 3)
+FLAT: Size = (1, 4)
+BLOCK = {(1, 2): FLAT, (2, 2): SQUARE}  # stride (rows, columns) -> kernel of decoder blocks
+UP = {(1, 2): (1, 5), (2, 2): SQUARE}  # of upsampling
 
 
 class CircularConv2d(nn.Conv2d):
-    """A convolution with given margins: circular left and right, zeros at the top and bottom."""
+    """A convolution with given margins: circular left and right, zeros at the top and bottom.
+
+    By default, the margins (left, right, top, bottom) keep the size at stride 1.
+    """
 
     def __init__(
         self,
         channels: int,
         out_channels: int,
-        kernel: Size = SQUARE[0],
-        margins: Margins = SQUARE[1],
+        kernel: Size = SQUARE,
         stride: Size | int = 1,
+        margins: tuple[int, int, int, int] | None = None,
     ) -> None:
         super().__init__(channels, out_channels, kernel, stride)
-        self.margins = margins
+        rows, columns = kernel
+        self.margins = margins or ((columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2)
 
     def forward(self, x: Tensor) -> Tensor:
         left, right, top, bottom = self.margins
@@ -54,12 +55,12 @@ class CircularConv2d(nn.Conv2d):
 class ResidualBlock(nn.Module):
     """shortcut(x) + conv silu norm conv silu norm (x)."""
 
-    def __init__(self, channels: int, out_channels: int, shape: tuple[Size, Margins] = SQUARE) -> None:
+    def __init__(self, channels: int, out_channels: int, kernel: Size = SQUARE) -> None:
         super().__init__()
         self.norm1 = GroupNorm(channels, GROUPS)
-        self.conv1 = CircularConv2d(channels, out_channels, *shape)
+        self.conv1 = CircularConv2d(channels, out_channels, kernel)
         self.norm2 = GroupNorm(out_channels, GROUPS)
-        self.conv2 = CircularConv2d(out_channels, out_channels, *shape)
+        self.conv2 = CircularConv2d(out_channels, out_channels, kernel)
         self.nin_shortcut = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -94,21 +95,22 @@ class Level(nn.Module):
     def __init__(
         self,
         widths: Sequence[int],
-        shape: tuple[Size, Margins],
+        kernel: Size,
         attends: bool,
         down: Size | None = None,
         up: Size | None = None,
     ) -> None:
         super().__init__()
-        self.block = nn.ModuleList(ResidualBlock(*pair, shape) for pair in pairwise(widths))
+        self.block = nn.ModuleList(ResidualBlock(*pair, kernel) for pair in pairwise(widths))
         self.attn = nn.ModuleList(Attention(width) if attends else nn.Identity() for width in widths[1:])
         last = widths[-1]
         self.downsample = self.upsample = nn.Sequential()
         if down is not None:
-            self.downsample = nn.Sequential(OrderedDict(conv=CircularConv2d(last, last, *DOWN[down], stride=down)))
+            convolution = CircularConv2d(last, last, stride=down, margins=(0, 1, 2 - down[0], 1))
+            self.downsample = nn.Sequential(OrderedDict(conv=convolution))
         if up is not None:
             enlarge = nn.Upsample(scale_factor=up, mode="bilinear", align_corners=True)
-            self.upsample = nn.Sequential(OrderedDict(enlarge=enlarge, conv=CircularConv2d(last, last, *UP[up])))
+            self.upsample = nn.Sequential(OrderedDict(enlarge=enlarge, conv=CircularConv2d(last, last, UP[up])))
 
     def forward(self, x: Tensor) -> Tensor:
         for block, attention in zip(self.block, self.attn, strict=True):
@@ -116,73 +118,19 @@ class Level(nn.Module):
         return self.upsample(self.downsample(x))
 
 
-class Encoder(nn.Module):
-    """Images (B, channels, H, W) to (B, out_channels, H / rows, W / columns), with the product of all strides."""
-
-    def __init__(
-        self,
-        channels: int,
-        out_channels: int,
-        widths: Sequence[int],
-        strides: Sequence[Size],
-        blocks: int,
-        attends: Sequence[int],
-    ) -> None:
-        super().__init__()
-        self.conv_in = CircularConv2d(channels, widths[0])
-        in_widths = [widths[0], *widths]
-        self.down = nn.ModuleList(
-            Level([in_widths[i], *[width] * blocks], SQUARE, i in attends, down=stride)
-            for i, (width, stride) in enumerate(zip(widths, [*strides, None], strict=True))
-        )
-        self.mid = _middle(widths[-1])
-        self.norm_out = GroupNorm(widths[-1], GROUPS)
-        self.conv_out = CircularConv2d(widths[-1], out_channels)
+class FromCoarse(nn.Sequential):
+    """Levels in order of decreasing resolution, applied from the last to the first."""
 
     def forward(self, x: Tensor) -> Tensor:
-        x = self.conv_in(x)
-        for level in self.down:
+        for level in reversed(self):
             x = level(x)
-        return self.conv_out(F.silu(self.norm_out(self.mid(x))))
-
-
-class Decoder(nn.Module):
-    """Latents to images, with one more block per level than the encoder; kernels follow the level's stride."""
-
-    def __init__(
-        self,
-        channels: int,
-        out_channels: int,
-        widths: Sequence[int],
-        strides: Sequence[Size],
-        blocks: int,
-        attends: Sequence[int],
-    ) -> None:
-        super().__init__()
-        self.conv_in = CircularConv2d(channels, widths[-1])
-        self.mid = _middle(widths[-1])
-        in_widths = [*widths[1:], widths[-1]]
-        self.up = nn.ModuleList(
-            Level(
-                [in_widths[i], *[width] * (blocks + 1)],
-                FLAT if stride is None else BLOCK[stride],
-                i in attends,
-                up=stride,
-            )
-            for i, (width, stride) in enumerate(zip(widths, [None, *strides], strict=True))
-        )
-        self.norm_out = GroupNorm(widths[0], GROUPS)
-        self.conv_out = CircularConv2d(widths[0], out_channels, *FLAT)
-
-    def forward(self, z: Tensor) -> Tensor:
-        x = self.mid(self.conv_in(z))
-        for level in reversed(self.up):
-            x = level(x)
-        return self.conv_out(F.silu(self.norm_out(x)))
+        return x
 
 
 class Autoencoder(nn.Module):
     """Images (B, C, H, W) to latents (B, code_channels, h, w), quantisation, and back.
+
+    The decoder's kernels follow the stride of their level.
 
     Args:
         channels: Image channels C.
@@ -215,7 +163,7 @@ class Autoencoder(nn.Module):
     ) -> None:
         super().__init__()
         given = [tuple(stride) for stride in strides]
-        self.strides = [(int(rows), int(columns)) for rows, columns in (s for s in given if s in DOWN)]
+        self.strides = [(int(rows), int(columns)) for rows, columns in (s for s in given if s in UP)]
         levels = max(len(multipliers), 1)
         if self.strides != given or len(given) != levels - 1:
             raise InputError(
@@ -224,9 +172,28 @@ class Autoencoder(nn.Module):
             )
         widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
         self.mask, self.code_channels = mask, code_channels
-        shared = widths, self.strides, blocks, attention
-        self.encoder = Encoder(channels, latent_channels, *shared)
-        self.decoder = Decoder(latent_channels, channels + mask, *shared)
+        finest, coarsest = widths[0], widths[-1]
+        down = (
+            Level([before, *[width] * blocks], SQUARE, i in attention, down=stride)
+            for i, (before, width, stride) in enumerate(
+                zip([finest, *widths[:-1]], widths, [*self.strides, None], strict=True)
+            )
+        )
+        up = (
+            Level([before, *[width] * (blocks + 1)], BLOCK[stride or (1, 2)], i in attention, up=stride)
+            for i, (before, width, stride) in enumerate(
+                zip([*widths[1:], coarsest], widths, [None, *self.strides], strict=True)
+            )
+        )
+        self.encoder = nn.Sequential(OrderedDict(
+            conv_in=CircularConv2d(channels, finest), down=nn.Sequential(*down), mid=_middle(coarsest),
+            norm_out=GroupNorm(coarsest, GROUPS), silu=nn.SiLU(), conv_out=CircularConv2d(coarsest, latent_channels),
+        ))  # fmt: skip
+        self.decoder = nn.Sequential(OrderedDict(
+            conv_in=CircularConv2d(latent_channels, coarsest), mid=_middle(coarsest), up=FromCoarse(*up),
+            norm_out=GroupNorm(finest, GROUPS), silu=nn.SiLU(),
+            conv_out=CircularConv2d(finest, channels + mask, FLAT),
+        ))  # fmt: skip
         self.quantize = Quantiser(codes, code_channels, beta, legacy)
         self.quant_conv = nn.Conv2d(latent_channels, code_channels, 1)
         self.post_quant_conv = nn.Conv2d(code_channels, latent_channels, 1)

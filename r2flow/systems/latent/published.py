@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 UNET, AUTOENCODER, AVERAGE = "model.diffusion_model.", "first_stage_model.", "model_ema."
 FIRST, CODES = "encoder.conv_in.weight", "quantize.embedding.weight"
-STRIDES = {kernel: list(stride) for stride, (kernel, _) in UP.items()}
+STRIDES = {kernel: list(stride) for stride, kernel in UP.items()}
 SIZE, RANGES, VIEW, HEAD = (64, 1024), (1.0, 56.0), (3, -25), 32
 
 

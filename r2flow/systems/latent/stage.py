@@ -97,7 +97,7 @@ class LearnAutoencoder(Stage):
         loss = reconstruction + self.codebook_weight * quantised.loss
         if factor:
             adversarial = -self.discriminator(made).mean()
-            last = self.autoencoder.decoder.conv_out.weight
+            last = self.autoencoder.decoder.get_parameter("conv_out.weight")
             weight = adaptive_weight(reconstruction, adversarial, last, self.adversarial_weight)
             loss = loss + factor * weight * adversarial
         self.take_step(for_autoencoder, loss)
