@@ -10,8 +10,7 @@ from r2flow.registry import Registry, lazy
 from r2flow.samplers import build_sampler
 from r2flow.stages.base import Stage
 from r2flow.stages.flow_map import LearnFlowMap
-from r2flow.stages.rectify import Rectify
-from r2flow.stages.reflow import Distill, Reflow
+from r2flow.stages.rectify import Distill, Rectify, Reflow
 from r2flow.stages.transfer import Transfer
 
 STAGES: Registry[type[Stage]] = Registry(

@@ -14,7 +14,7 @@ from r2flow.generators import FlowMap, Generator
 from r2flow.registry import Positive, construct
 from r2flow.samplers import Jump, build_sampler
 from r2flow.stages.base import Batch
-from r2flow.stages.reflow import Reflow
+from r2flow.stages.rectify import Reflow
 
 
 class LearnFlowMap(Reflow):

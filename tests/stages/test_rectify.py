@@ -13,8 +13,7 @@ from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler
 from r2flow.stages import STAGES, build_stage
 from r2flow.stages.base import learning_rate_factor
-from r2flow.stages.rectify import Rectify
-from r2flow.stages.reflow import Distill, Reflow
+from r2flow.stages.rectify import Distill, Rectify, Reflow
 from tests.fields import Field
 
 
