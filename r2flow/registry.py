@@ -5,7 +5,7 @@ import difflib
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from pkgutil import resolve_name
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
@@ -137,8 +137,8 @@ def _problems(known: Mapping[str, inspect.Parameter], options: Mapping[str, Any]
     for key, value in options.items():
         if key not in known:
             yield f" has no option {key!r}; it knows: {', '.join(known) or 'none'}.{did_you_mean(key, known)}"
-        elif (wanted := _wanted(known[key].annotation)) and not any(fits(value) for _, fits in wanted):
-            yield f": {key} must be {' or '.join(word for word, _ in wanted)}, found {value!r}."
+        elif (wanted := _wanted(known[key].annotation)) and not wanted[1](value):
+            yield f": {key} must be {wanted[0]}, found {value!r}."
     yield from (
         f" needs the option {key!r}." for key, p in known.items() if p.default is p.empty and key not in options
     )
@@ -175,56 +175,42 @@ def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
     return parameters
 
 
-Check = tuple[str, Callable[[Any], bool]]
+Check = tuple[str, Callable[[Any], bool]]  # what a value must be, and whether it is
 
-LIST: Check = ("a list", lambda v: isinstance(v, list | tuple))
 PLAIN: dict[Any, Check] = {
     bool: ("true or false", lambda v: isinstance(v, bool)),
     int: ("a whole number", lambda v: isinstance(v, int) and not isinstance(v, bool)),
     float: ("a finite number", lambda v: isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= LARGEST),
     str: ("a word", lambda v: isinstance(v, str)),
     NoneType: ("null", lambda v: v is None),
-    list: LIST,
-    tuple: LIST,
-    Sequence: LIST,
     Mapping: ("a group of keys", lambda v: isinstance(v, Mapping)),
 }
 
 
-def _wanted(annotation: Any) -> list[Check]:
-    """Alternative checks of an annotation; empty if it cannot be checked."""
-    origin = get_origin(annotation)
+def _wanted(annotation: Any) -> Check | None:
+    """The check of an annotation; None if it cannot be checked."""
+    origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        checks = _wanted(get_args(annotation)[0])
-        for bound in annotation.__metadata__:
-            checks = [_bounded(check, bound) for check in checks] if isinstance(bound, Bound) else checks
-        return checks
+        bounds = [bound for bound in annotation.__metadata__ if isinstance(bound, Bound)]
+        return reduce(_bounded, bounds, _wanted(inner[0]))
     if origin is Literal:
-        values = get_args(annotation)
-        return [(" or ".join(map(repr, values)), lambda v: any(type(v) is type(x) and v == x for x in values))]
+        return " or ".join(map(repr, inner)), lambda v: any(type(v) is type(x) and v == x for x in inner)
     if origin in (Union, UnionType):
-        alternatives = [_wanted(alternative) for alternative in get_args(annotation)]
-        return [check for checks in alternatives for check in checks] if all(alternatives) else []
-    check = PLAIN.get(origin or annotation)
-    if check is LIST and get_args(annotation):
-        return [_list_of(*get_args(annotation), counted=origin is tuple)]
-    return [check] if check else []
+        checks = [check for check in map(_wanted, inner) if check]
+        words = " or ".join(words for words, _ in checks)
+        return (words, lambda v: any(fits(v) for _, fits in checks)) if len(checks) == len(inner) else None
+    if (origin or annotation) in (list, tuple, Sequence):
+        size = len(inner) if origin is tuple and Ellipsis not in inner else None
+        each = _wanted(inner[0]) if inner else None
+        words = f"a list{f' of {size}' if size else ''}{f', each {each[0]}' if each else ''}"
+
+        def fits(value: Any) -> bool:
+            right_size = isinstance(value, list | tuple) and size in (None, len(value))
+            return right_size and (each is None or all(map(each[1], value)))
+
+        return words, fits
+    return PLAIN.get(origin or annotation)
 
 
-def _bounded(check: Check, bound: Bound) -> Check:
-    return f"{check[0]} {bound.words}", lambda v: check[1](v) and bound.holds(v)
-
-
-def _list_of(element: Any, *others: Any, counted: bool) -> Check:
-    """Check of a list with one type of element; a tuple without `...` also has a fixed length."""
-    checks = _wanted(element)
-    size = 1 + len(others) if counted and Ellipsis not in others else None
-    words = "a list" if size is None else f"a list of {size}"
-    if checks:
-        words += f", each {' or '.join(word for word, _ in checks)}"
-
-    def fits(value: Any) -> bool:
-        right_size = LIST[1](value) and size in (None, len(value))
-        return right_size and all(not checks or any(fit(item) for _, fit in checks) for item in value)
-
-    return words, fits
+def _bounded(check: Check | None, bound: Bound) -> Check | None:
+    return check and (f"{check[0]} {bound.words}", lambda v: check[1](v) and bound.holds(v))
