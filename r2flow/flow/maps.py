@@ -7,15 +7,13 @@ An objective returns a point x_t and the regression target of u there, without f
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from r2flow.errors import InputError, check
+from r2flow.errors import check
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.solvers.solution import selected
@@ -83,7 +81,6 @@ class Paths:
         return total
 
 
-@dataclass(frozen=True)
 class JumpTimes:
     """Distribution of the jumps (t, s) in training: steps of time grids, velocities (s = t), jumps to s = 1, others.
 
@@ -94,36 +91,33 @@ class JumpTimes:
         diagonal: Share of the rest with s = t.
         ends: Share of the rest with s = 1 and t from the density `time`.
         time: Time density (`r2flow.flow.times.TIMES`) for s = t and s = 1; None: `u_shaped`, as in reflow.
+
+    Attributes:
+        velocities: The time density: maps uniform draws to times, (B,) each.
+        times: The time grid of each number of steps, (len(steps), max(steps) + 1) float64, padded with NaN.
     """
 
-    steps: Sequence[int] = (1, 1, 1, 2, 4, 8)
-    grid: str = "uniform"
-    share: Portion = 0.55
-    diagonal: Portion = 0.55
-    ends: Portion = 0.0
-    time: Mapping[str, Any] | None = None
-
-    def __post_init__(self) -> None:
-        if not self.steps or min(self.steps) < 1:
-            raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
-        _ = self.velocities, self.times  # refuse an unknown density or grid early
-        check(self.diagonal + self.ends <= 1, f"diagonal + ends must be at most 1; found {self.diagonal}, {self.ends}.")
-
-    @cached_property
-    def velocities(self) -> Callable[[Tensor], Tensor]:
-        """The time density: maps uniform draws to times, (B,) each."""
-        return TIMES.build(self.time or {"name": "u_shaped"})
-
-    @cached_property
-    def times(self) -> Tensor:
-        """The time grid of each number of steps, (len(steps), max(steps) + 1) float64, padded with NaN."""
-        rows = [build_grid(self.grid, 0.0, 1.0, count) for count in self.steps]
-        return pad_sequence(rows, batch_first=True, padding_value=math.nan)
+    def __init__(
+        self,
+        steps: Sequence[int] = (1, 1, 1, 2, 4, 8),
+        grid: str = "uniform",
+        share: Portion = 0.55,
+        diagonal: Portion = 0.55,
+        ends: Portion = 0.0,
+        time: Mapping[str, Any] | None = None,
+    ) -> None:
+        check(steps and min(steps) >= 1, f"the steps of a flow map's jumps must be of at least 1, found {steps}.")
+        check(diagonal + ends <= 1, f"diagonal + ends must be at most 1; found {diagonal}, {ends}.")
+        self.grid, self.share, self.diagonal, self.ends = grid, share, diagonal, ends
+        self.velocities = TIMES.build(time or {"name": "u_shaped"})
+        self.steps = torch.tensor(tuple(steps))
+        grids = [build_grid(grid, 0.0, 1.0, count) for count in steps]
+        self.times = pad_sequence(grids, batch_first=True, padding_value=math.nan)
 
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Draw t and s, (B,) each, from uniform numbers in [0, 1), (B, 3)."""
         which, a, b = u.unbind(1)
-        times, counts = self.times.to(u), torch.tensor(tuple(self.steps), device=u.device)
+        times, counts = self.times.to(u), self.steps.to(u.device)
         row = (a * len(counts)).long()
         step = (b * counts[row]).long()
         low, high = torch.minimum(a, b), torch.maximum(a, b)

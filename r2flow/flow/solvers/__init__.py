@@ -10,7 +10,7 @@ from torch import Tensor
 from r2flow.errors import check
 from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
-from r2flow.flow.solvers.exponential import ExponentialMethod, automatic, exprb43
+from r2flow.flow.solvers.exponential import ExponentialMethod
 from r2flow.flow.solvers.external import TORCHDIFFEQ, TorchDiffEqMethod
 from r2flow.flow.solvers.fixed import Adams3, FixedStep, euler, heun2, midpoint, rk4
 from r2flow.flow.solvers.grids import build_grid, named_grid
@@ -32,8 +32,8 @@ SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
     rk4=FixedStep(rk4, order=4, evaluations=4),
     adams3=FixedStep(Adams3, order=3, evaluations=1, multistep=True),
     dopri5=dopri5,
-    exprb43=exprb43,
-    auto=automatic,
+    exprb43=ExponentialMethod(),
+    auto=ExponentialMethod(start=dopri5),
 )
 # For the error estimate, the tolerance is divided by this. At 10, sometimes at 30, the second solution's error is as
 # large as the first's if the velocity jumps in time; at 100, more scenes exceed their budget of evaluations.

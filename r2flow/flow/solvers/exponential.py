@@ -19,7 +19,7 @@ from torch import Tensor
 from r2flow.errors import check
 from r2flow.flow.solvers.adaptive import advance, attainable
 from r2flow.flow.solvers.batched import norms, powered, unpowered
-from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
+from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Spent
 
 LARGEST = 40  # dimension of a Krylov space; if that is not enough, the step is halved
@@ -53,10 +53,6 @@ class ExponentialMethod:
             v.converged[place] = scene.solve()
             ends[place] = scene.u.view(x.shape[1:])
         return v.solution(ends)
-
-
-exprb43 = ExponentialMethod()
-automatic = ExponentialMethod(start=dopri5)
 
 
 class _Scene:
