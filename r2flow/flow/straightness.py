@@ -66,11 +66,6 @@ class Straightness(NamedTuple):
     pixels: Tensor
     trajectories: Tensor
 
-    @property
-    def s_normalised(self) -> Tensor:
-        """s(t) / |d|^2, (B, n); NaN for d = 0."""
-        return self.s / self.curvature.squared_length[:, None]
-
 
 @torch.no_grad()
 def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progress = None) -> Curvature:
