@@ -185,7 +185,7 @@ def cell(row: Mapping[str, Any], column: str) -> str:
     value, deviation = row.get(column), row.get(f"{column}_spread")
     if value is None:
         return "-"
-    if value != value:  # noqa: PLR0124
+    if value != value:
         return "nan"
     text = f"{value:,}" if isinstance(value, int) else shown(value)
     return text if deviation is None else f"{text} ± {shown(deviation)}"
