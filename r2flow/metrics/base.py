@@ -1,7 +1,7 @@
 """Base class of metrics between two sets of scans, and the protocol of their results."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Self
 
@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
-from torchmetrics.utilities.distributed import gather_all_tensors
 
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor
@@ -100,7 +99,7 @@ class ScanMetric(Metric):
         for side in SIDES:
             self.add_state(f"{side}_scans", torch.tensor(0), dist_reduce_fx="sum")
             self.add_state(f"{side}_left_out", torch.tensor(0), dist_reduce_fx="sum")
-            if self.keeps:  # (N, 1 + D): scan number, then its row
+            if self.keeps:  # N times a scan number and its row; flat, since a process without rows has no width
                 self.add_state(f"{side}_rows", [], dist_reduce_fx="cat")
         # Distinguishes metrics in a MetricCollection, which updates only one of those with equal states.
         self.add_state(f"name_{self.name}", torch.tensor(0), dist_reduce_fx="sum")
@@ -163,7 +162,7 @@ class ScanMetric(Metric):
         self.accumulate(rows[whole], side)
         if self.keeps and whole.any():
             numbered = torch.cat([first + whole.nonzero(), rows[whole]], 1)
-            getattr(self, f"{side}_rows").append(numbered.float().to(self.device))
+            getattr(self, f"{side}_rows").append(numbered.flatten().float().to(self.device))
 
     def forward(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> dict[str, float]:
         """Update; return no values, since a batch alone has no distance."""
@@ -198,10 +197,10 @@ class ScanMetric(Metric):
         return self._numbered(side)[:, 1:]
 
     def _numbered(self, side: Side) -> Tensor:
-        rows = getattr(self, f"{side}_rows")
-        if not len(rows):
+        count = self.count(side)
+        if not count:
             return torch.zeros(0, 1)
-        table = dim_zero_cat(rows).cpu()
+        table = dim_zero_cat(getattr(self, f"{side}_rows")).cpu().view(count, -1)
         return table[table[:, 0].argsort(stable=True)]
 
     def real_state(self) -> dict[str, Tensor]:
@@ -219,18 +218,9 @@ class ScanMetric(Metric):
             return
         for name, value in state.items():
             if name == "real_rows":
-                self.real_rows = [value.to(self.device)] if len(value) else []
+                self.real_rows = [value.flatten().to(self.device)]
             else:
                 getattr(self, name).copy_(value)
-
-    def _sync_dist(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:
-        for side in SIDES if self.keeps else ():  # give processes without rows the others' width
-            rows = getattr(self, f"{side}_rows")
-            width = torch.tensor(rows[0].shape[1] if rows else 0, device=self.device)
-            most = max(map(int, dist_sync_fn(width, group=process_group or self.process_group)))
-            if not rows:
-                rows.append(torch.zeros(0, most, device=self.device))
-        super()._sync_dist(dist_sync_fn, process_group)
 
     def set_dtype(self, dst_type: str | torch.dtype) -> Self:
         """Do nothing: states stay float64, since lower precision would lose digits."""

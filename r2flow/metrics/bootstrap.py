@@ -42,7 +42,7 @@ def bootstrap(
     assert draws >= 4, f"an interval needs 4 draws, found {draws}"
     with metric.sync_context():
         values = {name: value for name, value in metric.figures()[0].items() if not np.isnan(value)}
-        sizes = {side: len(metric.kept(side)) for side in SIDES}
+        sizes = {side: metric.count(side) for side in SIDES}
         if not values or min(sizes.values()) < max(metric.fewest, 2):
             return {}
         drawn: dict[str, list[Tensor]] = {}
