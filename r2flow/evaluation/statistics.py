@@ -17,7 +17,7 @@ from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)
 
-FORMAT = 4  # increment if statistics change for the same scans and protocol
+FORMAT = 5  # increment if statistics change for the same scans and protocol
 
 
 @dataclass(frozen=True)

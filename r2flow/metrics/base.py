@@ -150,15 +150,13 @@ class ScanMetric(Metric):
         if self.needs_reflectance and not scans.has_reflectance:
             raise InputError(f"'{self.name}' needs reflectance, which these scans do not have; leave it out.")
         if len(scans):
-            self.take_in(scans, side, first)
-
-    def take_in(self, scans: Scans, side: Side, first: int) -> None:
-        self.add_rows(self.rows(scans), side, first)
+            self.add_rows(self.rows(scans), side, first)
 
     def add_rows(self, rows: Tensor, side: Side, first: int = 0) -> None:
         """Add the rows of scans `first`, `first + 1`, ... to the statistics of a side."""
         whole = rows.isfinite().all(1)
-        self.add_scans(side, len(rows), int((~whole).sum()))
+        getattr(self, f"{side}_scans").add_(len(rows))
+        getattr(self, f"{side}_left_out").add_(int((~whole).sum()))
         self.accumulate(rows[whole], side)
         if self.keeps and whole.any():
             numbered = torch.cat([first + whole.nonzero(), rows[whole]], 1)
@@ -178,11 +176,6 @@ class ScanMetric(Metric):
     def remarks(self) -> list[str]:
         """Remarks on the last computed values: empty scans, fewer scans than features."""
         return list(self._remarks)
-
-    def add_scans(self, side: Side, scans: int, left_out: int) -> None:
-        """Add to the counts of scans and of left-out scans of a side."""
-        getattr(self, f"{side}_scans").add_(scans)
-        getattr(self, f"{side}_left_out").add_(left_out)
 
     def given(self, side: Side) -> int:
         """Number of scans of a side."""

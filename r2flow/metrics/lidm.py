@@ -12,10 +12,13 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.nn.functional import pad
+from torch.nn.utils.rnn import pad_sequence
 
 from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.metrics.scans import Scans
+from r2flow.metrics.sums import SumMetric
 
 NEAR, FAR, EXTENT = 1.0, 56.0, 50  # metres
 FINE, COARSE = 0.05, 0.5  # cell size in metres: JSD, MMD
@@ -31,10 +34,10 @@ def occupied(points: Tensor, cell: float) -> Tensor:
     return torch.unique(x * side + y)
 
 
-class JSDLiDM(ScanMetric):
+class JSDLiDM(SumMetric):
     """Jensen-Shannon distance (root, natural logarithm) between counts of scans that occupy each 5 cm cell.
 
-    The 4 million cells of single scans are not stored: there are no intervals.
+    A row lists the occupied cells; the 4 million cells of single scans are not stored: there are no intervals.
     """
 
     name = "jsd_lidm"
@@ -43,25 +46,22 @@ class JSDLiDM(ScanMetric):
     settings: ClassVar[Mapping[str, Any]] = {
         "cell": FINE, "metres": [-EXTENT, EXTENT], "logarithm": "natural", "root": True
     }  # fmt: skip
+    width = round(2 * EXTENT / FINE) ** 2
     resamples = False
 
-    def __init__(self, keep: bool = False, **options: Any) -> None:
-        super().__init__(keep, **options)
-        cells = round(2 * EXTENT / FINE) ** 2
-        for side in SIDES:
-            self.add_state(f"{side}_cells", torch.zeros(cells, dtype=torch.int32), dist_reduce_fx="sum")
+    def rows(self, scans: Scans) -> Tensor:
+        """Indices of occupied cells, (B, K) float64, filled up with `width`."""
+        cells = [occupied(points, FINE).double() for points in scans.points]
+        rows = pad_sequence([pad(indices, (0, 1), value=self.width) for indices in cells], True, self.width)
+        return torch.where(rows[:, :1] < self.width, rows, torch.nan)
 
-    def take_in(self, scans: Scans, side: Side, first: int) -> None:
-        cells: Tensor = getattr(self, f"{side}_cells")
-        indices = [occupied(points, FINE) for points in scans.points]
-        for index in indices:
-            cells[index.to(cells.device)] += 1
-        self.add_scans(side, len(indices), sum(not len(index) for index in indices))
+    def accumulate(self, rows: Tensor, side: Side) -> None:
+        total: Tensor = getattr(self, f"{side}_sum")
+        cells = rows[rows < self.width].long().to(total.device)
+        total.index_add_(0, cells, total.new_ones(len(cells)))
 
-    def figures(self) -> tuple[dict[str, float], list[str]]:
-        real, generated = (getattr(self, f"{side}_cells").cpu().numpy() for side in SIDES)
-        complete = all(self.given(side) for side in SIDES)
-        return {"jsd_lidm": js_distance(real, generated) if complete else float("nan")}, []
+    def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
+        return {self.name: js_distance(real, generated)}
 
 
 class MMDLiDM(ScanMetric):

@@ -83,6 +83,7 @@ def given(metric: ScanMetric, real: ArrayLike, generated: ArrayLike) -> dict[str
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Larger cells on the ground, for tests to which their size is nothing: millions of them take time."""
     monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)
+    monkeypatch.setattr("r2flow.metrics.lidm.JSDLiDM.width", 200**2)
     monkeypatch.setattr("r2flow.metrics.lidm.COARSE", 5)
 
 
