@@ -1,3 +1,5 @@
+from itertools import product
+
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -7,17 +9,17 @@ from r2flow.metrics.extractors.sparse import Sparse, SparseConv3d, VoxelGrid, of
 from r2flow.metrics.extractors.spvcnn import SPVCNN
 
 
-def occupied(size: int, share: float, scans: int = 2) -> tuple[torch.Tensor, ...]:
-    """Voxels of `scans` random cubes in a random order, (N, 4), and whether each place is one, (B, 1, size^3)."""
-    mask = torch.rand(scans, size, size, size) < share
+def occupied(size: int, share: float) -> tuple[torch.Tensor, ...]:
+    """Voxels of a random cube in a random order, (N, 3), and whether each place is one, (1, 1, size^3)."""
+    mask = torch.rand(size, size, size) < share
     coords = mask.nonzero()
-    return coords[torch.randperm(len(coords))], mask[:, None].double()
+    return coords[torch.randperm(len(coords))], mask[None, None].double()
 
 
 def to_dense(features: torch.Tensor, coords: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
-    dense = features.new_zeros(shape[0], features.shape[1], *shape[2:])
-    b, x, y, z = coords.T
-    dense[b, :, x, y, z] = features
+    dense = features.new_zeros(1, features.shape[1], *shape[2:])
+    x, y, z = coords.T
+    dense[0, :, x, y, z] = features.T
     return dense
 
 
@@ -28,8 +30,8 @@ def dense_kernel(kernel: torch.Tensor, size: int) -> torch.Tensor:
 
 
 def at(dense: torch.Tensor, coords: torch.Tensor) -> torch.Tensor:
-    b, x, y, z = coords.T
-    return dense[b, :, x, y, z]
+    x, y, z = coords.T
+    return dense[0, :, x, y, z].T
 
 
 def test_the_order_of_the_weights_is_torchsparse_s():
@@ -39,7 +41,7 @@ def test_the_order_of_the_weights_is_torchsparse_s():
     assert offsets(2) == [(0, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1)]
     assert offsets(1) == [(0, 0, 0)]
     # A voxel at the origin, one behind it in x and one above it: weight k is k, so that a sum says which were used.
-    coords = torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    coords = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
     x = Sparse(torch.tensor([[1.0], [10.0], [100.0]]), VoxelGrid(coords))
     odd, down = SparseConv3d(1, 1, 3), SparseConv3d(1, 1, 2)
     odd.kernel.data = torch.arange(27.0).view(27, 1, 1)
@@ -53,13 +55,13 @@ def test_the_order_of_the_weights_is_torchsparse_s():
     assert down(x).features.flatten().tolist() == [0 * 1 + 4 * 10 + 1 * 100]
 
 
-def test_coordinates_may_be_negative_and_scans_do_not_touch():
-    coords = torch.tensor([[0, -3, 5, 0], [1, -2, 5, 0], [1, -3, 5, 1]])
-    grid = VoxelGrid(coords)
-    assert grid.find(coords).tolist() == [0, 1, 2]
-    assert grid.find(coords + torch.tensor([0, 1, 0, 0])).tolist() == [-1, -1, -1]  # (0, -2, 5, 0) is the other scan's
-    assert grid.find(torch.tensor([1, -3, 5, 10**6])) == -1
-    assert sorted(grid.coarser().coords.tolist()) == [[0, -2, 2, 0], [1, -2, 2, 0], [1, -1, 2, 0]]
+def test_cells_beside_the_bounding_box_are_no_voxels():
+    coords = torch.tensor([[3, 5, 1], [0, 5, 0], [0, 0, 0], [2, 4, 1]])
+    grid, where = VoxelGrid(coords), coords.tolist()
+    for offset in product((-1, 0, 1), repeat=3):
+        cells = coords + torch.tensor(offset)
+        assert grid.find(cells).tolist() == [where.index(cell) if cell in where else -1 for cell in cells.tolist()]
+    assert sorted(grid.coarser().coords.tolist()) == [[0, 0, 0], [0, 2, 0], [1, 2, 0]]
 
 
 class Dense:
@@ -108,7 +110,7 @@ class Dense:
         """Point by point: the eight voxels from its own on, by the share of the way to each, as far as they exist."""
         scale, mask = 2**level, self.masks[level]
         rows = []
-        for b, *place in self.coords.tolist():
+        for place in self.coords.tolist():
             total, weights = torch.zeros(x.shape[1], dtype=x.dtype), 0.0
             for ahead in offsets(2):
                 corner = [p // scale + a for p, a in zip(place, ahead, strict=True)]
@@ -116,8 +118,8 @@ class Dense:
                 for p, a in zip(place, ahead, strict=True):
                     share = (p % scale) / scale
                     weight *= share if a else 1 - share
-                if max(corner) < mask.shape[2] and mask[b, 0, corner[0], corner[1], corner[2]]:
-                    total += weight * x[b, :, corner[0], corner[1], corner[2]]
+                if max(corner) < mask.shape[2] and mask[0, 0, corner[0], corner[1], corner[2]]:
+                    total += weight * x[0, :, corner[0], corner[1], corner[2]]
                     weights += weight
             rows.append(total / weights)
         return torch.stack(rows)
@@ -149,7 +151,7 @@ def test_minkowskinet_is_its_dense_self():
 
 
 def test_spvcnn_is_its_dense_self():
-    coords, mask = occupied(32, 0.003, scans=1)
+    coords, mask = occupied(32, 0.003)
     x = torch.randn(len(coords), 4, dtype=torch.float64)
     network = randomised(SPVCNN((3, 3, 4, 5, 6, 6, 5, 4, 3)))
     dense = Dense(network, coords, mask)

@@ -85,7 +85,7 @@ class MinkowskiNet(Extractor):
         return self.get_submodule(f"up{level}.1")(x.with_features(torch.cat([x.features, skip.features], 1)))
 
     def forward(self, coords: Tensor, features: Tensor) -> Tensor:
-        """Last map, (N, 48); `coords` (N, 4) int64 as in `VoxelGrid`, `features` (N, 4): x, y, z in metres and -1."""
+        """Last map, (N, 48); `coords` (N, 3) int64 as in `VoxelGrid`, `features` (N, 4): x, y, z in metres and -1."""
         maps = self.down(self.stem(Sparse(features, VoxelGrid(coords))))
         y = maps[4]
         for level in range(1, 5):
@@ -101,7 +101,7 @@ class MinkowskiNet(Extractor):
         if not len(points):
             return torch.full((self.dim,), torch.nan, device=self.device)
         coords, features = voxelise(points)
-        return mean_by_distance(self(nn.functional.pad(coords, (1, 0)), features), coords)
+        return mean_by_distance(self(coords, features), coords)
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:

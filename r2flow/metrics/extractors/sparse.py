@@ -15,7 +15,7 @@ from typing import Self, cast
 import torch
 from torch import Tensor, nn
 
-# Indices of input and output voxels per offset; the same tensor twice for the kernel's centre.
+# Indices of input and output voxels per offset.
 KernelMap = list[tuple[Tensor, Tensor]]
 
 
@@ -32,16 +32,14 @@ def offsets(size: int) -> list[tuple[int, int, int]]:
 
 
 class VoxelGrid:
-    """Voxels of one size, at distinct scan, x, y, z, (N, 4) int64, and their neighbours within a kernel.
+    """Voxels of one size, at distinct x, y, z of at least 0, (N, 3) int64, and their neighbours within a kernel.
 
     `finer` is the grid of half the voxel size that `coarser` was called on; None for the finest.
     """
 
     def __init__(self, coords: Tensor, finer: Self | None = None) -> None:
-        self.coords = coords
-        self.finer = finer
-        self.low, self.high = coords.amin(0), coords.amax(0)
-        self.sizes = (self.high - self.low + 1).tolist()
+        self.coords, self.finer = coords, finer
+        self.sizes = (coords.amax(0) + 3).tolist()  # a margin of one cell on each side
         assert math.prod(self.sizes) < 2**63, self.sizes
         self.keys, self.order = self._keys(coords).sort()
         assert (self.keys.diff() > 0).all(), "voxels are distinct"
@@ -50,46 +48,41 @@ class VoxelGrid:
         return len(self.coords)
 
     def _keys(self, coords: Tensor) -> Tensor:
-        """Indices of cells in the bounding box, with the last axis fastest."""
-        scan, x, y, z = (coords - self.low).unbind(-1)
-        return ((scan * self.sizes[1] + x) * self.sizes[2] + y) * self.sizes[3] + z
+        """Indices of cells in the bounding box and its margin, with the last axis fastest."""
+        x, y, z = (coords + 1).unbind(-1)
+        return (x * self.sizes[1] + y) * self.sizes[2] + z
 
     def find(self, coords: Tensor) -> Tensor:
-        """Indices of the voxels at coordinates (..., 4); -1: no voxel."""
+        """Indices of the voxels at coordinates (N, 3), at most one cell outside the bounding box; -1: no voxel."""
         key = self._keys(coords)
         position = torch.searchsorted(self.keys, key).clamp_(max=len(self) - 1)
-        inside = ((coords >= self.low) & (coords <= self.high)).all(-1)
-        return torch.where(inside & (self.keys[position] == key), self.order[position], -1)
+        return torch.where(self.keys[position] == key, self.order[position], -1)
 
     def coarser(self) -> "VoxelGrid":
         """The grid of twice the voxel size that covers this grid."""
-        coords = self.coords.clone()
-        coords[:, 1:] = coords[:, 1:].div(2, rounding_mode="floor")
-        return VoxelGrid(coords.unique(dim=0), finer=self)
+        return VoxelGrid((self.coords // 2).unique(dim=0), finer=self)
 
     @cached_property
     def around(self) -> KernelMap:
         """Kernel map of a kernel of 3^3 with stride 1."""
-        return self._map(self, 3, 1)
+        return kernel_map(self, self, 3)
 
     @cached_property
     def inside(self) -> KernelMap:
         """Kernel map from the finer grid: a kernel of 2^3 with stride 2."""
         assert self.finer is not None
-        return self._map(self.finer, 2, 2)
+        return kernel_map(self.finer, self, 2)
 
-    def _map(self, inputs: "VoxelGrid", size: int, stride: int) -> KernelMap:
-        scaled = self.coords * torch.tensor([1, stride, stride, stride], device=self.coords.device)
-        entries = []
-        for offset in offsets(size):
-            if inputs is self and not any(offset):
-                indices = torch.arange(len(self), device=scaled.device)
-                entries.append((indices, indices))
-                continue
-            neighbours = inputs.find(scaled + torch.tensor([0, *offset], device=scaled.device))
-            outputs = (neighbours >= 0).nonzero()[:, 0]
-            entries.append((neighbours[outputs], outputs))
-        return entries
+
+def kernel_map(inputs: VoxelGrid, outputs: VoxelGrid, size: int) -> KernelMap:
+    """Neighbours of output voxels among input voxels, which are equal, or half as large for stride 2."""
+    corner = outputs.coords * (1 if inputs is outputs else 2)
+    entries = []
+    for offset in offsets(size):
+        neighbours = inputs.find(corner + torch.tensor(offset, device=corner.device))
+        present = (neighbours >= 0).nonzero()[:, 0]
+        entries.append((neighbours[present], present))
+    return entries
 
 
 @dataclass(frozen=True)
@@ -135,9 +128,6 @@ def convolve(features: Tensor, kernel: Tensor, where: KernelMap, num: int) -> Te
     """Convolve features (N, C_in) with weights (K, C_in, C_out) onto `num` voxels, (num, C_out)."""
     out = features.new_zeros(num, kernel.shape[2])
     for weight, (inputs, outputs) in zip(kernel, where, strict=True):
-        if inputs is outputs:  # the kernel's centre needs no gather or scatter
-            out.addmm_(features, weight)
-            continue
         # An output occurs at most once per offset, so that copies add correctly and, unlike index_add_ on a GPU,
         # deterministically.
         part = torch.addmm(out.index_select(0, outputs), features.index_select(0, inputs), weight)

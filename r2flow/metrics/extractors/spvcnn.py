@@ -44,18 +44,16 @@ class SPVCNN(MinkowskiNet):
 
 
 class Corners:
-    """Points at `coords` (scan, x, y, z; (N, 4) int64) in a grid of voxels that are `scale` times as large."""
+    """Points at `coords` (x, y, z; (N, 3) int64) in a grid of voxels that are `scale` times as large."""
 
     def __init__(self, coords: Tensor, grid: VoxelGrid, scale: int) -> None:
         self.num = len(grid)
-        around = coords.clone()
-        around[:, 1:] = coords[:, 1:].div(scale, rounding_mode="floor")
-        share = (coords[:, 1:] - around[:, 1:] * scale).float() / scale  # relative position within the voxel
+        around, share = coords // scale, (coords % scale).float() / scale  # voxel, relative position within it
         self.voxels = grid.find(around)
         self.corners = []
         total = torch.zeros(len(coords), device=coords.device)
         for offset in offsets(2):
-            voxel = grid.find(around + torch.tensor([0, *offset], device=coords.device))
+            voxel = grid.find(around + torch.tensor(offset, device=coords.device))
             ahead = torch.tensor(offset, dtype=torch.bool, device=coords.device)
             weight = torch.where(ahead, share, 1 - share).prod(1) * (voxel >= 0)
             total += weight
