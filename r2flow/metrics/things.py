@@ -1,7 +1,6 @@
 """Objects in scans: straight walls, right angles, poles and cars, detected by metric shape."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -61,7 +60,7 @@ class Things(SumMetric):
         rows = np.full((len(scans), self.width), np.nan)
         for row, xyz, returned in zip(rows, scans.xyz.cpu().numpy(), scans.returned[:, 0].cpu().numpy(), strict=True):
             if returned.any():
-                row[:] = counts(Returns.of(xyz, returned, scans.sensor))
+                row[:] = counts(Returns(xyz, returned, scans.sensor))
         return torch.from_numpy(rows)
 
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
@@ -73,25 +72,19 @@ class Things(SumMetric):
         return figures
 
 
-@dataclass(frozen=True)
 class Returns:
-    """N returns of a scan, ring by ring; `above` is NaN on the ground, `bins` are the widths of the bins."""
+    """N returns of a scan, ring by ring, from points (3, H, W) and a mask of returns, (H, W).
 
-    sensor: Sensor
-    p: np.ndarray
-    row: np.ndarray
-    column: np.ndarray
-    above: np.ndarray
-    far: np.ndarray
-    bins: np.ndarray
+    `p` are the points, (N, 3), `far` horizontal distances and `bins` widths of bins; `above` is NaN on the ground.
+    """
 
-    @classmethod
-    def of(cls, xyz: np.ndarray, returned: np.ndarray, sensor: Sensor) -> "Returns":
-        """Build from points (3, H, W) and a mask of returns, (H, W)."""
-        row, column = np.nonzero(returned)
-        p = xyz[:, row, column].T.astype(np.float64)
-        above, far = heights(xyz, returned, sensor.height)[row, column], np.hypot(p[:, 0], p[:, 1])
-        return cls(sensor, p, row, column, above, far, far * 2 * np.pi / sensor.columns)
+    def __init__(self, xyz: np.ndarray, returned: np.ndarray, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self.row, self.column = np.nonzero(returned)
+        self.p = xyz[:, self.row, self.column].T.astype(np.float64)
+        self.above = heights(xyz, returned, sensor.height)[self.row, self.column]
+        self.far = np.hypot(self.p[:, 0], self.p[:, 1])
+        self.bins = self.far * 2 * np.pi / sensor.columns
 
 
 def counts(s: Returns) -> tuple[float, ...]:

@@ -72,7 +72,7 @@ def figures(*scans):
 
 
 def found(finder, scans):
-    return finder(Returns.of(scans.xyz[0].numpy(), scans.returned[0, 0].numpy(), scans.sensor))
+    return finder(Returns(scans.xyz[0].numpy(), scans.returned[0, 0].numpy(), scans.sensor))
 
 
 @pytest.mark.parametrize("yaw", [0, 0.3, 0.7])
