@@ -175,15 +175,13 @@ def _update(
     rank, ranks = place()
     starts = range(0, len(numbers), work.batch_size)[rank::ranks]
     shared = [number for start in starts for number in numbers[start : start + work.batch_size]]
-    batches: Iterable[tuple[torch.Tensor, torch.Tensor | None]]
-    if real and protocol.real == "measured":
-        batches = scans.batches(shared, work.batch_size, work.workers, with_points=True)
-    else:
-        batches = ((images, None) for images in scans.batches(shared, work.batch_size, work.workers))
+    measured = real and protocol.real == "measured"
+    batches = scans.batches(shared, work.batch_size, work.workers, with_points=measured)
     names, side = scans.source.names, "real" if real else "generated"
     empty = 0
     with bar(f"reading {side} scans", len(shared)) as advance, torch.no_grad():
-        for start, (images, points) in zip(starts, batches, strict=True):
+        for start, read in zip(starts, batches, strict=True):
+            images, points = read if measured else (read, None)
             labels = [f"{names[number]} of {scans.label}" for number in numbers[start : start + work.batch_size]]
             batch = Scans(images.to(device), scans.sensor, protocol.rays(real), points, labels)
             empty += int((~batch.returned.flatten(1).any(1)).sum())

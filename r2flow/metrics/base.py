@@ -199,21 +199,17 @@ class ScanMetric(Metric):
     def real_state(self) -> dict[str, Tensor]:
         """Statistics of the real set, on the CPU and gathered from all processes, for a disk cache."""
         with self.sync_context():
-            names = [name for name in self._defaults if name.startswith("real_") and name != "real_rows"]
-            state = {name: getattr(self, name).detach().cpu().clone() for name in names}
-            if self.keeps:
-                state["real_rows"] = self._numbered("real")
-        return state
+            names = [name for name in self._defaults if name.startswith("real_")]
+            states = {name: self._numbered("real") if name == "real_rows" else getattr(self, name) for name in names}
+            return {name: state.detach().cpu().clone() for name, state in states.items()}
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
         """Load the real set's statistics from `real_state`, after `reset`; only on the first process."""
         if place()[0] > 0:
             return
         for name, value in state.items():
-            if name == "real_rows":
-                self.real_rows = [value.flatten().to(self.device)]
-            else:
-                getattr(self, name).copy_(value)
+            copy = value.to(self.device, copy=True)
+            setattr(self, name, [copy.flatten()] if name == "real_rows" else copy)
 
     def set_dtype(self, dst_type: str | torch.dtype) -> Self:
         """Do nothing: states stay float64, since lower precision would lose digits."""
@@ -225,8 +221,6 @@ class ScanMetric(Metric):
             scans, compared = self.given(side), self.count(side)
             if scans == 0:
                 remarks.append(f"there are no {side} scans.")
-            elif compared == 0:
-                remarks.append(f"none of the {scans} {side} scans has anything to compare; are all of them empty?")
             elif compared < scans:
                 skipped = f"{scans - compared} of {scans} {side} scans"
                 remarks.append(f"{skipped} are left out: empty, or nothing to compare.")

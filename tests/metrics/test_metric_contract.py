@@ -105,7 +105,7 @@ def test_a_figure_that_does_not_exist_comes_with_a_remark(build, sets, case):
         assert all(missing)
         assert "there are no generated scans." in metric.remarks()
     if case == "all empty":
-        assert any("none of the 9 generated scans" in remark for remark in metric.remarks())
+        assert any("9 of 9 generated scans are left out" in remark for remark in metric.remarks())
 
 
 def test_equal_sets_are_at_no_distance(build, sets):
