@@ -62,18 +62,9 @@ def drop_rate(value: np.ndarray, missing: np.ndarray, edges: np.ndarray) -> np.n
     return np.stack([histogram(value, edges, missing), histogram(value, edges)])
 
 
-def gradient_azimuth(scan: Scan) -> np.ndarray:
-    """Histogram of |r(h, w + 1) - r(h, w)| over pairs of returns, logarithmic bins in metres."""
-    return _differences(np.roll(scan.r, -1, -1), scan.r)
-
-
-def gradient_elevation(scan: Scan) -> np.ndarray:
-    """Histogram of |r(h + 1, w) - r(h, w)| over pairs of returns, logarithmic bins in metres."""
-    return _differences(scan.r[1:], scan.r[:-1])
-
-
-def _differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return histogram(np.abs(a - b)[(a > 0) & (b > 0)], GRADIENTS)
+def differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """|a - b| over pairs of returns."""
+    return np.abs(a - b)[(a > 0) & (b > 0)]
 
 
 def steps_by_sector(scan: Scan) -> np.ndarray:
@@ -85,13 +76,12 @@ def steps_by_sector(scan: Scan) -> np.ndarray:
 
 
 def run_lengths(scan: Scan) -> np.ndarray:
-    """Histogram of lengths of runs of returns along rows, weighted by length; rows are periodic."""
+    """Lengths of runs of returns along rows, which are periodic."""
     returned = (scan.r > 0).astype(np.int8)
     begin = returned.argmin(1)[:, None]  # at a missing ray, if any
     returned = np.take_along_axis(returned, (begin + np.arange(returned.shape[1])) % returned.shape[1], 1)
     edges = np.diff(np.pad(returned, ((0, 0), (1, 1))), axis=1)
-    length = np.nonzero(edges < 0)[1] - np.nonzero(edges > 0)[1]
-    return histogram(length, RUNS, length)
+    return np.asarray(np.nonzero(edges < 0)[1] - np.nonzero(edges > 0)[1])
 
 
 def changes_row(scan: Scan) -> np.ndarray:
@@ -118,16 +108,6 @@ def drop_incidence(scan: Scan) -> np.ndarray:
     return drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, INCIDENCES)
 
 
-def surface_normals(scan: Scan) -> np.ndarray:
-    """Histogram of n_z of surface normals, 20 bins from -1 to 1."""
-    return histogram(scan.surfaces[0].ravel(), NORMALS)
-
-
-def incidence(scan: Scan) -> np.ndarray:
-    """Histogram of cosines of the angle of incidence, 20 bins."""
-    return histogram(scan.surfaces[1].ravel(), COSINES)
-
-
 def range_pairs(scan: Scan) -> np.ndarray:
     """Joint histogram of ranges of pixels 2.8 degrees or one column apart, 16 x 16 logarithmic bins."""
     return _pairs(scan.r, scan.r > 0, np.geomspace(scan.sensor.min_range, scan.sensor.max_range, PAIRS + 1), APART[0])
@@ -146,11 +126,6 @@ def _pairs(x: np.ndarray, returned: np.ndarray, edges: np.ndarray, parts: int) -
     inside = returned & (place >= 0) & (place < bins)
     both = inside & np.roll(inside, by, -1)
     return np.bincount((place * bins + np.roll(place, by, -1))[both], minlength=bins * bins)
-
-
-def birds_eye_density(scan: Scan) -> np.ndarray:
-    """Histogram over points of the number of points in the same 1.6 m bird's-eye cell, 10 bins."""
-    return histogram(scan.birds_eye.ravel(), DENSITIES, scan.birds_eye.ravel())
 
 
 def rate_distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -178,19 +153,31 @@ class Member(NamedTuple):
     distance: Callable[[np.ndarray, np.ndarray], float] = js_distance
 
 
+def histogram_of(values: Callable[[Scan], np.ndarray], edges: np.ndarray, weighted: bool = False) -> Member:
+    """The histogram of some values of a scan, each counted once, or as often as its value says."""
+
+    def counts(scan: Scan) -> np.ndarray:
+        x = values(scan).ravel()
+        return histogram(x, edges, x if weighted else None)
+
+    return Member(counts, len(edges) - 1)
+
+
 PANEL: dict[str, Member] = {
-    "gradient, azimuth": Member(gradient_azimuth, len(GRADIENTS) - 1),
-    "gradient, elevation": Member(gradient_elevation, len(GRADIENTS) - 1),
+    # |r(h, w + 1) - r(h, w)| and |r(h + 1, w) - r(h, w)| over pairs of returns, logarithmic bins in metres
+    "gradient, azimuth": histogram_of(lambda scan: differences(np.roll(scan.r, -1, -1), scan.r), GRADIENTS),
+    "gradient, elevation": histogram_of(lambda scan: differences(scan.r[1:], scan.r[:-1]), GRADIENTS),
     "steps by sector": Member(steps_by_sector, SECTORS * (len(STEPS) - 1)),
-    "run lengths": Member(run_lengths, len(RUNS) - 1),
+    "run lengths": histogram_of(run_lengths, RUNS, weighted=True),
     "changes per row": Member(changes_row, 2 * MOST_ROWS, row_distance),
     "drop rate by range": Member(drop_range, 2 * DROPS, rate_distance),
     "drop rate by incidence": Member(drop_incidence, 2 * (len(INCIDENCES) - 1), rate_distance),
-    "surface normals": Member(surface_normals, len(NORMALS) - 1),
-    "incidence": Member(incidence, len(COSINES) - 1),
+    "surface normals": histogram_of(lambda scan: scan.surfaces[0], NORMALS),
+    "incidence": histogram_of(lambda scan: scan.surfaces[1], COSINES),
     "range pairs": Member(range_pairs, PAIRS**2),
     REFLECTANCE: Member(reflectance_pairs, (len(REFLECTANCES) - 1) ** 2, reflectance_distance),
-    "bird's-eye density": Member(birds_eye_density, len(DENSITIES) - 1),
+    # over points, the number of points in the same 1.6 m bird's-eye cell
+    "bird's-eye density": histogram_of(lambda scan: scan.birds_eye, DENSITIES, weighted=True),
 }
 ENDS = np.cumsum([member.size for member in PANEL.values()])
 

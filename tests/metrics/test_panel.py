@@ -12,7 +12,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics import panel as lines
 from r2flow.metrics.birds_eye import js_distance
-from r2flow.metrics.panel import PANEL, RUNS, Scan, distances, panel, run_lengths, steps_by_sector
+from r2flow.metrics.panel import PANEL, RUNS, Scan, distances, panel, steps_by_sector
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import measured
 
@@ -114,7 +114,8 @@ def test_a_turn_changes_no_run_of_returns():
     expected = np.histogram([13, 15, 40], RUNS, weights=[13, 15, 40])[0]
     for by in (0, 7, 20):
         turned = np.roll(images, by, -1)
-        np.testing.assert_array_equal(sum(run_lengths(scan_of(image)) for image in turned), expected)
+        counts = sum(PANEL["run lengths"].counts(scan_of(image)) for image in turned)
+        np.testing.assert_array_equal(counts, expected)
 
 
 def test_mirrored_scans_of_a_car_that_keeps_to_the_right_are_seen():

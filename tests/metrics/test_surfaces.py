@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.panel import Scan, drop_incidence, drop_range, drop_rate, surface_normals
+from r2flow.metrics.panel import PANEL, Scan, drop_incidence, drop_range, drop_rate
 from r2flow.metrics.surfaces import bridged, normals
 
 SENSOR = SENSORS["hdl64e"].resized(32, 512)
@@ -105,5 +105,5 @@ def test_losses_on_flat_ground_fall_into_the_bins_of_its_elevations():
     rate = share(drop_incidence, images)  # bins of 9 degrees, from 90 down: 63 to 90 is what -27 to 0 looks like
     assert (rate[3:] == 0).all()
     assert rate[1] == pytest.approx(0.02, abs=0.01)
-    upward = sum(surface_normals(scan) for scan in scans_of(images))
+    upward = sum(PANEL["surface normals"].counts(scan) for scan in scans_of(images))
     assert upward[-1] == upward.sum()
