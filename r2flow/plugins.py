@@ -14,6 +14,7 @@ import importlib.util
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from hashlib import sha256
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,11 @@ def load_plugins(names: Sequence[str]) -> None:
 def loaded_plugins() -> list[str]:
     """Names of the loaded modules, as they were given."""
     return list(dict.fromkeys(_loaded.values()))
+
+
+def plugin_digests() -> list[str]:
+    """SHA-256 of the loaded modules' files: stored results depend on a plug-in's code."""
+    return [sha256(Path(file).read_bytes()).hexdigest() for file in sorted(_loaded) if Path(file).is_file()]
 
 
 def _identity(name: str) -> str:

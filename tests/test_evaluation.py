@@ -78,6 +78,12 @@ class TestCache:
         monkeypatch.setattr("r2flow.evaluation.statistics.FORMAT", FORMAT + 1)
         keys.append(key())
         monkeypatch.undo()
+        plugin = tmp_path / "plugin.py"
+        monkeypatch.setattr("r2flow.plugins._loaded", {str(plugin): "plugin.py", "a.module": "a.module"})
+        for code in ("x = 1", "x = 2"):
+            plugin.write_text(code)
+            keys.append(key())
+        monkeypatch.undo()
         scan = real / "000003.npy"
         scan.write_bytes(scan.read_bytes())  # another time, the same content
         keys.append(key())

@@ -16,6 +16,7 @@ from r2flow.evaluation.statistics import Cache, Statistics
 from r2flow.files import read_json, write_file
 from r2flow.metrics.base import ScanMetric
 from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, Panel, mean_distance
+from r2flow.plugins import plugin_digests
 from r2flow.processes import place
 from r2flow.store import checksum
 
@@ -108,7 +109,7 @@ class Comparer:
         recipe = {
             "real": real.identity or [real.label, len(real)], "sampled": other.about, "bootstrap": self.draws,
             "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
-            "protocol": self.rules.name, "device": self.device,
+            "protocol": self.rules.name, "plugins": plugin_digests(), "device": self.device,
         }  # fmt: skip
         return self.folder / f"{checksum(recipe)[:16]}.json"
 

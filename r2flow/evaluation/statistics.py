@@ -13,6 +13,7 @@ from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
 from r2flow.files import cache_folder
 from r2flow.metrics.base import ScanMetric
+from r2flow.plugins import plugin_digests
 from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)
@@ -63,10 +64,10 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
     """Everything a metric's statistics of a set depend on, as JSON.
 
     The key contains scan files with sizes and times (or seed, or manifest), sensor, projection, mask, subset, the
-    metric's protocol with its weights' hash, the device type, and the file format.
+    metric's protocol with its weights' hash, the code of plug-ins, the device type, and the file format.
     """
     parts = {
         "format": FORMAT, "scans": scans.identity, "subset": rule, "protocol": asdict(metric.protocol),
-        "keeps": metric.keeps, "device": torch.device(metric.device).type,
+        "keeps": metric.keeps, "plugins": plugin_digests(), "device": torch.device(metric.device).type,
     }  # fmt: skip
     return json.dumps(parts, sort_keys=True)

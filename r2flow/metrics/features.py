@@ -9,6 +9,7 @@ from torch import Tensor
 from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.extractors.weights import weights_hash
 from r2flow.metrics.scans import Scans
 
 
@@ -21,6 +22,8 @@ class FeatureMetric(ScanMetric):
 
     def __init__(self, extractor: Extractor | str, keep: bool = False, **options: Any) -> None:
         network = EXTRACTORS[extractor].trained() if isinstance(extractor, str) else extractor.eval()
+        if isinstance(extractor, str) and network.weights == "random":  # a plug-in's own `trained`
+            network.weights = weights_hash(network)
         name = f"{self.kind}_{network.name}"
         name = f"{name}_random" if network.weights == "random" else self.names.get(network.name, name)
         super().__init__(keep, name=name, **options)

@@ -5,7 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
+from r2flow.metrics.extractors import EXTRACTORS
+from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.frechet import FrechetDistance, add_moments, frechet_distance, merge_moments, moments
 from tests.metrics.conftest import measured, scans_of
 
@@ -93,3 +96,25 @@ def test_random_weights_never_have_the_field_s_name(summary):
     assert metric.protocol.metric == "frd"
     metric.extractor.weights = "random"
     assert FrechetDistance(metric.extractor).protocol.metric == "frechet_rangenet53_random"
+
+
+def test_a_plugin_s_network_is_known_by_its_weights(monkeypatch):
+    class Mine(Extractor):
+        name, layer, dim = "mine", "sum", 1
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.scale = nn.Parameter(torch.rand(1))
+
+        def features(self, scans):
+            return self.scale * scans.images.sum((1, 2, 3))[:, None]
+
+        @classmethod
+        def trained(cls):
+            return cls()
+
+    monkeypatch.setattr(EXTRACTORS, "_entries", dict(EXTRACTORS._entries))
+    EXTRACTORS._entries["mine"] = Mine
+    one, other = (FrechetDistance("mine").protocol for _ in range(2))
+    assert one.metric == other.metric == "frechet_mine"
+    assert one.weights != other.weights

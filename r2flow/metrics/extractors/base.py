@@ -21,7 +21,7 @@ class Extractor(nn.Module, ABC):
         layer: Description of the features.
         dim: Number of features, D.
         needs_reflectance: Whether reflectance is an input.
-        weights: First 12 digits of the SHA-256 of its weights; "random" without trained weights.
+        weights: First 12 digits of the SHA-256 of its weights, set where they are loaded; "random" before.
     """
 
     name: ClassVar[str]
