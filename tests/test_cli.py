@@ -16,6 +16,7 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.export import Difference
 from r2flow.samplers import build_sampler
 from tests.conftest import write_run, write_scan
 from tests.test_sampling import network, scans
@@ -89,6 +90,15 @@ def test_export_writes_the_averaged_weights(r2flow, saved, tmp_path):
     for name, value in load_checkpoint(out).generator.state_dict().items():
         assert torch.equal(value, averaged[f"generator.{name}"])
     assert r2flow("export", out, "--to", "safetensors", "--out", out)[0] == 2
+
+
+@pytest.mark.parametrize("metres", [0.01, 18.0])
+def test_an_export_that_draws_other_scans_is_warned_of(r2flow, saved, tmp_path, monkeypatch, metres):
+    monkeypatch.setattr("r2flow.model.export.compare", lambda *_: Difference(metres, 0.0, 0))
+    code, said, error = r2flow("export", saved[0], "--to", "pt2", "--steps", 1, "--out", tmp_path / "it.pt2")
+    assert code == 0
+    assert f"range within {metres:.2g} m" in said
+    assert ("does not draw the flow's scans" in error) == (metres > 1)
 
 
 def verbs() -> list[str]:

@@ -52,6 +52,7 @@ export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
 export run --to onx # no export format named 'onx'
 export run --what all
+export run --to safetensors --what network # --what network is for
 export run --what network --steps 4 # takes no sampler: leave sampler, steps
 export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx
 export run --sampler dopri5 # give --sampler adams3 --steps 16

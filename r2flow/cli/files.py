@@ -1,5 +1,6 @@
 """`r2flow export`, `info` and `weights`."""
 
+import logging
 from hashlib import sha256
 from json import dumps as to_json
 from pathlib import Path
@@ -10,6 +11,10 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.options import SamplerOptions, grouped
 from r2flow.errors import InputError, check
+
+log = logging.getLogger(__name__)
+
+MOST_OFF = 0.1  # m, largest difference of an exported file without a warning
 
 
 @app.command(epilog="Example: r2flow export runs/NAME --to onnx --steps 8 --out flow.onnx")
@@ -40,6 +45,7 @@ def export(
         out = Path(f"{checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name}.{to}")
     check(out.suffix == f".{to}", f"--to {to} writes a .{to}, found --out {out}.")
     check(not half or to == "safetensors", "--half is for --to safetensors.")
+    check(what == "sampler" or to != "safetensors", "--what network is for --to onnx and --to pt2.")
     if (to == "safetensors" or what == "network") and how != SamplerOptions():
         raise InputError(f"--to {to} --what {what} takes no sampler: leave sampler, steps, tolerance and grid out.")
     loaded = load_checkpoint(checkpoint)
@@ -64,9 +70,11 @@ def export(
         print(f"not compared with the flow: {missing}")
         return
     print(
-        f"compared with the flow: range within {1000 * difference.metres:.2g} mm, reflectance within "
+        f"compared with the flow: range within {difference.metres:.2g} m, reflectance within "
         f"{difference.reflectance:.2g}, {difference.rays} rays differ in ray-drop"
     )
+    if difference.metres > MOST_OFF:
+        log.warning("the file does not draw the flow's scans, unless rounding grows that much with the steps.")
 
 
 @app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")

@@ -128,7 +128,7 @@ def nearest_sensor(elevations: np.ndarray) -> tuple[str | None, float]:
 
 
 def _family(name: str) -> str:
-    return name.removesuffix("_rings")
+    return name.partition("_rings")[0]
 
 
 def _distance(beams: np.ndarray, table: np.ndarray) -> float:

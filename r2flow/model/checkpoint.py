@@ -258,6 +258,9 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     if published is not None:
         converted = published.read(content, path, averaged)
         config, weights, step, kind = converted.config, converted.weights, converted.step, "published"
+        if converted.elevations is not None:
+            rings = torch.rad2deg(converted.elevations.double()).tolist()
+            config["sensor"] |= {"name": "hdl64e_rings_published", "elevations": rings, "rays": "centre"}
         drawing: Mapping[str, Any] = {"sampler": converted.sampler}
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:
         state: Any = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
@@ -279,10 +282,6 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         if drawing.get("sampler"):
             few = drawing.get("few")
             generator.run_by(build_sampler(drawing["sampler"]), few and build_sampler(few), bool(drawing.get("fixed")))
-    if published is not None and converted.elevations is not None:
-        rings = torch.rad2deg(converted.elevations.double())
-        sensor = replace(generator.space.sensor, elevations=tuple(rings.tolist()))
-        generator.space = replace(generator.space, sensor=sensor, rays=sensor.rays())
     return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind)
 
 

@@ -325,12 +325,16 @@ def test_a_published_file_holds_its_discriminator_by_our_names(cases: Any, share
     assert_near(network(io["x"]), io["score"], 1e-4)
 
 
-def test_sensor_and_angles_of_a_published_file_are_its_own(shared: Path):
+def test_sensor_and_angles_of_a_published_file_are_its_own_also_when_saved(shared: Path, tmp_path: Path):
     path = shared / "oracle_baselines" / "dusty2_published.pth"
     checkpoint = load_checkpoint(path)
     rays = checkpoint.sensor.rays()
     torch.testing.assert_close(checkpoint.generator.angle[0], rays, rtol=0, atol=1e-4)
     assert math.degrees(float(rays[0, 0, 0])) == pytest.approx(math.degrees(0.05), abs=1e-3)
+    checkpoint.save(tmp_path / "it.safetensors")
+    saved = load_checkpoint(tmp_path / "it.safetensors")
+    assert saved.sensor == checkpoint.sensor
+    assert torch.equal(saved.sample(1), checkpoint.sample(1))
 
 
 def test_a_file_that_would_run_code_beside_its_config_is_refused(shared: Path, tmp_path: Path):
