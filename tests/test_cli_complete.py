@@ -415,13 +415,6 @@ def test_points_next_to_range_images_are_completed(complete, r2flow, tmp_path: P
     assert np.array_equal(answer[: len(kept)], kept)
 
 
-def test_more_rows_than_a_sensor_has_beams_are_not_measured(tmp_path: Path):
-    sparse_scan(tmp_path / "0.ply")
-    ((scan,), (said,)) = open_partial([str(tmp_path)], Reading(VLP16.resized(64, 900)))
-    assert "16 of the 64 rows of vlp16 are measured" in said
-    assert (scan.read().state != Ray.UNKNOWN).any(1).sum() == 16
-
-
 def test_points_outside_the_limits_and_sectors_never_scanned_are_told(complete, tmp_path: Path):
     xyz, asked = sparse_scan(tmp_path / "whole.ply"), ("--to", "vlp16", "--size", "32x360")
     assert "no ray is known" not in success(complete(tmp_path / "whole.ply", *asked))

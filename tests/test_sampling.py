@@ -31,6 +31,7 @@ from tests.fields import Field
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 M, S = 0.2, 0.4
+SIZE = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true"]
 
 
 class GaussianFlow(nn.Module):
@@ -100,29 +101,19 @@ def test_round_trip_errors_are_what_they_say():
     assert errors["rms"].item() == pytest.approx((x - found.x_1).square().mean().sqrt().item(), rel=1e-6)
 
 
-EXTREMES = {
-    "all dropped": torch.zeros(1, 2, 8, 64),
-    "one return": torch.nn.functional.pad(torch.tensor([[[[12.0]], [[0.5]]]]), (40, 23, 3, 4)),
-    "all nearest": torch.full((1, 2, 8, 64), SENSOR.min_range),
-    "all farthest": torch.full((1, 2, 8, 64), SENSOR.max_range),
-    "saturated": torch.cat([torch.full((1, 1, 8, 64), 20.0), torch.ones(1, 1, 8, 64)], 1),
-}
-
-
-@pytest.mark.parametrize("name", EXTREMES)
-def test_extreme_scans_go_there_and_back(name):
-    image = EXTREMES[name].clone()
-    image[:, 1] = image[:, 1].clamp(0, 1)
-    found = invert(flow(), image, build_sampler("dopri5", tolerance=1e-6))
+def test_extreme_scans_go_there_and_back():
+    images = torch.zeros(5, 2, 8, 64)  # the first all dropped
+    images[1, :, 3, 40] = torch.tensor([12.0, 0.5])
+    images[2, 0], images[3, 0], images[4, 0] = SENSOR.min_range, SENSOR.max_range, 20.0
+    images[2:, 1] = 1
+    found = invert(flow(), images, build_sampler("dopri5", tolerance=1e-6))
     errors = round_trip(flow(), found)
     assert found.converged.all()
-    assert errors["rms"].item() < 1e-4
-    if name == "all dropped":
-        assert errors["median_m"].isnan().all()  # no ray returns: there is nothing to measure in metres
-    else:
-        assert errors["median_m"].item() < 0.05
+    assert errors["rms"].max() < 1e-4
+    assert errors["median_m"][0].isnan()  # no ray returns: there is nothing to measure in metres
+    assert (errors["median_m"][1:] < 0.05).all()
     # a dropped ray, or one at the very limit, stays what it is only as exactly as the solver goes
-    assert errors["dropped"].item() == 0 or name in ("all nearest", "all farthest")
+    assert not errors["dropped"][[0, 1, 4]].any()
     assert found.x_0.isfinite().all()
 
 
@@ -263,8 +254,7 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
 
 
 def test_what_makes_whole_images_alone_makes_the_region_that_is_all():
-    size = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true"]
-    gan = build_generator(compose(["experiment=vanilla_gan", "size=small", "generator.base_channels=4", *size])).eval()
+    gan = build_generator(compose(["experiment=vanilla_gan", "size=small", "generator.base_channels=4", *SIZE])).eval()
     (part,) = sample(gan, 1, region=region((16, 32)))
     (whole,) = sample(gan, 1)
     assert torch.equal(part.images, whole.images)
@@ -338,15 +328,13 @@ def test_a_seed_is_a_whole_number_of_python_or_numpy():
 
 @pytest.mark.parametrize("method", ["ddim", "ddpm"])
 def test_a_diffusion_walks_noise_of_half_precision_in_float32(method):
-    size = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true", "backbone.base_channels=8"]
-    walker = build_generator(compose(["experiment=r2dm", "size=small", *size])).eval()
+    walker = build_generator(compose(["experiment=r2dm", "size=small", "backbone.base_channels=8", *SIZE])).eval()
     draws = Draws(0, range(2))
     noise, how = draws.start(walker.noise_shape).bfloat16(), build_sampler(method, steps=4)
     half, full = (walker(one, sampler=how, draws=draws).x for one in (noise, noise.float()))
     assert torch.equal(half, full)
 
 
-SIZE = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true"]
 TINY = ["backbone=hdit_tiny", "backbone.base_channels=16", "backbone.num_heads=[1,2,4]"]
 
 

@@ -1,5 +1,3 @@
-import csv
-import math
 from types import SimpleNamespace
 
 import lightning as L
@@ -24,7 +22,8 @@ from tests.fields import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*")
 
-SHAPE = (2, 4, 8)
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+SPACE = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays())
 # Of 1, 2 and 3 at steps 2 and 3: the average copies 1, takes 1 - 2^(-2/3) of it and the rest of 2, then half of 3.
 AVERAGES = 1 + 2 ** (-2 / 3), (1 + 2 ** (-2 / 3) + 3) / 2
 
@@ -47,7 +46,7 @@ class Stage(L.LightningModule):
     def __init__(self) -> None:
         super().__init__()
         self.velocity = Shrinking(0.0)
-        self.generator = Field(self.velocity, SHAPE)
+        self.generator = Field(self.velocity, SPACE.shape, SPACE)
         self.warmup_steps = 0
         self.draws = []
 
@@ -67,9 +66,9 @@ class Stage(L.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.0)
 
 
-def fit(tmp_path, callbacks, steps=6, stage=None, logger=None, **options):
+def fit(tmp_path, callbacks, steps=6, logger=None, **options):
     torch.manual_seed(3)
-    stage = stage or Stage()
+    stage = Stage()
     loader = torch.utils.data.DataLoader(torch.zeros(64, 1), batch_size=1)
     logger = logger or CSVLogger(tmp_path, name="metrics")
     more = {"max_steps": steps, "callbacks": callbacks, "logger": logger, "log_every_n_steps": 1, **options}
@@ -82,7 +81,7 @@ def exact(a: float, n: int) -> tuple[float, float]:
     factors = [-a * (1 - a / n) ** k for k in range(n)]
     mean = sum(factors) / n
     variance = sum((f - mean) ** 2 for f in factors) / n
-    norms = [standard_normal(SHAPE, 7, "evaluation", i).double().square().sum().item() for i in range(2)]
+    norms = [standard_normal(SPACE.shape, 7, "evaluation", i).double().square().sum().item() for i in range(2)]
     return variance * sum(norms) / 2, variance / mean**2
 
 
@@ -105,14 +104,6 @@ def test_training_does_not_notice(tmp_path):
     assert torch.equal(plain.velocity.a, measured.velocity.a)
 
 
-def test_a_step_of_several_batches_is_measured_once(tmp_path):
-    fit(tmp_path, [Curvature(seed=0, every=2)], steps=4, accumulate_grad_batches=3)
-    with (tmp_path / "metrics" / "version_0" / "metrics.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row.get("curvature/s")]
-    assert [int(row["step"]) for row in rows] == [1, 3]
-    assert all(math.isfinite(float(row["curvature/s_normalised"])) for row in rows)
-
-
 def test_a_resumed_run_does_not_look_again_at_the_step_that_it_goes_on_from():
     """Under accumulation a batch of the next step ends before the step does."""
 
@@ -129,25 +120,13 @@ def test_a_resumed_run_does_not_look_again_at_the_step_that_it_goes_on_from():
     assert looked == [6]
 
 
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
-SPACE = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays())
-
-
-class Drawn(Stage):
-    """Its velocity is -a x, with a = 1, 2, 3, ... step by step."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.generator = Field(self.velocity, SPACE.shape, SPACE)
-
-
 def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_path, monkeypatch):
     sheets = []
     real = pictures.contact_sheet
     monkeypatch.setattr(pictures, "contact_sheet", lambda *given: sheets.append(given) or real(*given))
     callbacks = [EMA(decay=0.5, every=1, warmup_steps=0), SamplePictures(tmp_path / "p", 7, every=2, num=2, steps=4)]
     logger = TensorBoardLogger(tmp_path, name="tensorboard", version="")
-    fit(tmp_path, callbacks, steps=3, stage=Drawn(), logger=logger)
+    fit(tmp_path, callbacks, steps=3, logger=logger)
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == ["step-00000002.png", "step-00000003.png"]
     noise = torch.stack([standard_normal(SPACE.shape, 7, "evaluation", i) for i in range(2)])
     for a, (images, _, titles) in zip(AVERAGES, sheets, strict=True):
@@ -161,7 +140,7 @@ def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_pat
 def test_a_picture_that_is_there_is_kept_and_none_may_be_asked_for(tmp_path):
     (tmp_path / "p").mkdir()
     (tmp_path / "p" / "step-00000002.png").write_bytes(b"kept")
-    fit(tmp_path, [SamplePictures(tmp_path / "p", 0, every=2, num=1, steps=1)], steps=2, stage=Drawn())
+    fit(tmp_path, [SamplePictures(tmp_path / "p", 0, every=2, num=1, steps=1)], steps=2)
     assert (tmp_path / "p" / "step-00000002.png").read_bytes() == b"kept"
-    fit(tmp_path, [SamplePictures(tmp_path / "none", 0, every=0)], steps=2, stage=Drawn())
+    fit(tmp_path, [SamplePictures(tmp_path / "none", 0, every=0)], steps=2)
     assert not (tmp_path / "none").exists()
