@@ -106,7 +106,7 @@ class JumpTimes:
         ends: Portion = 0.0,
         time: Mapping[str, Any] | None = None,
     ) -> None:
-        check(steps and min(steps) >= 1, f"the steps of a flow map's jumps must be of at least 1, found {steps}.")
+        check(steps and min(steps) >= 1, f"the steps of a flow map's jumps must be at least 1, found {steps}.")
         check(diagonal + ends <= 1, f"diagonal + ends must be at most 1; found {diagonal}, {ends}.")
         self.grid, self.share, self.diagonal, self.ends = grid, share, diagonal, ends
         self.velocities = TIMES.build(time or {"name": "u_shaped"})
