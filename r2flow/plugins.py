@@ -3,9 +3,8 @@
     r2flow train --plugin my.module stage=my_stage
     r2flow sample --plugin ./my_stage.py runs/NAME
 
-Installed packages in the entry-point group `r2flow.plugins` are imported when a config is composed or a registry lacks
-a name. Configs and checkpoints list their plug-ins for information only: r2flow never imports a module because a file
-names it.
+Installed packages in the entry-point group `r2flow.plugins` are imported when a registry lacks a name. Configs and
+checkpoints list their plug-ins for information only: r2flow never imports a module because a file names it.
 """
 
 import argparse

@@ -2,11 +2,13 @@
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import hydra
 from hydra import initialize_config_dir
@@ -15,14 +17,15 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import OverrideType, Sweep
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from r2flow.config import flatten, key_of, override
 from r2flow.errors import InputError
-from r2flow.plugins import load_installed
 from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
+
+T = TypeVar("T")
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
@@ -45,11 +48,10 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
         InputError: an unknown key or choice.
     """
     search = ",".join(f"file://{Path(folder).resolve()}" for folder in folders)
-    add_choices()
     overrides = [*as_hydra_takes(overrides), f"hydra.searchpath=[{search}]"]
     try:
         with _hydra():
-            config = hydra.compose("train", overrides, return_hydra_config=True)
+            config = with_choices(partial(hydra.compose, "train", overrides, return_hydra_config=True))
             HydraConfig.instance().set_config(config)
             return plain(config)
     except (HydraException, OmegaConfBaseException) as error:
@@ -111,25 +113,43 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in resolved.items()}
 
 
-def add_choices() -> None:
-    """Add a Hydra choice for each registry entry without a YAML file, which is a plug-in's, from its options.
+def add_choices(group: str) -> None:
+    """Add a Hydra choice for each registry entry of a group without a YAML file, from its constructor's options."""
+    module, table, given_by_run = REGISTRIES[group]
+    for name, entry in getattr(import_module(module), table).items():
+        if (CONF / group / f"{name}.yaml").is_file():
+            continue
+        if group == "data":
+            node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
+        elif group == "sensor":
+            node = {**options_of(import_module(module).build_sensor), "name": name}
+        else:
+            node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
+            if group == "stage":
+                node = {"init": None, **node}
+            node = {"name": name, **node}
+        ConfigStore.instance().store(name, node, group=group)
 
-    Registries that no plug-in has imported are left alone, since their import takes seconds.
+
+def with_choices(compose: Callable[[], T]) -> T:
+    """The result of a composition; if it lacks a choice that a registry has, such as a plug-in's, of a second one.
+
+    A name that resembles a file's is not looked up if that would import torch. All groups get their choices, since the
+    same command may name several.
     """
-    load_installed()
-    for group, (module, table, given_by_run) in REGISTRIES.items():
-        registry = getattr(sys.modules.get(module), table, {})
-        for name in registry:
-            if (CONF / group / f"{name}.yaml").is_file():
-                continue
-            if group == "data":
-                node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
-            elif group == "sensor":
-                node = {**options_of(sys.modules[module].build_sensor), "name": name}
-            else:
-                options = {key: v for key, v in options_of(registry[name], given=1).items() if key not in given_by_run}
-                node = {"name": name, **({"init": None} if group == "stage" else {}), **options}
-            ConfigStore.instance().store(name, node, group=group)
+    try:
+        return compose()
+    except MissingConfigException as error:
+        group, _, name = str(error.missing_cfg_file or "").rpartition("/")
+        if group not in REGISTRIES:
+            raise
+        module, table, _ = REGISTRIES[group]
+        misspelt = module not in sys.modules and did_you_mean(name, choices(group))
+        if misspelt or name not in getattr(import_module(module), table):
+            raise
+        for registered in REGISTRIES:
+            add_choices(registered)
+        return compose()
 
 
 def choices(group: str) -> list[str]:

@@ -27,7 +27,17 @@ from r2flow import __version__
 from r2flow.config import key_of, override
 from r2flow.errors import InputError, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
-from r2flow.runs.composing import CONF, add_choices, as_hydra_takes, check_keys, compose, explain, plain
+from r2flow.runs.composing import (
+    CONF,
+    REGISTRIES,
+    add_choices,
+    as_hydra_takes,
+    check_keys,
+    compose,
+    explain,
+    plain,
+    with_choices,
+)
 from r2flow.signals import LATER, Stopped, listening, stop_at_once
 
 log = logging.getLogger("r2flow")
@@ -55,7 +65,8 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
                 return 0
             arguments, plugins = _plugins_of(list(arguments) or ["experiment=demo"])
             load_plugins(plugins)
-            add_choices()
+            for group in REGISTRIES if plugins else ():
+                add_choices(group)
             arguments = _checked_arguments(arguments)
             _run_hydra(arguments, functools.partial(_job, arguments, command, ended, os.getpid()))
             if ended:
@@ -145,9 +156,12 @@ def _run_hydra(arguments: Sequence[str], job: Callable[[DictConfig], None]) -> N
     decorated = hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(task)
     OmegaConf.register_new_resolver("job_folder", functools.partial(job_folder, arguments), replace=True)
 
-    try:
+    def composed() -> None:
         sys.argv = [original[0], *arguments]
         decorated()
+
+    try:
+        with_choices(composed)
     finally:
         sys.argv = original
 
