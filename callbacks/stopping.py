@@ -4,6 +4,7 @@ import logging
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -93,9 +94,10 @@ class Stopping(L.Callback):
                 if trainer.strategy.reduce_boolean_decision(self.told == number, all=False):
                     self.told = number
         if received and trainer.global_step < trainer.max_steps:
-            for callback in trainer.checkpoint_callbacks:
-                if isinstance(callback, Checkpoints):
-                    callback.save(trainer)
+            kept: list[Any] = trainer.checkpoint_callbacks
+            if kept:  # a plug-in's own callback does not save where the run stops, and its files are its own
+                ours = (callback for callback in kept if isinstance(callback, Checkpoints))
+                next(ours, Checkpoints(self.run_dir, keep=sys.maxsize)).save(trainer)
             self._training = False
             environment = getattr(trainer.strategy, "cluster_environment", None)
             if not trainer.is_global_zero and isinstance(environment, LightningEnvironment):
