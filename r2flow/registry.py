@@ -200,7 +200,7 @@ def _wanted(annotation: Any) -> Check | None:
         words = " or ".join(words for words, _ in checks)
         return (words, lambda v: any(fits(v) for _, fits in checks)) if len(checks) == len(inner) else None
     if (origin or annotation) in (list, tuple, Sequence):
-        size = len(inner) if origin is tuple and Ellipsis not in inner else None
+        size = len(inner) if origin is tuple and inner and Ellipsis not in inner else None
         each = _wanted(inner[0]) if inner else None
         words = f"a list{f' of {size}' if size else ''}{f', each {each[0]}' if each else ''}"
 

@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, named_grid
+from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, named_grid, solve
 from r2flow.registry import Count, Portion, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Sampler
 
@@ -20,7 +20,7 @@ class ODESampler(Sampler):
         """Options of `r2flow.flow.solvers.solve`."""
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        end = generator.solve(noise, sampler=self, condition=condition, progress=progress)
+        end = solve(generator.field(condition), noise, progress=progress, **self.options())
         return Generated(end.x, end.evaluations, end.converged)
 
 
@@ -50,9 +50,9 @@ class FixedSteps(OnGrid, ODESampler):
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if not self.finish or self.steps == 1:
             return super().__call__(generator, noise, condition, draws, progress)
-        how = {"sampler": self, "condition": condition, "progress": progress}
-        near = generator.solve(noise, 0.0, 1 - self.finish, steps=self.steps - 1, **how)
-        last = generator.solve(near.x, 1 - self.finish, method="euler", steps=1, grid="uniform", **how)
+        v, t = generator.field(condition), 1 - self.finish
+        near = solve(v, noise, 0.0, t, progress=progress, **(self.options() | {"steps": self.steps - 1}))
+        last = solve(v, near.x, t, steps=1, progress=progress)
         return Generated(last.x, near.evaluations + last.evaluations, near.converged & last.converged)
 
     def knot_times(self, knots: int) -> Tensor:
