@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -83,6 +84,15 @@ def test_inversion_finds_the_noise(method, apart):
     if method != "euler":
         assert errors["median_m"].max() < 1e-2
         assert errors["dropped"].max() < 0.01
+
+
+@pytest.mark.parametrize(("finish", "expected"), [(0.0, (1 - 0.25) ** 4), (0.1, (1 - 0.3) ** 3 * (1 - 0.1))])
+def test_a_sampler_needs_a_field_alone_and_passes_gradients(finish, expected):
+    plugin = SimpleNamespace(field=lambda condition: lambda t, x: -x)  # dx/dt = -x in four Euler steps
+    x = torch.ones(1, 2, 4, 8, requires_grad=True)
+    end = build_sampler("euler", steps=4, finish=finish)(plugin, x, None, None, lambda: None).x
+    (gradient,) = torch.autograd.grad(end.sum(), x)
+    torch.testing.assert_close([end, gradient], [torch.full_like(x, expected)] * 2)
 
 
 def test_round_trip_errors_are_what_they_say():

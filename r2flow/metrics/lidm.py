@@ -37,7 +37,7 @@ def occupied(points: Tensor, cell: float) -> Tensor:
 class JSDLiDM(SumMetric):
     """Jensen-Shannon distance (root, natural logarithm) between counts of scans that occupy each 5 cm cell.
 
-    A row lists the occupied cells; the 4 million cells of single scans are not stored: there are no intervals.
+    A row lists the occupied cells; the 4 million cells of single scans are not stored, so that it has no intervals.
     """
 
     name = "jsd_lidm"

@@ -258,7 +258,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     if published is not None:
         converted = published.read(content, path, averaged)
         config, weights, step, kind = converted.config, converted.weights, converted.step, "published"
-        if converted.elevations is not None:
+        if converted.elevations is not None:  # elevations of its own need a name of its own, as in `build_sensor`
             rings = torch.rad2deg(converted.elevations.double()).tolist()
             config["sensor"] |= {"name": "hdl64e_rings_published", "elevations": rings, "rays": "centre"}
         drawing: Mapping[str, Any] = {"sampler": converted.sampler}

@@ -55,7 +55,7 @@ def test_the_order_of_the_weights_is_torchsparse_s():
     assert down(x).features.flatten().tolist() == [0 * 1 + 4 * 10 + 1 * 100]
 
 
-def test_cells_beside_the_bounding_box_are_no_voxels():
+def test_cells_outside_the_bounding_box_are_not_voxels():
     coords = torch.tensor([[3, 5, 1], [0, 5, 0], [0, 0, 0], [2, 4, 1]])
     grid, where = VoxelGrid(coords), coords.tolist()
     for offset in product((-1, 0, 1), repeat=3):

@@ -1,6 +1,7 @@
 """Frechet distances with known answers."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,8 @@ import torch
 from torch import nn
 
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.frechet import FrechetDistance, add_moments, frechet_distance, merge_moments, moments
-from tests.metrics.conftest import measured, scans_of
+from tests.metrics.conftest import Summary, measured, scans_of
 
 
 def zeros(d):
@@ -99,22 +99,12 @@ def test_random_weights_never_have_the_field_s_name(summary):
 
 
 def test_a_plugin_s_network_is_known_by_its_weights(monkeypatch):
-    class Mine(Extractor):
-        name, layer, dim = "mine", "sum", 1
+    def trained():
+        network = Summary("mine")
+        network.weights, network.scale = "random", nn.Parameter(torch.rand(1))
+        return network
 
-        def __init__(self) -> None:
-            super().__init__()
-            self.scale = nn.Parameter(torch.rand(1))
-
-        def features(self, scans):
-            return self.scale * scans.images.sum((1, 2, 3))[:, None]
-
-        @classmethod
-        def trained(cls):
-            return cls()
-
-    monkeypatch.setattr(EXTRACTORS, "_entries", dict(EXTRACTORS._entries))
-    EXTRACTORS._entries["mine"] = Mine
+    monkeypatch.setattr(EXTRACTORS, "_entries", {"mine": SimpleNamespace(trained=trained)})
     one, other = (FrechetDistance("mine").protocol for _ in range(2))
     assert one.metric == other.metric == "frechet_mine"
     assert one.weights != other.weights

@@ -15,7 +15,6 @@ import json
 import zlib
 from collections.abc import Sequence
 from importlib.resources import files
-from itertools import repeat
 from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
@@ -65,10 +64,10 @@ def page(panels: Sequence[Panel], title: str = "r2flow") -> str:
         assert rays.shape == (2, *images.shape[2:]), f"{caption}: images of {images.shape[2:]}, rays of {rays.shape}"
         angles = np.asarray(rays, dtype=np.float64)
         number, _ = sensors.setdefault(angles.tobytes(), (len(sensors), _described(angles)))
-        numbers = repeat(None) if labels is None else _numbered(labels, classes)
+        numbers = [None] * len(images) if labels is None else _numbered(labels, classes)
         scans.append({
             "caption": printable(caption), "rays": number,
-            "frames": [packed_image(image, step, ids) for image, ids in zip(images, numbers, strict=False)],
+            "frames": [packed_image(image, step, ids) for image, ids in zip(images, numbers, strict=True)],
             "reflectance": images.shape[1] > 1, "labels": labels is not None,
         })  # fmt: skip
     contents = {
