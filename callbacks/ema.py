@@ -10,7 +10,6 @@ from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
 from r2flow.registry import Count, Natural, Portion, Positive, Registry
-from r2flow.systems.gan.losses import half_life_decay
 
 
 def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
@@ -107,9 +106,19 @@ class EMA(WeightAveraging):
             self._raw = []
 
 
+def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:
+    """Decay of the generator's average after step 1, 2, ...: 2^(-B / h), h = min(half_life, rampup B step).
+
+    Half of the average is from the last h images. h grows with the images seen, so that the average is not that of an
+    untrained generator; the first step all but copies the weights (Karras et al. 2020, StyleGAN2-ADA, appendix B).
+    """
+    images = min(half_life, rampup * batch_size * step)
+    return 0.5 ** (batch_size / images) if images > 0 else 0.0
+
+
 class HalfLifeEMA(EMA):
     """EMA of a GAN's generator, updated every step: its half-life is `half_life` images, or a share `rampup` of the
-    images seen so far if that is less (`r2flow.systems.gan.losses.half_life_decay`).
+    images seen so far if that is less (`half_life_decay`).
 
     Args:
         batch_size: Images per step.

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from r2flow.callbacks import HalfLifeEMA
+from r2flow.callbacks.ema import HalfLifeEMA, half_life_decay
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
@@ -24,11 +24,11 @@ from r2flow.model.published import inert
 from r2flow.noise import Draws
 from r2flow.reports.training import read_curves
 from r2flow.samplers import build_sampler
-from r2flow.systems.gan import dcgan, losses, style_gan
+from r2flow.systems.gan import dcgan, style_gan
 from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, affine, coloured, transformed
 from r2flow.systems.gan.dcgan import DustyV1, VanillaGan
 from r2flow.systems.gan.layers import logistic, straight_through_mask
-from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
+from r2flow.systems.gan.stage import Warmup, blurred, discriminator_loss, generator_loss, lazy_adam, r1
 from r2flow.systems.gan.style_gan import DustyV2
 from r2flow.training import build, compose, fit
 from tests.conftest import ROOT, Trap
@@ -177,24 +177,23 @@ def test_rules_of_training(cases: Any):
     case = cases("gan_training_rules.pt")
     ema = case["ema_decay"]
     found = [
-        losses.half_life_decay(step, ema["batch_size"], 1000 * ema["ema_kimg"], ema["rampup"])
-        for step in ema["iteration"]
+        half_life_decay(step, ema["batch_size"], 1000 * ema["ema_kimg"], ema["rampup"]) for step in ema["iteration"]
     ]
     torch.testing.assert_close(torch.tensor(found, dtype=torch.float64), ema["decay"], rtol=1e-6, atol=0)
     for who, every in (("generator", 0), ("discriminator", 16)):
-        rate, betas = losses.lazy_adam(0.002, (0.0, 0.99), every)
+        rate, betas = lazy_adam(0.002, (0.0, 0.99), every)
         assert rate == pytest.approx(case["adam"][who]["lr"], rel=1e-12)
         assert betas == pytest.approx(case["adam"][who]["betas"], rel=1e-12)
     assert case["r1_weight"] == 1.0 * 16 / 2
-    dropout, warmup = case["warmup_dropout"], losses.Warmup()
+    dropout, warmup = case["warmup_dropout"], Warmup()
     left = [warmup.dropout * warmup.left(images) for images in dropout["images"]]
     assert left == pytest.approx(dropout["ratio"], abs=1e-12)
     applied = case["warmup_dropout_apply"]
     uniform = torch.where(applied["keep"] > 0, 0.1, 0.9)  # of which a share of 0.5 is dropped
     assert torch.equal(warmup(applied["x"], 0, uniform), applied["y"])
     blur = case["warmup_blur"]
-    assert_near(losses.blurred(blur["x"], blur["sigma"]), blur["y"], 1e-6)
-    assert torch.equal(losses.Warmup(images=100, blur=1.7)(blur["x"], 100, None), blur["x"])
+    assert_near(blurred(blur["x"], blur["sigma"]), blur["y"], 1e-6)
+    assert torch.equal(Warmup(images=100, blur=1.7)(blur["x"], 100, None), blur["x"])
 
 
 def test_the_average_follows_the_published_trace(cases: Any, monkeypatch: pytest.MonkeyPatch):

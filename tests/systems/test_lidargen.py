@@ -12,8 +12,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project_indices
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.checkpoint import load_checkpoint
-from r2flow.systems.score.generator import Langevin
-from r2flow.systems.score.langevin import annealed_langevin, noise_levels, score_loss, step_sizes
+from r2flow.systems.score.generator import Langevin, annealed_langevin, noise_levels, score_loss, step_sizes
 from r2flow.systems.score.refinenet import InstanceNormPlus, RefineNet
 from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
 

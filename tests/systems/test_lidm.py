@@ -25,21 +25,18 @@ from r2flow.registry import options_of
 from r2flow.runs.composing import CONF
 from r2flow.runs.lineage import Parent
 from r2flow.samplers import Noise, build_sampler
-from r2flow.systems.diffusion.log_snr import square_root_linear
-from r2flow.systems.diffusion.objectives import PREDICTIONS
-from r2flow.systems.diffusion.sampling import noised, walk
-from r2flow.systems.latent.autoencoder import Autoencoder
-from r2flow.systems.latent.discriminator import (
+from r2flow.systems.diffusion.process import PREDICTIONS, noised, square_root_linear, walk
+from r2flow.systems.latent.autoencoder import Autoencoder, Quantiser
+from r2flow.systems.latent.generator import LatentDiffusion, some_of
+from r2flow.systems.latent.published import _autoencoder, _unet
+from r2flow.systems.latent.stage import (
     PatchDiscriminator,
     adaptive_weight,
     adversarial_factor,
     hinge_loss,
     reconstruction_loss,
+    returns,
 )
-from r2flow.systems.latent.generator import LatentDiffusion, some_of
-from r2flow.systems.latent.published import _autoencoder, _unet
-from r2flow.systems.latent.quantiser import Quantiser
-from r2flow.systems.latent.stage import returns
 from r2flow.systems.latent.unet import LatentUNet
 from r2flow.training import check, compose
 from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of

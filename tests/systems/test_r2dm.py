@@ -20,10 +20,18 @@ from r2flow.model.completion import completing
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
-from r2flow.systems.diffusion.generator import Diffusion
-from r2flow.systems.diffusion.log_snr import SCHEDULES, Cosine, alpha_sigma, log_snr_of, straight_time
-from r2flow.systems.diffusion.objectives import PREDICTIONS
-from r2flow.systems.diffusion.sampling import forward_step, noised, repaint, step, walk
+from r2flow.systems.diffusion.generator import Diffusion, log_snr_of, straight_time
+from r2flow.systems.diffusion.process import (
+    PREDICTIONS,
+    SCHEDULES,
+    Cosine,
+    alpha_sigma,
+    forward_step,
+    noised,
+    repaint,
+    step,
+    walk,
+)
 from r2flow.training import compose
 from tests.reference import (
     assert_near,

@@ -13,9 +13,7 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Positive, Share
 from r2flow.samplers import MMPS, Repaint
 from r2flow.samplers.base import Call, Condition, Fresh, Generated, Given, Noise, OnGrid, Steps, last_of
-from r2flow.systems.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
-from r2flow.systems.diffusion.objectives import PREDICTIONS
-from r2flow.systems.diffusion.sampling import repaint, walk
+from r2flow.systems.diffusion.process import PREDICTIONS, SCHEDULES, alpha_sigma, for_images, repaint, walk
 
 
 class Diffusion(NetworkFlow):
@@ -32,8 +30,8 @@ class Diffusion(NetworkFlow):
 
     Args:
         backbone: Name and options, as in conf/backbone.
-        prediction: Meaning of y, a name in `r2flow.systems.diffusion.objectives.PREDICTIONS`.
-        schedule: Name and options of a log-SNR schedule in `r2flow.systems.diffusion.log_snr.SCHEDULES`.
+        prediction: Meaning of y, a name in `r2flow.systems.diffusion.process.PREDICTIONS`.
+        schedule: Name and options of a log-SNR schedule in `r2flow.systems.diffusion.process.SCHEDULES`.
         clip: Clamp expected data to [-clip, clip] in sampling; null: no clamping.
     """
 
@@ -113,3 +111,16 @@ class DDPM(DDIM):
     """Ancestral steps."""
 
     eta: Share = 1.0
+
+
+def straight_time(log_snr: Tensor) -> Tensor:
+    """alpha / (alpha + sigma) = sigmoid(lambda / 2): the time of a straight line from noise to data with equal log-SNR.
+
+    z_t = (alpha + sigma) [s x + (1 - s) eps] with this s, so a diffusion's states, rescaled, are those of a flow.
+    """
+    return torch.sigmoid(log_snr / 2)
+
+
+def log_snr_of(s: Tensor) -> Tensor:
+    """2 ln(s / (1 - s)): lambda of the straight line's time s, the inverse of `straight_time`."""
+    return 2 * torch.logit(s)

@@ -1,22 +1,32 @@
 """Training of diffusion models."""
 
+from collections.abc import Callable
 from typing import Any
 
+import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.generators import Generator
-from r2flow.registry import Positive
+from r2flow.registry import Positive, Registry
 from r2flow.stages.base import Batch, SingleLoss
 from r2flow.systems.diffusion.generator import Diffusion
-from r2flow.systems.diffusion.objectives import ERRORS
-from r2flow.systems.diffusion.sampling import noised
+from r2flow.systems.diffusion.process import noised
+
+Error = Callable[[Tensor, Tensor], Tensor]  # per element
+
+ERRORS: Registry[Error] = Registry(
+    "error of an element",
+    l2=lambda y, target: F.mse_loss(y, target, reduction="none"),
+    l1=lambda y, target: F.l1_loss(y, target, reduction="none"),
+    huber=lambda y, target: F.smooth_l1_loss(y, target, reduction="none"),
+)
 
 
 class LearnDiffusion(SingleLoss):
     """Regression of the prediction y(z_t, lambda_t) at t ~ Uniform[0, 1] (Kingma et al. 2021).
 
     Args:
-        loss: Name in `r2flow.systems.diffusion.objectives.ERRORS`.
+        loss: Name in `ERRORS`.
         min_snr: gamma of the weight min(SNR, gamma) on the error of expected data; None: the SNR, which weights the
             noise's error equally.
         paired: Whether a sample's error has its own weight; False: the batch's mean, as in R2DM's published code.

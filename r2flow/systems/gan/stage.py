@@ -1,18 +1,93 @@
-"""Training of GANs."""
+"""Training of GANs: losses, R1, learning rates, warm-up, and the stage."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from r2flow.generators import Generator
-from r2flow.registry import Count, NonNegative, Portion, Registry, construct
+from r2flow.registry import Count, Natural, NonNegative, Portion, Registry, construct
 from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_gan
 from r2flow.systems.gan.augment import AdaptiveAugment, BatchDraws
 from r2flow.systems.gan.generator import Gan
-from r2flow.systems.gan.losses import Warmup, discriminator_loss, generator_loss, lazy_adam, r1
+from r2flow.systems.gan.layers import DROPPED, Filter
+
+
+def generator_loss(fake: Tensor) -> Tensor:
+    """mean softplus(-D(G(z))) (Goodfellow et al. 2014, section 3, the non-saturating form)."""
+    return softplus(-fake).mean()
+
+
+def discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
+    """mean softplus(-D(x)) + mean softplus(D(G(z))) (Goodfellow et al. 2014, eq. 1, as a loss)."""
+    return softplus(-real).mean() + softplus(fake).mean()
+
+
+def r1(scores: Tensor, x: Tensor) -> Tensor:
+    """mean over images x of |dD/dx|^2, from scores D(x) (Mescheder et al. 2018, eq. 9, without its gamma / 2).
+
+    x, (B, C, H, W), must require a gradient, and the scores have their graph.
+    """
+    (gradient,) = torch.autograd.grad(scores.sum(), x, create_graph=True)
+    return gradient.square().flatten(1).sum(1).mean()
+
+
+def lazy_adam(learning_rate: float, betas: tuple[float, float], every: int) -> tuple[float, tuple[float, float]]:
+    """Adam's learning rate and betas with an additional penalty step every `every` steps.
+
+    With c = every / (every + 1): c times the rate, and betas to the power of c (Karras et al. 2020, StyleGAN2,
+    appendix B). 0 for no such steps.
+    """
+    c = every / (every + 1) if every else 1.0
+    return c * learning_rate, (betas[0] ** c, betas[1] ** c)
+
+
+@dataclass(frozen=True)
+class Warmup:
+    """Decreasing degradation of the discriminator's inputs: dropped pixels and blur.
+
+    Attributes:
+        images: Images seen until nothing is changed any more; 0 for no warm-up.
+        dropout: Share of dropped pixels at the start.
+        blur: sigma of the blur at the start, in pixels.
+    """
+
+    images: Natural = 200_000
+    dropout: Portion = 0.5
+    blur: NonNegative = 0.0
+
+    def left(self, images: int) -> float:
+        """1 at the start, 0 from `images` on, linear between."""
+        return max(1 - images / self.images, 0.0) if self.images else 0.0
+
+    def __call__(self, x: Tensor, images: int, uniform: Tensor | None) -> Tensor:
+        """Degrade x (B, C, H, W) in model space, after a number of images of the run.
+
+        `uniform` has each value's draw in [0, 1); None is enough once the warm-up is over.
+        """
+        left = self.left(images)
+        x = blurred(x, self.blur * left)
+        if uniform is None or self.dropout * left == 0:
+            return x
+        return torch.where(uniform < 1 - self.dropout * left, x, DROPPED)
+
+
+def blurred(x: Tensor, sigma: float) -> Tensor:
+    """x filtered by 2^(-(k / sigma)^2), |k| <= floor(3 sigma), over its sum (Karras et al. 2021, StyleGAN3).
+
+    Circular in azimuth, the edge rows repeated.
+    """
+    reach = math.floor(3 * sigma)
+    if reach == 0:
+        return x
+    taps = torch.exp2(-((torch.arange(-reach, reach + 1) / sigma) ** 2))
+    return Filter(taps.tolist()).to(x.device)(x)
+
 
 DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
     "discriminator", dcgan=dcgan.Discriminator, style_gan=style_gan.Discriminator
@@ -25,7 +100,7 @@ GENERATOR, FAKE, REAL, PENALTY = range(1, 5)  # parts of a step, with separate r
 class LearnGan(Stage):
     """Alternating steps of G and D (on new G(z) and scans), and a step of R1 every `r1_every` steps.
 
-    All that D sees is warmed up (`r2flow.systems.gan.losses.Warmup`) and augmented (`AdaptiveAugment`). Both learn by
+    All that D sees is warmed up (`Warmup`) and augmented (`AdaptiveAugment`). Both learn by
     Adam at a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is
     r1 r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's. The log has the probability of
     augmentation after each step (`train/augmented`) and R1 when it was last measured (`train/last_r1`).

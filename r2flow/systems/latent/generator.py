@@ -13,9 +13,7 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Bound, Count, construct
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.diffusion.generator import DDIM, Share
-from r2flow.systems.diffusion.log_snr import square_root_linear
-from r2flow.systems.diffusion.objectives import PREDICTIONS
-from r2flow.systems.diffusion.sampling import walk
+from r2flow.systems.diffusion.process import PREDICTIONS, square_root_linear, walk
 from r2flow.systems.latent.autoencoder import Autoencoder
 from r2flow.systems.latent.unet import LatentUNet
 
@@ -48,7 +46,7 @@ class LatentDiffusion(Generator):
     Args:
         autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
         unet: Options of `r2flow.systems.latent.unet.LatentUNet`; `position: learnable` is LiDM + APE.
-        beta_first, beta_last: Arguments of `r2flow.systems.diffusion.log_snr.square_root_linear`.
+        beta_first, beta_last: Arguments of `r2flow.systems.diffusion.process.square_root_linear`.
         diffusion_steps: N.
     """
 

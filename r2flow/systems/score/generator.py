@@ -1,20 +1,85 @@
-"""Score-based generators: LiDARGen."""
+"""LiDARGen's generator: scores at decreasing noise levels, and annealed Langevin dynamics.
 
-from collections.abc import Mapping
+Song and Ermon 2019, "Generative modeling by estimating gradients of the data distribution", and 2020, "Improved
+techniques for training score-based generative models". The score s(x, i) is the gradient by x of the log density of
+data plus noise of standard deviation sigma_i.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from r2flow.backbones.layers import halved
+from r2flow.errors import check
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator, parts_of
 from r2flow.lidar.space import ModelSpace
-from r2flow.registry import Count, Positive
+from r2flow.registry import Count, Positive, Registry
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
-from r2flow.systems.score.langevin import annealed_langevin, noise_levels
 from r2flow.systems.score.refinenet import RefineNet
+
+Score = Callable[[Tensor, Tensor], Tensor]
+"""s(x, i): maps images (B, C, H, W) and their noise-level indices, (B,) int64, to (B, C, H, W)."""
+
+SPACINGS: Registry[Callable[[float, float, int], np.ndarray]] = Registry(
+    "spacing of noise levels", geometric=np.geomspace, uniform=np.linspace
+)
+
+
+def noise_levels(first: float, last: float, levels: int, spacing: str = "geometric") -> Tensor:
+    """sigma_0 = first > ... > sigma_{L-1} = last, (levels,) float32."""
+    check(last <= first, f"noise levels fall from {first:g} and cannot reach {last:g}.")
+    return torch.from_numpy(SPACINGS[spacing](first, last, levels).astype(np.float32))
+
+
+def step_sizes(sigmas: Tensor, rate: float) -> Tensor:
+    """e_i = rate (sigma_i / sigma_{L-1})^2, (L,), which gives each level the same signal-to-noise ratio per step."""
+    return rate * (sigmas / sigmas[-1]).square()
+
+
+def score_loss(score: Score, x: Tensor, noise: Tensor, labels: Tensor, sigmas: Tensor, power: float = 2.0) -> Tensor:
+    """Denoising score matching, sigma^power / 2 |s(x + sigma n, i) + n / sigma|^2 of each image, (B,).
+
+    Power 2 weights all levels equally (2019, eq. 6). Noise n is standard normal, labels i are (B,) int64.
+    """
+    sigma = sigmas[labels][:, None, None, None]
+    error = score(x + sigma * noise, labels) + noise / sigma
+    return error.square().flatten(1).sum(1) * sigmas[labels] ** power / 2
+
+
+def annealed_langevin(
+    score: Score,
+    x: Tensor,
+    sigmas: Tensor,
+    noise: Callable[[int], Tensor],
+    rate: float = 6.2e-6,
+    steps: int = 5,
+    pull: Callable[[Tensor], Tensor] = torch.zeros_like,
+) -> Iterator[Tensor]:
+    """Yield the states of annealed Langevin dynamics (2019, algorithm 1) after each evaluation of the score.
+
+    `steps` times at each level i, from the first to the last: x <- x + e_i s(x, i) + sqrt(2 e_i) z with e_i of
+    `step_sizes` and z = noise(k), k = 1, 2, ... counted over all levels. A last step removes the remaining noise (2020,
+    section 3.3): x <- x + sigma_{L-1}^2 s(x, L-1).
+
+    `pull`, the likelihood gradient as a function of the state before a step, is added in every step. As in LiDARGen,
+    the last denoising adds the previous pull again, and the final state is pulled once more.
+    """
+    number = 0
+    for level, size in enumerate(step_sizes(sigmas, rate).tolist()):
+        labels = torch.full((len(x),), level, device=x.device)
+        for _ in range(steps):
+            number += 1
+            pulled = pull(x)
+            x = x + size * score(x, labels) + math.sqrt(2 * size) * noise(number) + pulled
+            yield x
+    x = x + sigmas[-1].square() * score(x, labels) + pulled
+    yield x + pull(x)
 
 
 class ScoreModel(Generator):
@@ -25,10 +90,10 @@ class ScoreModel(Generator):
     `steps` are per noise level. A condition pulls the scan to the known rays: densification.
 
     Args:
-        rate: Rate of `r2flow.systems.score.langevin.step_sizes`.
+        rate: Rate of `step_sizes`.
         pull: Strength of the pull to known pixels per step.
         width: Width of the network, see `RefineNet`.
-        sigma_first, sigma_last, levels, spacing: The noise levels, see `r2flow.systems.score.langevin.noise_levels`.
+        sigma_first, sigma_last, levels, spacing: The noise levels, see `noise_levels`.
     """
 
     told = True

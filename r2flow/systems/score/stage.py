@@ -8,12 +8,11 @@ from torch import Tensor
 from r2flow.generators import Generator
 from r2flow.registry import NonNegative
 from r2flow.stages.base import Batch, SingleLoss
-from r2flow.systems.score.generator import ScoreModel
-from r2flow.systems.score.langevin import score_loss
+from r2flow.systems.score.generator import ScoreModel, score_loss
 
 
 class MatchScore(SingleLoss):
-    """Denoising score matching at all noise levels alike (`r2flow.systems.score.langevin.score_loss`).
+    """Denoising score matching at all noise levels alike (`r2flow.systems.score.generator.score_loss`).
 
     Args:
         power: Exponent of sigma in the weight of each level.
