@@ -29,16 +29,16 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     mmd_lidm=lazy(f"{__name__}.lidm:MMDLiDM"),
     panel=lazy(f"{__name__}.panel:Panel"),
     things=lazy(f"{__name__}.things:Things"),
-    auc=lazy(f"{__name__}.two_sample:TwoSample", "handcrafted"),
-    auc_range=lazy(f"{__name__}.two_sample:TwoSample", "handcrafted_range"),
+    auc=lazy(f"{__name__}.features:TwoSample", "handcrafted"),
+    auc_range=lazy(f"{__name__}.features:TwoSample", "handcrafted_range"),
 )
 
 
 def add_network(name: str) -> None:
     """Register a network's metrics: Frechet distance, kernel distance, precision and recall."""
     METRICS.add(FIELD_NAMES.get(name, f"frechet_{name}"), lazy(f"{__name__}.frechet:FrechetDistance", name))
-    METRICS.add(f"kid_{name}", lazy(f"{__name__}.kid:KernelDistance", name))
-    METRICS.add(f"manifold_{name}", lazy(f"{__name__}.manifold:Manifold", name))
+    METRICS.add(f"kid_{name}", lazy(f"{__name__}.features:KernelDistance", name))
+    METRICS.add(f"manifold_{name}", lazy(f"{__name__}.features:Manifold", name))
 
 
 for _network in EXTRACTORS:

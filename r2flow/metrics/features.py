@@ -1,16 +1,24 @@
-"""Metrics on a network's features of scans."""
+"""Metrics on a network's features of scans: kernel distance, precision and recall, classifier two-sample test."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import Protocol, ScanMetric
+from r2flow.metrics.base import SIDES, Protocol, ScanMetric, Side, blocks
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.extractors.weights import weights_hash
 from r2flow.metrics.scans import Scans
+
+BLOCK = 2000  # scans per block: a kernel or matrix of distances takes 32 MB
+NEIGHBOURS = 5  # k of `Manifold`
+TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
+NAMES = ("precision", "recall", "density", "coverage")
+RIDGE = 1.0  # L2 penalty of `TwoSample` on the weights of standardised features
+STEPS = 25  # iterations of Newton's method
+SAME = 1e-5  # relative tolerance of equal scores
 
 
 class FeatureMetric(ScanMetric):
@@ -45,3 +53,155 @@ class FeatureMetric(ScanMetric):
             with torch.no_grad():
                 scans.features[key] = network.features(scans)
         return scans.features[key]
+
+
+class KernelDistance(FeatureMetric):
+    """Unbiased estimate of squared MMD with a cubic kernel, the KID of Binkowski et al. (2018).
+
+    MMD^2 = mean_{i != j} k(x_i, x_j) + mean_{i != j} k(y_i, y_j) - 2 mean k(x_i, y_j), k(a, b) = (a . b / D + 1)^3 on D
+    features. The expectation does not depend on the number of scans; values may be negative. The usual mean over random
+    subsets of 1000 scans is replaced by the exact mean over all subsets.
+    """
+
+    kind = "kid"
+    settings: ClassVar[Mapping[str, Any]] = {"kernel": "(a b / D + 1)^3", "estimate": "unbiased, all pairs"}
+    keeping = True
+    resamples = False  # repeated scans would form pairs of equal scans and bias the estimate
+
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+        x, y = (self.kept(side) for side in SIDES)
+        return {self.name: _mean(x, x) + _mean(y, y) - 2 * _mean(x, y)}
+
+
+def _mean(x: Tensor, y: Tensor) -> Tensor:
+    """Mean of k - 1 over all pairs of two sets, which cancels the 1 in MMD^2; if x is y, without pairs of a scan with
+    itself."""
+    total = x.new_zeros((), dtype=torch.float64)
+    for i, a in blocks(x, BLOCK):
+        for j, b in blocks(y, BLOCK):
+            z = a @ b.T / x.shape[1]
+            kernel = z * (3 + z * (3 + z))  # (z + 1)^3 - 1
+            total += kernel.sum() - (kernel.trace() if x is y and i == j else 0)
+    return total / (len(x) * (len(y) - (x is y)))
+
+
+class Manifold(FeatureMetric):
+    """Precision, recall, density and coverage of generated scans in a network's feature space.
+
+    A set is represented by balls around its scans, with the distance to the k-th nearest neighbour in the set as
+    radius. Kynkaanniemi et al. (2019): precision is the share of generated scans inside a real ball, recall the share
+    of real scans inside a generated ball. Naeem et al. (2020): density is the mean number of real balls that contain a
+    generated scan, over k (it may exceed 1 and is robust to outliers), coverage the share of real balls that contain a
+    generated scan.
+
+    There are no bootstrap intervals: balls around repeated scans have radius 0, and with fixed balls, 95 % intervals
+    had a coverage of 76 to 81 %.
+
+    The values are named `precision_<network>` and so on.
+    """
+
+    kind = "manifold"
+    settings: ClassVar[Mapping[str, Any]] = {"neighbours": NEIGHBOURS, "distance": "Euclidean"}
+    keeping = True
+    resamples = False
+
+    def figures(self) -> tuple[dict[str, float], list[str]]:
+        names = [f"{name}_{self.name.removeprefix('manifold_')}" for name in NAMES]
+        few = [side for side in SIDES if self.count(side) <= NEIGHBOURS]
+        if few:
+            remark = f"{self.name}: too few {' and '.join(few)} scans to have {NEIGHBOURS} neighbours each."
+            return dict.fromkeys(names, float("nan")), [remark]
+        real, generated = self.kept("real"), self.kept("generated")
+        middle = real[:BLOCK].double().mean(0)
+        in_real, in_generated = (radii(rows, NEIGHBOURS, middle) * (1 + TIE) for rows in (real, generated))
+        balls = torch.zeros(len(generated), dtype=torch.float64)
+        recalled, covered = (torch.zeros(len(real), dtype=torch.bool) for _ in range(2))
+        for i, x in blocks(real, BLOCK):
+            for j, y in blocks(generated, BLOCK):
+                d = squared_distances(x - middle, y - middle)
+                within = d <= in_real[i, None]
+                balls[j] += within.sum(0)
+                covered[i] |= within.any(1)
+                recalled[i] |= (d <= in_generated[j]).any(1)
+        values = (balls > 0, recalled, balls / NEIGHBOURS, covered)
+        return {name: float(value.double().mean()) for name, value in zip(names, values, strict=True)}, []
+
+
+def radii(rows: Tensor, k: int, middle: Tensor) -> Tensor:
+    """Squared distance of each row to its k-th nearest neighbour, (N,); `middle` is subtracted for accuracy."""
+    squared = []
+    for i, x in blocks(rows, BLOCK):
+        nearest = torch.full((len(x), k), torch.inf, dtype=torch.float64)
+        for j, y in blocks(rows, BLOCK):
+            d = squared_distances(x - middle, y - middle)
+            if i == j:
+                d.fill_diagonal_(torch.inf)
+            nearest = torch.cat([nearest, d], 1).topk(k, largest=False).values
+        squared.append(nearest.amax(1))
+    return torch.cat(squared)
+
+
+def squared_distances(x: Tensor, y: Tensor) -> Tensor:
+    """|x - y|^2 of all pairs, (N, M), by matrix products; rounding errors of equal rows are set to 0."""
+    size = x.square().sum(1)[:, None] + y.square().sum(1)
+    d = size - 2 * x @ y.T
+    return d.masked_fill_(d <= 1e-12 * size, 0)
+
+
+class TwoSample(FeatureMetric):
+    """Area under the ROC curve of a logistic regression between two sets (Lopez-Paz and Oquab 2017).
+
+    Each contiguous half of both sets is scored by the classifier trained on the other half, so that neighbouring scans
+    of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always distinguished. The interval resamples
+    the scored scans for these two classifiers: it contains the mean over new sets of 30 to 100 scans in 70 to 86 %.
+    """
+
+    kind = "auc"
+    names: ClassVar[Mapping[str, str]] = {"handcrafted": "auc", "handcrafted_range": "auc_range"}
+    settings: ClassVar[Mapping[str, Any]] = {"classifier": "logistic regression, ridge 1", "folds": "two halves"}
+    keeping = True
+    fewest = 4  # two to train on, two to test
+    highest = 1.0
+
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+        real, generated = (self.kept(side).double() for side in SIDES)
+        areas = []
+        for turn in (1, -1):
+            (learn_real, judge_real), (learn_made, judge_made) = (_halves(len(x))[::turn] for x in (real, generated))
+            score = _classifier(real[learn_real], generated[learn_made])
+            areas.append(
+                area(
+                    score(real[judge_real]), score(generated[judge_made]),
+                    weights["real"][:, judge_real], weights["generated"][:, judge_made],
+                )
+            )  # fmt: skip
+        return {self.name: torch.stack(areas).mean(0)}
+
+
+def area(negative: Tensor, positive: Tensor, weights: Tensor, others: Tensor) -> Tensor:
+    """P(positive > negative) + P(equal) / 2, (R,), for scores (N,) and (M,) with weights (R, N) and (R, M)."""
+    difference = positive[None] - negative[:, None]
+    equal = difference.abs() < SAME * (1 + positive.abs())  # features of a scan differ by rounding between batches
+    above = torch.where(equal, 0.5, (difference > 0).double())
+    return ((weights @ above) * others).sum(1) / (weights.sum(1) * others.sum(1))
+
+
+def _halves(count: int) -> tuple[slice, slice]:
+    return slice(0, count // 2), slice(count // 2, count)
+
+
+def _classifier(real: Tensor, generated: Tensor) -> Callable[[Tensor], Tensor]:
+    """Fit a logistic regression to two sets of equal total weight; return its score function, (N, D) to (N,)."""
+    x = torch.cat([real, generated])
+    centre, spread = x.mean(0), x.std(0).clamp(min=1e-9)
+    x = torch.cat([(x - centre) / spread, x.new_ones(len(x), 1)], 1)
+    y = torch.cat([x.new_zeros(len(real)), x.new_ones(len(generated))])
+    each = torch.cat([x.new_full((len(part),), len(y) / 2 / len(part)) for part in (real, generated)])
+    ridge = torch.eye(x.shape[1], dtype=x.dtype) * RIDGE
+    ridge[-1, -1] = 1e-9
+    w = x.new_zeros(x.shape[1])
+    for _ in range(STEPS):
+        p = (x @ w).sigmoid()
+        curvature = (x * (each * p * (1 - p))[:, None]).mT @ x + ridge
+        w = w - torch.linalg.solve(curvature, x.mT @ (each * (p - y)) + ridge @ w)
+    return lambda rows: torch.cat([(rows - centre) / spread, rows.new_ones(len(rows), 1)], 1) @ w

@@ -8,11 +8,9 @@ import torch
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors import EXTRACTORS, pointnet
-from r2flow.metrics.extractors.minkowski import MinkowskiNet
 from r2flow.metrics.extractors.pointnet import PointNet
 from r2flow.metrics.extractors.rangenet import RangeNet21, RangeNet53, translate
-from r2flow.metrics.extractors.spvcnn import SPVCNN
-from r2flow.metrics.extractors.voxels import mean_by_distance, voxelise
+from r2flow.metrics.extractors.voxels import SPVCNN, MinkowskiNet, mean_by_distance, voxelise
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import untrained
 from tests.reference import load_case

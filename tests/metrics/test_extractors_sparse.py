@@ -4,9 +4,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from r2flow.metrics.extractors.minkowski import MinkowskiNet
 from r2flow.metrics.extractors.sparse import Sparse, SparseConv3d, VoxelGrid, offsets
-from r2flow.metrics.extractors.spvcnn import SPVCNN
+from r2flow.metrics.extractors.voxels import SPVCNN, MinkowskiNet
 
 
 def occupied(size: int, share: float) -> tuple[torch.Tensor, ...]:

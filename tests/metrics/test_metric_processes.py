@@ -11,8 +11,8 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics.bootstrap import bootstrap
 from r2flow.metrics.extractors import EXTRACTORS
+from r2flow.metrics.features import Manifold
 from r2flow.metrics.frechet import FrechetDistance
-from r2flow.metrics.manifold import Manifold
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import scans_of
 

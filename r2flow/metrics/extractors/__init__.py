@@ -28,6 +28,6 @@ EXTRACTORS = Extractors(
     rangenet53=lazy(f"{__name__}.rangenet:RangeNet53"),
     rangenet21=lazy(f"{__name__}.rangenet:RangeNet21"),
     pointnet=lazy(f"{__name__}.pointnet:PointNet"),
-    minkowskinet=lazy(f"{__name__}.minkowski:MinkowskiNet"),
-    spvcnn=lazy(f"{__name__}.spvcnn:SPVCNN"),
+    minkowskinet=lazy(f"{__name__}.voxels:MinkowskiNet"),
+    spvcnn=lazy(f"{__name__}.voxels:SPVCNN"),
 )

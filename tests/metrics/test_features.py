@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.metrics import METRICS, kid, manifold
-from r2flow.metrics.kid import KernelDistance
-from r2flow.metrics.manifold import Manifold
-from r2flow.metrics.two_sample import area
+from r2flow.metrics import METRICS, features
+from r2flow.metrics.features import KernelDistance, Manifold, area
 from tests.metrics.conftest import Summary, given
 
 
@@ -36,8 +34,8 @@ def brute_force(real, generated, k):
 
 @pytest.mark.parametrize(("k", "block"), [(1, 7), (3, 2000), (5, 10)])
 def test_as_pair_by_pair(k, block, monkeypatch):
-    monkeypatch.setattr(manifold, "BLOCK", block)
-    monkeypatch.setattr(manifold, "NEIGHBOURS", k)
+    monkeypatch.setattr(features, "BLOCK", block)
+    monkeypatch.setattr(features, "NEIGHBOURS", k)
     draw = np.random.default_rng(k)
     real, generated = draw.normal(size=(31, 3)).astype("f4"), draw.normal(0.7, 0.6, size=(24, 3)).astype("f4")
     found = figures(real, generated)
@@ -50,7 +48,7 @@ def test_repeated_scans_lie_on_each_other_however_far_from_zero():
     # Every ball has the radius 0, and holds the six that are one: density 6 / 5.
     assert figures(rows, rows) == pytest.approx([1, 1, 6 / 5, 1])
     x = torch.from_numpy(rows)
-    assert not manifold.squared_distances(x, x).diagonal().any()  # where two ways to add up are rounded differently
+    assert not features.squared_distances(x, x).diagonal().any()  # where two ways to add up are rounded differently
 
 
 def test_the_kernel_distance_of_two_gaussians_is_that_of_their_moments():
@@ -68,7 +66,7 @@ def test_the_kernel_distance_is_the_mean_over_all_subsets_in_blocks_of_any_size(
     sides = [list(combinations(range(len(rows)), 3)) for rows in (real, generated)]
     expected = np.mean([kernel_distance(real[list(a)], generated[list(b)]) for a, b in product(*sides)])
     for block in (2, 1000):
-        monkeypatch.setattr(kid, "BLOCK", block)
+        monkeypatch.setattr(features, "BLOCK", block)
         assert kernel_distance(real, generated) == pytest.approx(expected, rel=1e-9)
 
 
