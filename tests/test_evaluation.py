@@ -17,10 +17,18 @@ from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.comparing import with_equal_panels
-from r2flow.evaluation.measuring import MetricResult, Work, gather_real, measure, real_rule
-from r2flow.evaluation.references import reference_sets
-from r2flow.evaluation.sets import sampled_set
-from r2flow.evaluation.statistics import FORMAT, Cache, Statistics, key_of
+from r2flow.evaluation.measuring import (
+    FORMAT,
+    Cache,
+    MetricResult,
+    Statistics,
+    Work,
+    gather_real,
+    key_of,
+    measure,
+    real_rule,
+)
+from r2flow.evaluation.sets import reference_sets, sampled_set
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -75,7 +83,7 @@ class TestCache:
         changes = {"reflectance": False}, {"projection": "unfolding"}, {"convention": "reference"}
         keys += [key(reading=Reading(SENSOR, **one)) for one in (*changes, {"reflectance_scale": 2})]
         keys.append(key_of(JSD(), open_scans(str(real), READING, num=7), "all"))
-        monkeypatch.setattr("r2flow.evaluation.statistics.FORMAT", FORMAT + 1)
+        monkeypatch.setattr("r2flow.evaluation.measuring.FORMAT", FORMAT + 1)
         keys.append(key())
         monkeypatch.undo()
         plugin = tmp_path / "plugin.py"
@@ -226,7 +234,7 @@ def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path, monk
     assert [len(one) for one in found["generated, as many"]] == [4, 5]
     sampled = sampled_set(flow(), "flow", 8)
     assert len(reference_sets(real, {"flow": sampled})["flow, as many"][1]) == 5
-    monkeypatch.setattr("r2flow.evaluation.references.AGAIN", 4)
+    monkeypatch.setattr("r2flow.evaluation.sets.AGAIN", 4)
     assert "flow, as many" not in reference_sets(real, {"flow": sampled})
     assert [sorted({name.split("/")[1][17:21] for name in one.source.names}) for one in found["real drives"]] == [
         ["0003"], ["0004"]

@@ -167,9 +167,8 @@ def _compare(
     """Compare all sets; the first process prints and writes the results."""
     from r2flow.evaluation.comparing import Comparer, pairs_of, with_equal_panels
     from r2flow.evaluation.copies import Nearest, find_nearest, with_copies
-    from r2flow.evaluation.measuring import Work
+    from r2flow.evaluation.measuring import Cache, Work
     from r2flow.evaluation.protocols import PROTOCOLS
-    from r2flow.evaluation.statistics import Cache
     from r2flow.processes import place
     from r2flow.reports.evaluation import evaluation_page, print_comparisons
     from r2flow.reports.pages import write_json, write_page

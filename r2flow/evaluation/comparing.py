@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Literal
 
 from r2flow.data.sets import ScanSet
-from r2flow.evaluation.measuring import MetricResult, Work, gather_real, measure, speed_result
+from r2flow.evaluation.measuring import Cache, MetricResult, Statistics, Work, gather_real, measure, speed_result
 from r2flow.evaluation.protocols import Rules
-from r2flow.evaluation.references import baseline_sets, reference_sets
-from r2flow.evaluation.statistics import Cache, Statistics
+from r2flow.evaluation.sets import baseline_sets, reference_sets
 from r2flow.files import read_json, write_file
 from r2flow.metrics.base import ScanMetric
 from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, Panel, mean_distance

@@ -21,7 +21,7 @@ from r2flow.data.sets import ScanSet
 from r2flow.errors import check
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.measuring import MetricResult, Work, bar
-from r2flow.evaluation.references import HALVES
+from r2flow.evaluation.sets import HALVES
 from r2flow.lidar.encoding import Encoding
 from r2flow.metrics.base import Protocol
 from r2flow.metrics.scans import Scans

@@ -1,6 +1,7 @@
-"""Sets of scans sampled from a generator on access."""
+"""Sets of scans to measure: sampled from a generator on access; real references; baselines made without a model."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
@@ -9,13 +10,20 @@ from torch import Tensor
 
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import MadeScans
+from r2flow.errors import check
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.sensors import Sensor
 from r2flow.model.checkpoint import Checkpoint, checkpoints_of, weights_hash
 from r2flow.model.sampling import draw
 from r2flow.models import MODELS
+from r2flow.noise import generator, standard_normal
 
 CHECKPOINTS = (".ckpt", ".pth", ".safetensors")
+LEARNED_FROM = 200  # number of evenly spaced real scans behind the mean and shuffled pixels
+AGAIN = 100  # largest half of the real scans for which a model is sampled again
+HALVES, AS_MANY = "real halves", ", as many"  # names, of a judged set as suffix
 
 
 def is_checkpoint(text: str) -> bool:
@@ -78,3 +86,81 @@ class SampledScans(MadeScans):
         self.evaluations += batch.evaluations.tolist()
         self.unsolved += int((~batch.converged).sum())
         return batch.images.nan_to_num(0.0)
+
+
+def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None) -> dict[str, tuple[ScanSet, ScanSet]]:
+    """Pairs of real sets, as lower references for a generator's distance: two halves, and two drives if any.
+
+    Halves are contiguous blocks: neighbouring scans of a drive are near-duplicates, and random halves would share
+    places. The two drives are the largest. Distances decrease with the number of scans; generated scans are therefore
+    also compared with the first half, limited to the size of the second half. Models are sampled again for that, if the
+    half has at most `AGAIN` scans.
+    """
+    count = len(real)
+    check(count >= 2, f"{real.label} has {count} scan; --reference needs at least two real ones.")
+    half, other = real.part(range(count // 2), "first half"), real.part(range(count // 2, count), "second half")
+    pairs = {HALVES: (half, other)}
+    for name, scans in (generated or {}).items():
+        if len(scans) >= len(other) and (len(other) <= AGAIN or not scans.source.drawn):
+            pairs[f"{name}{AS_MANY}"] = half, scans.limited(len(other))
+    largest = sorted(real.drives, key=lambda drive: -len(real.drives[drive]))[:2]
+    if len(largest) == 2:
+        a, b = (real.part(list(real.drives[drive]), f"drive {drive}") for drive in sorted(largest))
+        pairs["real drives"] = a, b
+    return pairs
+
+
+class Baseline(MadeScans):
+    """Scans (2 or 1, H, W) of the baseline `word` of `BASELINES`; `training` are real scans, (N, 2 or 1, H, W)."""
+
+    def __init__(self, word: str, training: np.ndarray, sensor: Sensor, numbers: Sequence[int], seed: int = 0) -> None:
+        self.word, self.training, self.sensor, self.numbers, self.seed = word, training, sensor, numbers, seed
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        return BASELINES[self.word](self, self.numbers[index])
+
+    def about(self) -> dict[str, object]:
+        return {"kind": "baseline", "seed": self.seed, "reflectance": self.training.shape[1] > 1}
+
+    def noise(self, number: int) -> np.ndarray:
+        """Decoded x_0 ~ N(0, I)."""
+        encoding = Encoding(self.sensor, reflectance=self.training.shape[1] > 1)
+        return encoding.decode(standard_normal(self.training.shape[1:], self.seed, "evaluation", number)).numpy()
+
+    def flat_ground(self, number: int) -> np.ndarray:
+        """r = -height / sin e within the sensor's range limits."""
+        e = self.sensor.rays()[0].numpy().astype(np.float64)
+        r = np.where(e < 0, -self.sensor.height / np.sin(np.minimum(e, -1e-6)), 0)
+        r = np.where((r >= self.sensor.min_range) & (r <= self.sensor.max_range), r, 0)
+        return np.stack([r, 0.3 * (r > 0)])[: self.training.shape[1]].astype(np.float32)
+
+    @cached_property
+    def _mean(self) -> np.ndarray:
+        returned = self.training[:, 0] > 0
+        mean = self.training.sum(0) / np.maximum(returned.sum(0), 1)
+        return np.where(returned.mean(0) > 0.5, mean, 0).astype(np.float32)
+
+    def mean_scan(self, number: int) -> np.ndarray:
+        """Mean of the training scans, at pixels where more than half of them return."""
+        return self._mean
+
+    def shuffled_pixels(self, number: int) -> np.ndarray:
+        """Each pixel from a random training scan."""
+        rows, columns = np.indices(self.sensor.shape)
+        scan = generator(self.seed, "shuffle", number).integers(len(self.training), size=self.sensor.shape)
+        return np.moveaxis(self.training[scan, :, rows, columns], -1, 0)
+
+
+BASELINES = {
+    "noise": Baseline.noise,
+    "flat ground": Baseline.flat_ground,
+    "mean scan": Baseline.mean_scan,
+    "shuffled pixels": Baseline.shuffled_pixels,
+}
+
+
+def baseline_sets(real: ScanSet, num: int) -> dict[str, ScanSet]:
+    """Each baseline as a set of `num` scans, computed from a subset of the real scans."""
+    subset = real.spread(LEARNED_FROM)
+    training = np.concatenate([batch.numpy() for batch in subset.batches(range(len(subset)), 8)])
+    return {name: ScanSet(name, Baseline(name, training, real.sensor, range(num)), real.sensor) for name in BASELINES}

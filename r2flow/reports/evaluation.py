@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
-from r2flow.evaluation.references import AS_MANY, HALVES
+from r2flow.evaluation.sets import AS_MANY, HALVES
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.pictures import draw_range
 from r2flow.reports.tables import print_table, shown, table

@@ -7,7 +7,7 @@ import torch
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet
-from r2flow.evaluation.references import BASELINES, Baseline
+from r2flow.evaluation.sets import BASELINES, Baseline
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics import panel as lines
