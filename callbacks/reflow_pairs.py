@@ -3,8 +3,8 @@
 import lightning as L
 
 from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.pairs import make_pairs
 from r2flow.model.checkpoint import load_checkpoint
-from r2flow.reports.pairs import make_and_tell
 
 
 class ReflowPairs(L.Callback):
@@ -21,6 +21,5 @@ class ReflowPairs(L.Callback):
         data = trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, ScanDataModule) or data.pairs is None or self.of is None:
             return
-        store, device, flow = data.pair_store, trainer.strategy.root_device, load_checkpoint(self.of)
         # File locks, not a barrier: collective calls time out after half an hour, and a slow rank may take longer.
-        make_and_tell(store, flow, device)
+        make_pairs(data.pair_store, load_checkpoint(self.of).generator.to(trainer.strategy.root_device))

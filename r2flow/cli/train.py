@@ -46,9 +46,8 @@ def pairs(
     --sampler dopri5. chord or renoise samples a flow map in several jumps, as targets for its first jump.
     """
     from r2flow.data.options import PairOptions
-    from r2flow.data.pairs import PairStore, default_folder
+    from r2flow.data.pairs import PairStore, default_folder, make_pairs
     from r2flow.model.checkpoint import load_checkpoint, weights_hash
-    from r2flow.reports.pairs import make_and_tell
     from r2flow.runs.lineage import check_finished, pairs_of
 
     where = choose_device(device)
@@ -65,7 +64,7 @@ def pairs(
     }  # fmt: skip
     chosen = PairOptions(**pairs_of(flow, options, weights_hash(flow)))
     store = PairStore(out or default_folder(flow.path), chosen, flow.encoding.shape, flow.generator.noise_shape)
-    make_and_tell(store, flow, where, wait=False)
+    make_pairs(store, flow.generator.to(where), wait=False)
     if missing := store.missing_pairs():
         print(f"{store.folder}: other processes are still generating about {missing} of {num} pairs")
     else:

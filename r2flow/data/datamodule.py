@@ -13,8 +13,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow.data.augment import Augmentation
-from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler
-from r2flow.data.mixture import MixedOrder, Mixture
+from r2flow.data.loader import FlowDataset, Further, Item, MixedOrder, Mixture, Permutations, RunLoader, RunSampler
 from r2flow.data.opening import open_source
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
 from r2flow.data.pairs import PairDataset, PairSource, PairStore
@@ -125,7 +124,7 @@ class ScanDataModule(L.LightningDataModule):
         reading = Reading.of({**options.chosen, **images, "sensor": (sensor or self.sensor).described()})
         return open_source(options, reading, self.seed, first_scene)
 
-    def _order(self, source: Mixture | PairSource) -> Order:
+    def _order(self, source: Mixture | PairSource) -> MixedOrder | Permutations:
         """Order of the scans: maps image k of the run to a scan."""
         weights = [part.weight for part in self.parts if part.weight is not None]
         if isinstance(source, Mixture) and len(weights) > 1:

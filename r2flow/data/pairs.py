@@ -2,9 +2,10 @@
 
 import copy
 import math
+import os
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from r2flow.generators import Generated, Generator, as_flow
 from r2flow.generators.base import autocast
 from r2flow.models import name_of
 from r2flow.processes import place
+from r2flow.progress import Bar
 from r2flow.samplers import build_sampler
 from r2flow.store import Damaged, Store
 
@@ -93,18 +95,12 @@ class Made:
     seconds: float = 0.0
 
 
-def make_pairs(
-    store: PairStore,
-    generator: Generator,
-    progress: Callable[[Made], None] = lambda made: None,
-    wait: bool = True,
-) -> Made:
-    """Make the missing or damaged pairs of a store; `wait`: await those that others are making.
+def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> Made:
+    """Make the missing or damaged pairs of a store, with a progress bar; `wait`: await those that others are making.
 
     x_1 is the generator's sample for x_0 = `store.noise`, neither clamped nor snapped, in half precision. With `chord`
     or `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function
     of (seed, index, step). Batches do not depend on the process: shards are byte-identical for any number of processes.
-    `progress` is called after each batch.
     """
     if generator.noise_shape != store.noise_shape:
         raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")
@@ -123,7 +119,7 @@ def make_pairs(
             made.evaluations += int(batches[-1]["evaluations"].sum())
             made.unusable += int((~batches[-1]["usable"]).sum())
             made.seconds = time.monotonic() - start
-            progress(made)
+            bar.set(made.pairs)
             if made.unusable == made.pairs and (made.pairs > 64 or batch == store.batches_of(shard)[-1]):
                 raise InputError(
                     f"none of {made.pairs} pairs came to an end with sampler {sampler.name}: the flow is broken, or "
@@ -133,12 +129,18 @@ def make_pairs(
         usable = tensors.pop("usable").astype(int).tolist()
         store.write(shard, tensors, {"usable": usable})
 
-    store.begin()
-    rank, ranks = place()  # of a run, whose processes verify a part each
-    store.mend(store.shards[rank::ranks])
-    missing = store.missing(store.shards)
-    random.Random().shuffle(missing)  # processes rarely meet, also where locks do not reach other machines
-    store.make(missing, make_shard, wait=wait)
+    with Bar("drawing", store.missing_pairs(), "pairs", lines="WORLD_SIZE" in os.environ) as bar:
+        store.begin()
+        rank, ranks = place()  # of a run, whose processes verify a part each
+        store.mend(store.shards[rank::ranks])
+        missing = store.missing(store.shards)
+        random.Random().shuffle(missing)  # processes rarely meet, also where locks do not reach other machines
+        store.make(missing, make_shard, wait=wait)
+    if made.pairs:
+        unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
+        rate, cost = made.pairs / made.seconds, made.evaluations / made.pairs
+        drawn = f"{made.pairs} pairs drawn in whole batches"
+        print(f"{drawn}, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
     return made
 
 

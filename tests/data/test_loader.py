@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.loader import FlowDataset, Permutations, RunLoader, RunSampler
-from r2flow.data.mixture import MixedOrder, Mixture
+from r2flow.data.loader import FlowDataset, MixedOrder, Mixture, Permutations, RunLoader, RunSampler
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
