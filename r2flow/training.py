@@ -22,6 +22,7 @@ import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from r2flow.callbacks import build_callbacks
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.loggers import build_loggers, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
@@ -42,7 +43,6 @@ from r2flow.runs.folder import check_run, open_run, read_config, run_lock
 from r2flow.runs.lineage import Parent, find_parent, inherit
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
-from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
 

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from r2flow import cli, errors
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.data.opening import find_drives
 from r2flow.data.prepared import plan_files, prepare
 from r2flow.data.reading import Reading
@@ -24,7 +25,6 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.stages import build_stage
-from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 ROOT = Path(__file__).resolve().parent.parent
 

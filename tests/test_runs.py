@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
 from r2flow.runs.folder import RESUMED, contradictions, open_run, read_config, run_lock
-from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10}}
 

@@ -9,12 +9,12 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow import noise
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.ema import EMA
 from r2flow.callbacks.guard import Guard
 from r2flow.data.loader import Permutations, RunLoader, RunSampler
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
-from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.conftest import quiet_trainer
 
 NAN, INF = float("nan"), float("inf")

@@ -15,10 +15,10 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from r2flow.callbacks import CALLBACKS, Entry
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.ema import averaged_weights
 from r2flow.data.loader import FlowDataset
 from r2flow.runs.launch import main
-from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 FOLDER = Path(os.environ["R2FLOW_RECORD"])
 BROKEN = set(json.loads(os.environ["R2FLOW_BROKEN"]))  # images whose scan is NaN

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
-from r2flow.stages.checkpointing import AtomicCheckpointIO
 from r2flow.training import build, check
 from tests.training.conftest import Run, in_process
 
