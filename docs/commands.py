@@ -18,8 +18,7 @@ from hydra.errors import HydraException
 
 from r2flow.cli.verbs import USAGE_ERROR, app
 from r2flow.errors import InputError
-from r2flow.lidar.sensor_files import write_sensor
-from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.plugins import take_plugins
 from r2flow.runs.composing import compose, explain
 

@@ -17,8 +17,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.known import Ray, parse_mask
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
-from r2flow.lidar.sensor_files import write_sensor
-from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.lidar.transfer import Partial, image_through
 from r2flow.model.completion import Completed
 from r2flow.noise import generator

@@ -14,8 +14,7 @@ from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
-from r2flow.lidar.sensor_files import read_sensor
-from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.lidar.sensors import SENSORS, Sensor, read_sensor
 from r2flow.store import read_manifest
 from tests.training.conftest import TINY, in_process
 

@@ -19,8 +19,7 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairStore
 from r2flow.data.reading import Reading
 from r2flow.lidar.scan_files import write_points
-from r2flow.lidar.sensor_files import write_sensor
-from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from r2flow.store import Store
 from tests.conftest import CONFIG, prepare_folder

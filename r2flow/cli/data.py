@@ -38,7 +38,7 @@ def simulate(
     workers: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one per core.")] = None,
 ) -> None:
     """Simulate scans of street scenes. The same command resumes an interrupted run."""
-    from r2flow.lidar.sensor_files import named_sensor
+    from r2flow.lidar.sensors import named_sensor
     from r2flow.progress import Bar
     from r2flow.simulator.folder import SimulatedFolder
 
@@ -113,8 +113,7 @@ def sensor(
     from r2flow.data.sources import spread, warn_of_frame
     from r2flow.lidar.estimation import estimate_sensor, nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
-    from r2flow.lidar.sensor_files import ENDINGS, write_sensor
-    from r2flow.lidar.sensors import SENSORS
+    from r2flow.lidar.sensors import ENDINGS, SENSORS, write_sensor
     from r2flow.progress import track
     from r2flow.reports.tables import print_table
     from r2flow.reports.view.panels import scans_of

@@ -155,7 +155,7 @@ class PartialOptions:
 
     def open(self, model: str, device: str, what: Sequence[str]) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
         """The model, for another sensor if given, the scans as it takes them, and remarks on their sensor."""
-        from r2flow.lidar.sensor_files import named_sensor
+        from r2flow.lidar.sensors import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
 
         loaded = load_checkpoint(model, choose_device(device))

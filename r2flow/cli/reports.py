@@ -127,7 +127,7 @@ def backbones(
 ) -> None:
     """List parameters, multiply-accumulates and latency of all backbone configurations (the paper's table II)."""
     from r2flow.backbones import configurations
-    from r2flow.lidar.sensor_files import named_sensor
+    from r2flow.lidar.sensors import named_sensor
     from r2flow.progress import track
     from r2flow.reports.backbones import backbone_costs, print_costs
 
@@ -168,7 +168,7 @@ def completion(
     from r2flow.data.opening import own_reading, parse, scale_of
     from r2flow.generators import TransferFlow
     from r2flow.inversion import real_scans
-    from r2flow.lidar.sensor_files import named_sensor
+    from r2flow.lidar.sensors import named_sensor
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
     from r2flow.models import DENSIFY

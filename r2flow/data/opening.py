@@ -26,8 +26,7 @@ from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, mismatch_of, warn_of_other_sensor
 from r2flow.errors import InputError, check
 from r2flow.lidar.scan_files import read_range_image
-from r2flow.lidar.sensor_files import named_sensor
-from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.lidar.sensors import SENSORS, Sensor, named_sensor
 from r2flow.models import MODELS
 from r2flow.registry import Registry, did_you_mean
 from r2flow.store import MANIFEST, manifest_of

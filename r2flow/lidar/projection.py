@@ -13,8 +13,7 @@ from r2flow.errors import check
 from r2flow.files import save_array
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.scan_files.points import check_xyz
-from r2flow.lidar.sensor_files import named_sensor
-from r2flow.lidar.sensors import Convention, Sensor
+from r2flow.lidar.sensors import Convention, Sensor, named_sensor
 from r2flow.lidar.unfolding import unfolded_rows
 
 Projection = Literal["spherical", "unfolding"]

@@ -1,22 +1,27 @@
-"""Sensors: spinning LiDARs, described by their rays."""
+"""Sensors: spinning LiDARs, described by their rays, by name or in YAML files, as in conf/sensor/."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+import yaml
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.registry import Registry
+from r2flow.errors import InputError, naming
+from r2flow.files import atomic_write, reading
+from r2flow.registry import Registry, UnknownName, check_options
 
 Rays = Literal["centre", "reference"]
 Convention = Literal[Rays, "lidm"]
 
 MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, but within memory
+ENDINGS = (".yaml", ".yml")
+LARGEST_FILE = 1 << 20  # bytes; a sensor is a dozen lines
 
 
 @dataclass(frozen=True)
@@ -209,3 +214,47 @@ def build_sensor(
     except (OverflowError, TypeError) as error:  # YAML integers can have any number of digits, lists any values
         raise InputError(f"sensor {name!r}: elevations, firing and limits must be numbers; {error}.") from None
     return replace(sensor.resized(rows, columns, rays), **given)  # type: ignore[arg-type]
+
+
+def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
+    """Read a sensor from a YAML file with the options of `build_sensor`, in another size if given."""
+    path = Path(path)
+    with reading(path, LARGEST_FILE, "sensor's YAML"):
+        options = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not isinstance(options, dict) or not all(isinstance(key, str) for key in options):
+        raise InputError(f"{path} is no sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
+    sized = {"rows": rows, "columns": columns}
+    options.update({key: value for key, value in sized.items() if value is not None})
+    check_options(str(path), build_sensor, options)
+    with naming(path):
+        return build_sensor(**options)
+
+
+def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
+    """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
+    if size is not None and not (isinstance(size, tuple | list) and [type(n) for n in size] == [int, int]):
+        raise InputError(f"a size is (rows, columns), found {size!r}.")
+    if isinstance(sensor, Sensor):
+        return sensor if size is None else sensor.resized(*size)
+    sensor = str(sensor)
+    if sensor.lower().endswith(ENDINGS):
+        return read_sensor(sensor, *(size or (None, None)))
+    try:
+        return build_sensor(sensor, *(size or (None, None)))
+    except UnknownName as error:
+        raise UnknownName(f"{error} Your own is a YAML file: r2flow sensor SCANS --out NAME.yaml") from None
+
+
+def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
+    """Write a sensor as a YAML file that begins with a comment, such as the source of the numbers."""
+    options = {key: value for key, value in options_of_sensor(sensor).items() if key == "rows" or value is not None}
+    units = "Elevations in degrees, the top row first, a row each where rows is null; ranges and height in metres."
+    with atomic_write(path, "w") as file:
+        file.writelines(f"# {line}\n" for line in (*comment.splitlines(), units))
+        yaml.safe_dump(options, file, default_flow_style=None, sort_keys=False, width=100)
+
+
+def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
+    """The keys of `sensor` in a config: the options of `build_sensor`, and rays through the pixels' centres."""
+    options = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(sensor).items()}
+    return {**options, "rows": None, "rays": "centre"}

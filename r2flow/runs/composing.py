@@ -193,7 +193,7 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
         elif parsed.is_delete() and key.partition(".")[0] not in MAY_GO:
             problem = f": every run has its {key}; give {key}=VALUE"
         elif key == "sensor" and str(value).lower().endswith((".yaml", ".yml")):
-            from r2flow.lidar.sensor_files import options_of_sensor, read_sensor
+            from r2flow.lidar.sensors import options_of_sensor, read_sensor
 
             options = {f"sensor.{name}": option for name, option in options_of_sensor(read_sensor(str(value))).items()}
             given = set(map(key_of, overrides))

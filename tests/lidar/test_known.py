@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
+from r2flow.generators.surroundings import nearest_returns
 from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
 from r2flow.lidar.known import Ray, parse_mask, ray_states
-from r2flow.lidar.neighbours import nearest_returns
 from r2flow.lidar.sensors import SENSORS
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)

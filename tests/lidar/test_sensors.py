@@ -8,8 +8,7 @@ import yaml
 
 from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points, project
-from r2flow.lidar.sensor_files import read_sensor, write_sensor
-from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
+from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor, read_sensor, write_sensor
 from r2flow.lidar.space import build_space
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "sensor"

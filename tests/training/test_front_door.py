@@ -10,8 +10,7 @@ import yaml
 
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
-from r2flow.lidar.sensor_files import write_sensor
-from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.training import build, check

@@ -14,8 +14,7 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 
 from r2flow.lidar.scan_files import read_points, write_points
-from r2flow.lidar.sensor_files import write_sensor
-from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.sensors import Sensor, write_sensor
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, step_of
 from r2flow.reports.outputs import what_next
 from r2flow.reports.training import read_curves
