@@ -15,7 +15,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from r2flow.errors import check
 from r2flow.flow.path import expand_time, interpolate
-from r2flow.flow.solvers.grids import build_grid
+from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import selected
 from r2flow.flow.times import TIMES
 from r2flow.registry import Portion, Registry
@@ -86,7 +86,7 @@ class JumpTimes:
 
     Args:
         steps: Numbers of steps of the grids, drawn uniformly; repeat a number to draw it more often.
-        grid: Time grid of the steps (`r2flow.flow.solvers.grids.named_grid`).
+        grid: Time grid of the steps (`r2flow.flow.solvers.fixed.named_grid`).
         share: Share of jumps that are steps of these grids.
         diagonal: Share of the rest with s = t.
         ends: Share of the rest with s = 1 and t from the density `time`.

@@ -11,7 +11,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from r2flow.flow.solvers.grids import build_grid
+from r2flow.flow.solvers.fixed import build_grid
 from r2flow.registry import Bound, Count, Portion, Positive, Registry
 
 GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer

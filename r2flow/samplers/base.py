@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError, check
-from r2flow.flow.solvers.grids import build_grid
+from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, wide
 from r2flow.registry import Bound, check_options, options_of
 

@@ -72,7 +72,7 @@ class Distill(Reflow):
 
     Args:
         steps: k, the number of sampling steps.
-        grid: Time grid: uniform as in the paper, or another one of `r2flow.flow.solvers.grids.named_grid`.
+        grid: Time grid: uniform as in the paper, or another one of `r2flow.flow.solvers.fixed.named_grid`.
     """
 
     def __init__(

@@ -12,8 +12,7 @@ from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
 from r2flow.flow.solvers.exponential import ExponentialMethod
 from r2flow.flow.solvers.external import TORCHDIFFEQ, TorchDiffEqMethod
-from r2flow.flow.solvers.fixed import Adams3, FixedStep, euler, heun2, midpoint, rk4
-from r2flow.flow.solvers.grids import build_grid, named_grid
+from r2flow.flow.solvers.fixed import Adams3, FixedStep, build_grid, euler, heun2, midpoint, named_grid, rk4
 from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity, finite, flat, selected, wide
 from r2flow.registry import Registry
 
