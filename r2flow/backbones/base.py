@@ -38,8 +38,8 @@ class Backbone(ExactBuffers):
     - any_size: It takes images of any number of rows and columns.
     - learns_directions: It learns a vector per direction, so that scans must not be rotated in training.
 
-    Its modules may have a method `macs` (`r2flow.backbones.cost`). `model.compile(dynamic=True)` compiles it to a graph
-    without breaks for batches of two or more images, and another for single images.
+    Its modules may have a method `macs` (`r2flow.reports.backbones.count_macs`). `model.compile(dynamic=True)` compiles
+    it to a graph without breaks for batches of two or more images, and another for single images.
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
