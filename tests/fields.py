@@ -4,7 +4,7 @@ from torch import Tensor, nn
 
 from r2flow.flow.solvers import Velocity
 from r2flow.generators import Flow
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.samplers import FixedSteps
 
 CONFIG = {

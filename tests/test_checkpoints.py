@@ -13,7 +13,7 @@ import torch
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.lidar.space import build_space
+from r2flow.lidar.encoding import build_space
 from r2flow.model.checkpoint import Checkpoint, check_weights, load_checkpoint, save_checkpoint
 from r2flow.model.published import published_config
 from tests.conftest import CONFIG, Trap, small_disk

@@ -16,10 +16,9 @@ from r2flow.errors import InputError
 from r2flow.evaluation.sets import sampled_set
 from r2flow.generators import Generator, Sampler, build_generator
 from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
-from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.region import region
 from r2flow.lidar.sensors import SENSORS
-from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import completing
 from r2flow.model.sampling import draw, evaluated_region, sample

@@ -10,7 +10,7 @@ from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.condition import condition_of
 from r2flow.generators.flow import USUAL, Flow, FlowMap, RectifiedFlow, as_flow
 from r2flow.generators.transfer import TransferFlow
-from r2flow.lidar.space import build_space
+from r2flow.lidar.encoding import build_space
 from r2flow.registry import Registry, lazy
 
 __all__ = [

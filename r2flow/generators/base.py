@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from r2flow.errors import InputError, check
 from r2flow.flow.solvers.solution import wide
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.region import Region
-from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import options_of
 from r2flow.samplers import SAMPLERS, FixedSteps, build_sampler, parse_sampler

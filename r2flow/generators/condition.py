@@ -6,9 +6,9 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.generators.base import IMAGE, KNOWN, Condition
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Ray
-from r2flow.lidar.space import ModelSpace
 
 
 def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:

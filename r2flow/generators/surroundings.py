@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.generators.base import IMAGE, KNOWN, Condition
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 
 NEIGHBOURS = 4
 FEATURES = 5 * NEIGHBOURS + 11  # of `Surroundings`

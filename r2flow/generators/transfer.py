@@ -18,7 +18,7 @@ from r2flow.flow.path import expand_time
 from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator, parts_of
 from r2flow.generators.flow import Conditioned, Flow
 from r2flow.generators.surroundings import FEATURES, ROW, STEEP, RowFeatures, Surroundings, encoded, steps_of
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.registry import NonNegative
 from r2flow.samplers import Jump
 

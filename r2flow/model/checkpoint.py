@@ -23,9 +23,8 @@ from r2flow.errors import InputError, check, naming
 from r2flow.files import parse_json, telling, write_file
 from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.hashing import state_hash
-from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.encoding import Encoding, build_space
 from r2flow.lidar.sensors import Sensor, named_sensor
-from r2flow.lidar.space import build_space
 from r2flow.model.completion import complete
 from r2flow.model.published import BACKBONE, FORMATS, inert, plain
 from r2flow.model.sampling import sample

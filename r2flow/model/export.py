@@ -21,8 +21,8 @@ from r2flow import __version__
 from r2flow.errors import InputError, check, require
 from r2flow.files import write_file
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.projection import unproject
-from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import Checkpoint, weights_hash
 from r2flow.noise import Draws
 from r2flow.registry import Registry

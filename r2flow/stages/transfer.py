@@ -15,9 +15,9 @@ from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
 from r2flow.generators.surroundings import steps_of
 from r2flow.generators.transfer import WEIGHTS, gain_of, scaled
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.known import every_row, random_points, random_rows
 from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Count, Portion, construct
 from r2flow.stages.base import Batch, SingleLoss
 

@@ -10,9 +10,8 @@ from torch import nn
 
 from r2flow.callbacks import EMA, SamplePictures
 from r2flow.callbacks.periodic import Curvature, Periodic
-from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.sensors import SENSORS
-from r2flow.lidar.space import ModelSpace
 from r2flow.noise import standard_normal
 from r2flow.reports import pictures
 from r2flow.reports.training import read_curves

@@ -8,9 +8,8 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.generators import GENERATORS
-from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.sensors import SENSORS
-from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.lidar.encoding import FORMATS, Encoding
+from r2flow.lidar.encoding import FORMATS, Encoding, ModelSpace
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.lidar.space import ModelSpace
 
 HDL64E = SENSORS["hdl64e"]
 

@@ -7,9 +7,9 @@ import torch
 import yaml
 
 from r2flow.errors import InputError
+from r2flow.lidar.encoding import build_space
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor, read_sensor, write_sensor
-from r2flow.lidar.space import build_space
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "sensor"
 

@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.sensors import SENSORS
-from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.curvature import curvature_page, curvature_rows, measure_paths, summary

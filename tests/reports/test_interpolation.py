@@ -7,9 +7,8 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.inversion import interpolate_scans, real_scans
-from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.sensors import SENSORS
-from r2flow.lidar.space import ModelSpace
 from r2flow.reports.interpolation import interpolation, interpolation_figure
 from r2flow.reports.pictures import figure_pixels
 from r2flow.samplers import build_sampler

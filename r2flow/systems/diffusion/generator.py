@@ -9,7 +9,7 @@ from torch import Tensor
 
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.flow import NetworkFlow
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.registry import Positive, Share
 from r2flow.samplers import MMPS, Repaint
 from r2flow.samplers.base import Call, Condition, Fresh, Generated, Given, Noise, OnGrid, Steps, last_of

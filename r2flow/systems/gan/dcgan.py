@@ -8,7 +8,7 @@ from typing import Any
 from torch import nn
 
 from r2flow.backbones.layers import halved
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.registry import Count, Positive
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (

@@ -9,7 +9,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Bound
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler

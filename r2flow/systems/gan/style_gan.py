@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from r2flow.backbones.convolutions import Resample
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, halved
 from r2flow.generators.base import Generator
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.processes import averaged
 from r2flow.registry import Count, Positive
 from r2flow.systems.gan.generator import Gan

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from r2flow.errors import check
 from r2flow.generators.base import Generator
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.registry import Bound, Count, construct
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.diffusion.generator import DDIM, Share

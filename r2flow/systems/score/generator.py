@@ -18,7 +18,7 @@ from r2flow.backbones.layers import halved
 from r2flow.errors import check
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator, parts_of
-from r2flow.lidar.space import ModelSpace
+from r2flow.lidar.encoding import ModelSpace
 from r2flow.registry import Count, Positive, Registry
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.score.refinenet import RefineNet
