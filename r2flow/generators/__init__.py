@@ -6,8 +6,7 @@ from typing import Any
 import torch
 
 from r2flow.errors import check
-from r2flow.generators.base import Condition, Generated, Generator, Sampler
-from r2flow.generators.condition import condition_of
+from r2flow.generators.base import Condition, Generated, Generator, Sampler, condition_of
 from r2flow.generators.flow import USUAL, Flow, FlowMap, RectifiedFlow, as_flow
 from r2flow.generators.transfer import TransferFlow
 from r2flow.lidar.encoding import build_space
