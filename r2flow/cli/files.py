@@ -105,8 +105,8 @@ def weights(
     R2FLOW_WEIGHTS (default ~/.cache/r2flow/weights).
     """
     from r2flow.metrics import FIELD_NAMES
-    from r2flow.metrics.extractors.weights import SOURCES, kept, kept_file, weights_folder
-    from r2flow.metrics.extractors.weights import add as take
+    from r2flow.metrics.extractors.base import SOURCES, kept, kept_file, weights_folder
+    from r2flow.metrics.extractors.base import add as take
     from r2flow.models import MODELS
     from r2flow.reports.tables import print_table
 

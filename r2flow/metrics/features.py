@@ -8,8 +8,7 @@ from torch import Tensor
 
 from r2flow.metrics.base import SIDES, Protocol, ScanMetric, Side, blocks
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.metrics.extractors.base import Extractor
-from r2flow.metrics.extractors.weights import weights_hash
+from r2flow.metrics.extractors.base import Extractor, weights_hash
 from r2flow.metrics.scans import Scans
 
 BLOCK = 2000  # scans per block: a kernel or matrix of distances takes 32 MB

@@ -12,8 +12,8 @@ import yaml
 
 from r2flow.errors import InputError
 from r2flow.metrics.extractors import EXTRACTORS
+from r2flow.metrics.extractors.base import SOURCES, add, kept, read_published, weights_hash
 from r2flow.metrics.extractors.pointnet import PointNet
-from r2flow.metrics.extractors.weights import SOURCES, add, kept, read_published, weights_hash
 from tests.conftest import Trap
 from tests.metrics.conftest import untrained
 
