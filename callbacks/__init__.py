@@ -11,9 +11,10 @@ from r2flow.registry import Registry, check_options
 from r2flow.runs.lineage import drawn_by
 
 from .checkpoints import Checkpoints
+from .curvature import Curvature
 from .ema import EMA, HalfLifeEMA
 from .guard import Guard
-from .periodic import Curvature, SamplePictures
+from .periodic import SamplePictures
 from .progress import Progress
 from .reflow_pairs import ReflowPairs
 from .stopping import Stopping

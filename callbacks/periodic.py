@@ -1,4 +1,4 @@
-"""Callbacks that act every so many steps: pictures of samples, curvature of paths."""
+"""Callbacks that act every so many steps, and pictures of samples."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -6,10 +6,8 @@ from pathlib import Path
 import lightning as L
 import torch
 
-from r2flow.flow.straightness import curvature
-from r2flow.generators import Flow, Generator
+from r2flow.generators import Generator
 from r2flow.model.sampling import draw
-from r2flow.noise import Draws
 from r2flow.registry import Count, Natural
 
 from .ema import averaged_weights
@@ -75,32 +73,3 @@ class SamplePictures(Periodic):
         figure = contact_sheet(list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"])
         save_figure(figure, path)
         log_picture(trainer.loggers, "samples", figure_pixels(figure), step)
-
-
-class Curvature(Periodic):
-    """Logs int s(t) dt (paper, eq. 6) of a few scans from fixed noise, if the generator is a flow.
-
-    The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/s_normalised`: an untrained
-    flow is straight because its paths have almost no length. One measurement is one pass of `steps` Euler steps;
-    `r2flow report curvature` computes s(t) itself, in two passes.
-
-    Args:
-        every: Steps between two measurements; 0 for none.
-        num: Scans per measurement.
-        steps: Euler steps per scan.
-    """
-
-    def __init__(self, seed: int, every: Natural = 500, num: Count = 2, steps: Count = 16) -> None:
-        super().__init__(every)
-        self.seed, self.num, self.steps = seed, num, steps
-
-    def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        flow = pl_module.generator
-        if not isinstance(flow, Flow) or not flow.draws:
-            return
-        x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
-        result = curvature(flow.velocity, x_0, self.steps)
-        values = {"s": result.total.mean().item(), "s_normalised": result.normalised.mean().item()}
-        for logger in trainer.loggers:
-            # Lightning logs with the step before the one just finished
-            logger.log_metrics({f"curvature/{name}": value for name, value in values.items()}, trainer.global_step - 1)

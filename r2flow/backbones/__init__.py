@@ -7,10 +7,11 @@ from typing import Any
 import yaml
 from torch import Tensor
 
+from r2flow.backbones.adm_unet import ADMUNet
 from r2flow.backbones.base import Backbone
+from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
-from r2flow.backbones.unets import ADMUNet, EfficientUNet
 from r2flow.registry import Registry
 
 BACKBONES: Registry[type[Backbone]] = Registry(

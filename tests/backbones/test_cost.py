@@ -8,8 +8,8 @@ from plain_backbone import Plain
 from torch import nn
 
 from r2flow.backbones import build_backbone, configurations
+from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
-from r2flow.backbones.unets import EfficientUNet
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
 from r2flow.reports.backbones import backbone_costs, cost, count_macs, count_parameters

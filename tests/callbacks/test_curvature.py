@@ -9,7 +9,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import nn
 
 from r2flow.callbacks import EMA, SamplePictures
-from r2flow.callbacks.periodic import Curvature, Periodic
+from r2flow.callbacks.curvature import Curvature
+from r2flow.callbacks.periodic import Periodic
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import standard_normal
