@@ -35,14 +35,10 @@ LAYOUT = "labels of little-endian uint32, one a point"
 
 
 def labels_beside(scan: str | Path) -> Path | None:
-    """The label file of a scan: `labels/000000.label` for `velodyne/000000.bin`, or `000000.label` next to it."""
-    scan = Path(scan)
-    file = scan.with_suffix(".label")
-    made = scan.with_name("manifest.json").exists()  # by r2flow: completed scans are not the labelled ones
-    for path in (file,) if made else (scan.parent.parent / "labels" / file.name, file):
-        if path.exists() or path.is_symlink():  # returns broken links, too: reading them raises
-            return path
-    return None
+    """The label file of a scan: `000000.label` next to it, or `../labels/000000.label` of `velodyne/000000.bin`."""
+    file = Path(scan).with_suffix(".label")
+    files = [file, file.parent.parent / "labels" / file.name][: 1 + (file.parent.name == "velodyne")]
+    return next((path for path in files if path.exists() or path.is_symlink()), None)  # reading a broken link raises
 
 
 def read_labels(path: str | Path, scan: str | Path, points: Points | None = None) -> np.ndarray:

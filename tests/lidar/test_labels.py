@@ -50,13 +50,11 @@ def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Pa
     np.testing.assert_array_equal(read_labels(beside, scan), IDS)
 
 
-def test_labels_are_not_those_of_completed_scans_next_to_the_folder(scan: Path, label: Path):
+def test_labels_are_not_those_of_other_scans_next_to_the_folder(scan: Path, label: Path):
     assert labels_beside(scan) == label
-    dense = scan.parent.parent / "dense"
-    dense.mkdir()
-    assert labels_beside(dense / scan.name) == label
-    (dense / "manifest.json").touch()
-    assert labels_beside(dense / scan.name) is None
+    assert labels_beside(scan.parent.with_name("thinned") / scan.name) is None
+    scan.with_suffix(".label").touch()
+    assert labels_beside(scan) == scan.with_suffix(".label")
 
 
 def test_each_pixel_has_the_label_of_its_nearest_return(scan: Path, label: Path):
