@@ -181,7 +181,7 @@ def image_to_points(
     check(image.ndim == 3 and image.shape[1:] == rays.shape[1:],
           f"the image is {image.shape}, its rays are {tuple(rays.shape)}: give (2 or 1, H, W), and the rays of as many "
           "pixels.")  # fmt: skip
-    r = torch.from_numpy(np.ascontiguousarray(image[:1]))[None]
+    r = torch.from_numpy(np.ascontiguousarray(np.nan_to_num(image[:1], posinf=0)))[None]
     xyz = unproject(r, rays)[0].numpy()
     if measured is not None:
         xyz = np.where(measured.any(axis=0), measured, xyz)
@@ -189,7 +189,7 @@ def image_to_points(
     columns = image.shape[-1]
     # Azimuth decreases with w from +180 degrees: backwards from the middle, it increases from 0.
     order = np.roll(np.arange(columns)[::-1], (columns + 1) // 2)
-    xyz, reflectance, returned = xyz[..., order], reflectance[..., order], image[0][..., order] > 0
+    xyz, reflectance, returned = xyz[..., order], reflectance[..., order], r[0, 0].numpy()[..., order] > 0
     return np.ascontiguousarray(xyz[:, returned].T), np.ascontiguousarray(reflectance[returned])
 
 

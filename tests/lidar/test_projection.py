@@ -45,6 +45,14 @@ def test_points_to_image_to_points(sensor, projection):
     np.testing.assert_array_equal(project(xyz, reflectance, sensor.name, projection), again)
 
 
+@pytest.mark.parametrize("r", [math.nan, math.inf, -5])
+def test_a_range_that_is_none_is_no_point(r):
+    image = np.array([[[10, r, 20]], [[0.1, 0.2, 0.3]]], np.float32)
+    xyz, reflectance = image_to_points(image, np.zeros((2, 1, 3)))
+    assert sorted(xyz.tolist()) == [[10, 0, 0], [20, 0, 0]]
+    np.testing.assert_array_equal(np.sort(reflectance), image[1, 0, ::2])
+
+
 def test_a_pixel_keeps_the_nearest_return_in_any_order():
     points = np.array([point(r, -5, 20) for r in (30, 12, 50)])
     for order in ([0, 1, 2], [1, 0, 2], [2, 0, 1]):
