@@ -92,6 +92,13 @@ def test_export_writes_the_averaged_weights(r2flow, saved, tmp_path):
     assert r2flow("export", out, "--to", "safetensors", "--out", out)[0] == 2
 
 
+def test_the_network_and_the_sampler_are_not_written_to_one_file(r2flow, saved, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for options in (["--what", "network"], ["--steps", 1]):
+        assert r2flow("export", saved[0], "--to", "pt2", *options)[0] == 0
+    assert {path.name for path in tmp_path.glob("*.pt2")} == {f"{saved[0].stem}{end}.pt2" for end in ("", "-network")}
+
+
 @pytest.mark.parametrize("metres", [0.01, 18.0])
 def test_an_export_that_draws_other_scans_is_warned_of(r2flow, saved, tmp_path, monkeypatch, metres):
     monkeypatch.setattr("r2flow.model.export.compare", lambda *_: Difference(metres, 0.0, 0))

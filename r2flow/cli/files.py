@@ -41,8 +41,8 @@ def export(
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 
-    if out is None:
-        out = Path(f"{checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name}.{to}")
+    name = checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name
+    out = out or Path(f"{name}{'-network' * (what == 'network')}.{to}")
     check(out.suffix == f".{to}", f"--to {to} writes a .{to}, found --out {out}.")
     check(not half or to == "safetensors", "--half is for --to safetensors.")
     check(what == "sampler" or to != "safetensors", "--what network is for --to onnx and --to pt2.")
