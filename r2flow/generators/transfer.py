@@ -214,7 +214,7 @@ class TransferFlow(Flow):
     @torch.no_grad()
     def forward(self, noise: Tensor, condition: Condition | None = None, **how: Any) -> Generated:
         if condition is None:
-            raise InputError("a transfer flow begins at a scan: give a condition, or use r2flow complete.")
+            raise InputError("this model completes scans: give one of which a ray is known, as r2flow complete does.")
         weight = next(self.parameters())
         condition = {name: value.to(weight) for name, value in condition.items()}
         image, known = parts_of(condition, noise.to(weight))
