@@ -316,6 +316,15 @@ def test_reflectance_beyond_the_sensor_s_scale_is_neither_clipped_nor_silent(com
     np.testing.assert_allclose(answer[1 : len(xyz)], counts[1:] / 200, atol=1e-6)
 
 
+def test_points_that_are_dropped_are_told(complete, tmp_path):
+    full_scan(tmp_path / "one.bin")
+    rows = np.fromfile(tmp_path / "one.bin", np.float32).reshape(-1, 4)
+    rows[::5, 3] = np.nan
+    rows.tofile(tmp_path / "one.bin")
+    said = f"are dropped ({len(rows[::5])} points"
+    assert said in complete(tmp_path / "one.bin", "--mask", "rows:2")[2]
+
+
 def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):
     full_scan(tmp_path / "one.bin")
     mask = np.arange(8)[:, None] % 2 == np.zeros(64)

@@ -13,7 +13,6 @@ from r2flow.errors import InputError, naming, warn_odd
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
-from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import manifest_of
 
@@ -82,8 +81,6 @@ def read_projected(path: str | Path, reading: Reading) -> Projected:
     sensor = reading.sensor
     try:
         points = read_points(path, reading.columns)
-        if points.dropped:
-            warn_odd(Path(path), f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped", points.dropped)
         if reading.projection == "unfolding":
             points = points.with_lost_rays()
         scaled = scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None

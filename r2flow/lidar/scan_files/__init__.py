@@ -12,7 +12,7 @@ import numpy as np
 from r2flow.errors import InputError, check, warn_odd
 from r2flow.files import atomic_write, reading
 from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
-from r2flow.lidar.scan_files.points import NoPointsError, Points, check_columns, check_xyz, column_points
+from r2flow.lidar.scan_files.points import FARTHEST, NoPointsError, Points, check_columns, check_xyz, column_points
 from r2flow.lidar.scan_files.tables import (
     read_array,
     read_arrow,
@@ -99,7 +99,10 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
         names, arrays = (None, read_rows(path, columns)) if raw else _READERS[ending](path)
         check(names is None or columns is None, "it names its columns: leave --columns (data.reading.columns) out.")
-        return column_points(names or usual_names(len(arrays), columns), arrays, raw)
+        points = column_points(names or usual_names(len(arrays), columns), arrays, raw)
+    if points.dropped:
+        warn_odd(path, f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped", points.dropped)
+    return points
 
 
 def points_beside(path: Path) -> Path:
