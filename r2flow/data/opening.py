@@ -246,10 +246,9 @@ def _reading_of(model: Any) -> Reading:
 
 def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale: float | None = None) -> Tensor:
     """`r2flow.read`."""
-    check(
-        reflectance_scale is None or 0 < reflectance_scale < math.inf,
-        f"reflectance_scale must be a positive number, found {reflectance_scale}.",
-    )
+    check(isinstance(path, str | Path), f"give the path of a scan; found {type(path)}.")
+    right = reflectance_scale is None or 0 < reflectance_scale < math.inf
+    check(right, f"reflectance_scale must be a positive number, found {reflectance_scale}.")
     options, file = parse(str(path))
     check(options.name != FOLDER or file, f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
     reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale, estimate_scale=True)

@@ -124,8 +124,7 @@ def _files(
             log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         of_sensor, options = known.reflectance_scale if known else None, parse(spec)[0]
         usual = scale_of(options, of_sensor) if options.name != FOLDER or of_sensor else 0.0
-        estimated = full_reflectance(scans, usual) or usual
-        full = scale or (1.0 if stored else estimated) or 1.0
+        full = scale or (1.0 if stored else full_reflectance(scans, usual) or usual) or 1.0
         strict = scale is not None or full in FULL_REFLECTANCE
         as_own = same and fired.columns >= FEWER * target.columns
         by_points = partial(_read_points, reading=reading, fired=None if as_own else fired, scale=full, strict=strict)
@@ -192,8 +191,7 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
         points = points.with_lost_rays()
     strength = None  # reflectance in [0, 1]; None if the file has none, or only 0
     if points.reflectance is not None and points.reflectance.any():
-        scaled = scaled_reflectance(path, points, scale) if strict else points.reflectance / np.float32(scale)
-        strength = scaled.clip(0, 1)
+        strength = scaled_reflectance(path, points, scale, strict)
     with naming(path):
         if fired is None:
             seen = points_of_same(points, target, reading.projection, reading.convention, strength)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from r2flow.errors import InputError, naming, warn_odd
+from r2flow.lidar.estimation import OUTLIERS
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
@@ -127,8 +128,8 @@ def _no_reflectance(path: str | Path) -> InputError:
     )
 
 
-def scaled_reflectance(path: str | Path, points: Points, scale: float | None) -> np.ndarray:
-    """The reflectance of points, scaled to [0, 1]; the scale is estimated if None."""
+def scaled_reflectance(path: str | Path, points: Points, scale: float | None, strict: bool = True) -> np.ndarray:
+    """The reflectance of points, scaled to [0, 1]; None estimates the scale. Unless `strict`, all beyond is clipped."""
     if points.reflectance is None:
         raise _no_reflectance(path)
     highest = float(np.nan_to_num(points.reflectance).max(initial=0))
@@ -138,13 +139,13 @@ def scaled_reflectance(path: str | Path, points: Points, scale: float | None) ->
         warn_odd(Path(path), DARK)
     scaled = points.reflectance / np.float32(scale)
     # NaN compares false and is refused, too.
-    if not (float(scaled.max(initial=0)) <= 1 + 1e-3 and float(scaled.min(initial=0)) >= 0):
+    if strict and not (np.count_nonzero(scaled > 1.001) <= OUTLIERS * len(scaled) and scaled.min(initial=0) >= 0):
         raise InputError(
             f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
             "Give the value of full reflectance, often 255: data.reading.reflectance_scale=255, that of "
             "its part of data.parts, or --reflectance-scale 255."
         )
-    return scaled
+    return scaled.clip(0, 1)
 
 
 def read_image(path: Path, reading: Reading) -> np.ndarray:

@@ -17,6 +17,7 @@ from r2flow.lidar.unfolding import elevations_of
 FEWEST_RETURNS = 200  # minimum for an estimate
 COLUMNS = 64  # image widths are multiples of it, so that every backbone can halve them
 FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full reflectance
+OUTLIERS = 1e-4  # share of values that may exceed one of them
 IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
 OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
 MOST_VOID = 0.1  # share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16
@@ -216,19 +217,20 @@ def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> floa
 
 
 def full_reflectance(scans: Sequence[Points], usual: float | None = None) -> float | None:
-    """Estimate the value of full reflectance; None if a file has no reflectance, or only one value.
+    """Estimate the value of full reflectance; None if a file has no reflectance, or only 0.
 
-    It is `usual`, if given, unless more than 1 % of the values exceed it.
+    It is `usual`, if given, unless more than 1 % of the values exceed it; else the first common value that at most one
+    in 10,000 exceeds, or the highest value, rounded up, if that is below a tenth of it.
     """
     if any(scan.reflectance is None for scan in scans):
         return None
     values = np.concatenate([scan.reflectance for scan in scans])
     highest = float(values.max())
-    if highest <= max(0.0, float(values.min())):
+    if highest <= 0:
         return None
     if usual and np.mean(values > usual) <= 0.01:
         return usual
-    common = next((full for full in FULL_REFLECTANCE if highest <= full * (1 + 1e-3)), math.inf)
+    common = min((full for full in FULL_REFLECTANCE if np.mean(values > full * 1.001) <= OUTLIERS), default=math.inf)
     if highest >= 0.1 * common:  # else the values would fill less than a tenth of the scale
         return common
     return float(f"{highest:.1g}") if float(f"{highest:.1g}") >= highest else float(f"{highest * 1.05:.2g}")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.reading import Reading
+from r2flow.data.reading import Reading, scaled_reflectance
 from r2flow.data.sources import warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_beams
@@ -116,13 +116,18 @@ def test_ring_numbers_by_laser_give_the_firing_order(first):
         (np.linspace(0, 3000, 50), 3000),
         (np.linspace(0, 7000, 50), 65535),
         (np.linspace(0, 0.0115, 50), 0.012),
+        (np.append(np.linspace(0, 1, 29997), [1.5] * 3), 1),  # one in 10,000 is an outlier
+        (np.append(np.linspace(0, 1, 29997), [1.5] * 4), 2),
         (np.zeros(5), None),
     ],
 )
 def test_the_scale_of_reflectance_is_estimated(values, scale):
-    points = scan(SENSORS["vlp16"].resized(columns=192), RING_AFTER_RING)
-    assert full_reflectance([Points(points.xyz, np.resize(values, len(points.xyz)).astype(np.float32))]) == scale
+    points = Points(np.ones((len(values), 3)), values.astype(np.float32))
+    assert full_reflectance([points]) == scale
     assert full_reflectance([Points(points.xyz)]) is None
+    if scale:
+        highest = scaled_reflectance("a.bin", points, scale).max()
+        assert highest == pytest.approx(min(values.max() / scale, 1))
 
 
 def test_range_limits_include_all_but_stray_returns():
