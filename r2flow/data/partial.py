@@ -16,7 +16,7 @@ import numpy as np
 
 from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, scale_of
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
-from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
+from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.errors import InputError, naming
 from r2flow.lidar.estimation import FULL_REFLECTANCE, full_reflectance, other_sensor
@@ -132,7 +132,7 @@ def _files(
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
         if not (scale or stored) and full != usual and (of_sensor or full not in FULL_REFLECTANCE):
-            log.warning("%s: reflectance is divided by %g; --reflectance-scale names another value", spec, full)
+            log.warning("%s: %s", spec, DIVIDED % full)
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
 

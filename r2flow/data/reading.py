@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from r2flow.errors import InputError, naming, warn_odd
-from r2flow.lidar.estimation import OUTLIERS
+from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, full_reflectance
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
@@ -19,6 +19,7 @@ from r2flow.store import manifest_of
 
 AUTO = "auto"
 FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
+DIVIDED = "reflectance is divided by %g; --reflectance-scale (of r2flow.read reflectance_scale) names another value"
 DARK = (
     "reflectance stays below a tenth of full reflectance: give its value as --reflectance-scale, in training as "
     "data.reading.reflectance_scale; r2flow sensor estimates it"
@@ -31,8 +32,7 @@ class Reading:
 
     Attributes:
         projection, convention: As in `r2flow.lidar.projection.project`.
-        reflectance_scale: The value in the files that means full reflectance; None estimates it from each file, which
-            is good enough for pictures only.
+        reflectance_scale: The value in the files that means full reflectance; None estimates it from each file.
         reflectance: Whether images have reflectance: True requires it of every scan; `auto`: see `lacks_reflectance`.
         on_bad_scan: Treatment of unusable scans. `error` raises; `skip` takes the next usable scan; `empty` raises,
             but returns an empty image for a scan without a return in the sensor's view.
@@ -134,7 +134,9 @@ def scaled_reflectance(path: str | Path, points: Points, scale: float | None, st
         raise _no_reflectance(path)
     highest = float(np.nan_to_num(points.reflectance).max(initial=0))
     if scale is None:
-        scale = max(highest, 255.0) if highest > 1 else highest if 0 < highest < FAINT else 1.0
+        scale = full_reflectance([points]) or 1.0
+        if scale not in FULL_REFLECTANCE:
+            warn_odd(Path(path), DIVIDED % scale)
     if 0 < highest < FAINT * scale:
         warn_odd(Path(path), DARK)
     scaled = points.reflectance / np.float32(scale)

@@ -151,10 +151,11 @@ class TestWhatR2FlowWrote:
             assert scan[0].max() == 10
             assert not scan[1].any()
 
-    def test_reflectance_in_bytes_is_scaled_and_in_another_scale_too(self, tmp_path: Path):
-        write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32), np.array([51], np.float32))
-        for scale, value in ((None, 0.2), (102, 0.5)):  # 51 / 255
+    def test_reflectance_of_another_scale_is_scaled_and_of_an_uncommon_one_with_a_warning(self, tmp_path: Path, caplog):
+        for stored, scale, value in ((204, None, 0.8), (51, 102, 0.5), (51, None, 0.51), (0.048, None, 0.96)):
+            write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32), np.array([stored], np.float32))
             assert float(r2flow.read(tmp_path / "a.ply", "vlp16", scale)[1].max()) == pytest.approx(value, abs=1e-6)
+            assert ("divided by 0.05" in caplog.text) == (stored < 0.1)
         for wrong in (0, -1.0, float("inf"), float("nan")):
             with pytest.raises(InputError, match="reflectance_scale must be"):
                 r2flow.read(tmp_path / "a.ply", "vlp16", wrong)
