@@ -372,9 +372,13 @@ def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_p
     assert "--to FILE (r2flow sensor) --size 64x900 uses them" in said
 
 
-def test_points_in_memory_are_named_in_a_refusal(run):
-    with pytest.raises(InputError, match=r"points in memory of \(N, 3\) or \(N, 4\), found \(4,\)"):
-        r2flow.load(run).complete(np.zeros(4))
+def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path, caplog):
+    xyz = sparse_scan(tmp_path / "room.ply")
+    r2flow.load(run).complete(np.column_stack([xyz, np.linspace(0, 0.05, len(xyz))]), sensor="vlp16")
+    assert "points in memory" in caplog.text
+    for given, found in ((np.zeros(4), "(4,)"), (np.zeros((0, 2, 8, 64)), "(0, 2, 8, 64)"), (["a.bin"], "list")):
+        with pytest.raises(InputError, match=rf"points \(N, 3 or 4\); found .*{re.escape(found)}"):
+            r2flow.load(run).complete(given)
     with pytest.raises(InputError, match="^points in memory: .*beams cannot be told apart"):
         r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
 

@@ -97,12 +97,12 @@ class Checkpoint:
             how: Options of `r2flow.model.completion.complete`: sampler, steps, batch_size, ...
         """
         if not isinstance(images, str | Path):
+            shape = tuple(getattr(images, "shape", ()))
+            right = (len(shape) == 4 and shape[0]) or (len(shape) == 2 and shape[1] in (3, 4))
+            check(right, f"give a path, images (B, 2 or 1, H, W) or points (N, 3 or 4); found {shape or type(images)}.")
             images = torch.as_tensor(images)
-            shape = tuple(images.shape)
-            right = len(shape) == 4 or (len(shape) == 2 and shape[1] in (3, 4))
-            check(right, f"give images of (B, 2 or 1, H, W), or points in memory of (N, 3) or (N, 4), found {shape}.")
         if isinstance(images, Tensor) and images.ndim == 2:
-            with TemporaryDirectory() as folder:
+            with TemporaryDirectory(prefix="points in memory ") as folder:  # also named so in warnings
                 np.save(file := Path(folder, "points.npy"), images.cpu())
                 try:
                     return self.complete(file, state, num, seed, sensor=sensor, **how)

@@ -159,6 +159,8 @@ class TestWhatR2FlowWrote:
         for wrong in (0, -1.0, float("inf"), float("nan")):
             with pytest.raises(InputError, match="reflectance_scale must be"):
                 r2flow.read(tmp_path / "a.ply", "vlp16", wrong)
+        with pytest.raises(InputError, match="give the path of a scan"):
+            r2flow.read(np.zeros((9999, 4)))
 
 
 class TestReflectance:
