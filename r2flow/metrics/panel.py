@@ -58,8 +58,8 @@ def histogram(x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = Non
 
 
 def drop_rate(value: np.ndarray, missing: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Counts of missing rays and of all rays per bin of a value, (2, bins)."""
-    return np.stack([histogram(value, edges, missing), histogram(value, edges)])
+    """Per bin of a value, counts of missing rays and of all rays, and the rays of the image, (3, bins)."""
+    return np.stack([histogram(value, edges, missing), histogram(value, edges), np.full(len(edges) - 1, value.size)])
 
 
 def differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -85,16 +85,16 @@ def run_lengths(scan: Scan) -> np.ndarray:
 
 
 def changes_row(scan: Scan) -> np.ndarray:
-    """Per row, pairs of neighbours with exactly one return, and all pairs, (2, 1024); 0 beyond the image's rows."""
+    """Per row, pairs of neighbours with exactly one return, all, and those of the image, (3, 1024); none beyond."""
     returned = scan.r > 0
-    counts = np.zeros((2, MOST_ROWS))
+    counts = np.zeros((3, MOST_ROWS))
     counts[0, : len(returned)] = (returned != np.roll(returned, -1, -1)).sum(1)
-    counts[1, : len(returned)] = returned.shape[1]
+    counts[1, : len(returned)], counts[2] = returned.shape[1], returned.size
     return counts
 
 
 def drop_range(scan: Scan) -> np.ndarray:
-    """Missing rays and all rays per logarithmic bin of range, (2, 12), from 3 m, beyond the ego vehicle.
+    """`drop_rate` per logarithmic bin of range, (3, 12), from 3 m, beyond the ego vehicle.
 
     The range of a missing ray is the mean of its neighbours in the row; gaps over 16 columns are not counted.
     """
@@ -103,7 +103,7 @@ def drop_range(scan: Scan) -> np.ndarray:
 
 
 def drop_incidence(scan: Scan) -> np.ndarray:
-    """Missing rays and all rays per bin of the angle of incidence, (2, 10), estimated as in `drop_range`."""
+    """`drop_rate` per bin of the angle of incidence, (3, 10), estimated as in `drop_range`."""
     cosine = scan.surfaces[1][0]
     return drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, INCIDENCES)
 
@@ -129,15 +129,18 @@ def _pairs(x: np.ndarray, returned: np.ndarray, edges: np.ndarray, parts: int) -
 
 
 def rate_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean |x - y| over bins, x and y the rates of counts (missing, all); a rate without counts is 0."""
-    x, y = (lost / np.maximum(rays, 1) for lost, rays in (a.reshape(2, -1), b.reshape(2, -1)))
-    return float(np.abs(x - y).mean())
+    """Mean |x - y| over bins, x and y the rates of counts (missing, all, of images), 0 without; at least `lacking`."""
+    sets = a.reshape(3, -1), b.reshape(3, -1)
+    (x, p), (y, q) = ((lost / np.maximum(rays, 1), rays / pixels) for lost, rays, pixels in sets)
+    # Share of a set's rays in bins of which the other has less than 1 %: 1 if it has none.
+    lacking = [u[v < u / 100].sum() / u.sum() for u, v in ((p, q), (q, p)) if u.any()]
+    return float(max([np.abs(x - y).mean(), *lacking]))
 
 
 def row_distance(a: np.ndarray, b: np.ndarray) -> float:
     """`rate_distance` over the rows of the images."""
-    rows = (a + b).reshape(2, -1)[1] > 0
-    return rate_distance(a.reshape(2, -1)[:, rows], b.reshape(2, -1)[:, rows])
+    rows = (a + b).reshape(3, -1)[1] > 0
+    return rate_distance(a.reshape(3, -1)[:, rows], b.reshape(3, -1)[:, rows])
 
 
 def reflectance_distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -169,9 +172,9 @@ PANEL: dict[str, Member] = {
     "gradient, elevation": histogram_of(lambda scan: differences(scan.r[1:], scan.r[:-1]), GRADIENTS),
     "steps by sector": Member(steps_by_sector, SECTORS * (len(STEPS) - 1)),
     "run lengths": histogram_of(run_lengths, RUNS, weighted=True),
-    "changes per row": Member(changes_row, 2 * MOST_ROWS, row_distance),
-    "drop rate by range": Member(drop_range, 2 * DROPS, rate_distance),
-    "drop rate by incidence": Member(drop_incidence, 2 * (len(INCIDENCES) - 1), rate_distance),
+    "changes per row": Member(changes_row, 3 * MOST_ROWS, row_distance),
+    "drop rate by range": Member(drop_range, 3 * DROPS, rate_distance),
+    "drop rate by incidence": Member(drop_incidence, 3 * (len(INCIDENCES) - 1), rate_distance),
     "surface normals": histogram_of(lambda scan: scan.surfaces[0], NORMALS),
     "incidence": histogram_of(lambda scan: scan.surfaces[1], COSINES),
     "range pairs": Member(range_pairs, PAIRS**2),
@@ -215,7 +218,7 @@ class Panel(SumMetric):
     name = "panel"
     representation = "range image"
     settings: ClassVar[Mapping[str, Any]] = {
-        "members": list(PANEL), "distance": "Jensen-Shannon distance of histograms, mean |a - b| of rates"
+        "members": list(PANEL), "distance": "Jensen-Shannon distance of histograms, |a - b| of rates or share lacking"
     }  # fmt: skip
     width = int(ENDS[-1])
     uses_reflectance = True

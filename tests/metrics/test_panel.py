@@ -12,7 +12,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics import panel as lines
 from r2flow.metrics.birds_eye import js_distance
-from r2flow.metrics.panel import PANEL, RUNS, Scan, distances, panel, steps_by_sector
+from r2flow.metrics.panel import PANEL, RUNS, Scan, distances, panel, rate_distance, steps_by_sector
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import measured
 
@@ -131,6 +131,19 @@ def test_mirrored_scans_of_a_car_that_keeps_to_the_right_are_seen():
     mirrored = steps(np.roll(images[30:, ..., ::-1], 1, axis=-1))  # about the first column
     np.testing.assert_array_equal(mirrored, other[::-1, ::-1])  # sectors and signs change sides, nothing else
     assert js_distance(one, mirrored) > 5 * js_distance(one, other)
+
+
+def test_a_set_without_surfaces_is_not_near_in_the_drop_rate():
+    draw, real = np.random.default_rng(0), walls(20, 1)
+    lossy = real * (draw.random((20, 1, *SENSOR.shape)) > 0.05)
+    random = (real > 0) * draw.uniform([[[2]], [[0]]], [[[60]], [[1]]], real.shape).astype(np.float32)
+    found = [apart(images, real)["drop rate by incidence"] for images in (real, lossy, random, 0 * real)]
+    assert found[0] == 0 < found[1] < 0.2
+    assert found[3] == 1 > found[2] > 0.9
+    counts = np.array([[1, 18], [10, 90], [200, 200]])  # missing, all, of the image
+    for rates, expected in (([[2, 9], [10, 90]], 0.1), ([[2, 0], [10, 0]], 0.9), ([[1, 0], [10, 0.5]], 0.9)):
+        other = np.array([*rates, [200, 200]])
+        assert rate_distance(counts, other) == rate_distance(other, counts) == pytest.approx(expected)
 
 
 def test_range_alone_leaves_reflectance_out():

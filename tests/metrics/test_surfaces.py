@@ -25,7 +25,7 @@ def scans_of(images: np.ndarray) -> list[Scan]:
 
 def share(counts, images: np.ndarray) -> np.ndarray:
     """Share of lost rays in each bin, over a set."""
-    lost, rays = sum(counts(scan) for scan in scans_of(images))
+    lost, rays, _ = sum(counts(scan) for scan in scans_of(images))
     return lost / np.maximum(rays, 1)
 
 
@@ -95,7 +95,7 @@ def test_the_drop_rate_is_the_share_that_a_mask_takes():
     # between them there are but gaps across the edge, at 27.5 m: nothing that is not lost
     assert rate.sum() == pytest.approx(0.05 + 0.25 + 1, abs=0.01)
     counts = drop_rate(np.array([1.0, 2, 3, np.nan]), np.array([True, False, True, True]), np.array([0.0, 2.5, 5]))
-    np.testing.assert_array_equal(counts, [[1, 1], [2, 1]])
+    np.testing.assert_array_equal(counts, [[1, 1], [2, 1], [4, 4]])
 
 
 def test_losses_on_flat_ground_fall_into_the_bins_of_its_elevations():
