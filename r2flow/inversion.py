@@ -36,15 +36,15 @@ def real_scans(
 ) -> list[Real]:
     """Read scans (`open_scans`), at most `most` per set, evenly spread, projected as the checkpoint's training scans.
 
-    `reflectance_scale` is the value of full reflectance in the files; None: as in training. `need_reflectance`: a set
+    `reflectance_scale` is the value of full reflectance in the files; None: by `reading_for`. `need_reflectance`: a set
     without reflectance is refused if the checkpoint has it.
     """
-    trained = reading_for([], checkpoint)
-    scale = trained.reflectance_scale if reflectance_scale is None else reflectance_scale
     reflectance = checkpoint.encoding.reflectance and (need_reflectance or AUTO)
-    reading = replace(trained, reflectance=reflectance, reflectance_scale=scale,
-                      on_bad_scan="error", within_limits=True)  # fmt: skip
-    sets = [open_scans(spec, reading).spread(most) for spec in specs]
+    sets = []
+    for spec in specs:
+        reading = reading_for([spec], checkpoint, reflectance_scale=reflectance_scale)
+        reading = replace(reading, reflectance=reflectance, on_bad_scan="error", within_limits=True)
+        sets.append(open_scans(spec, reading).spread(most))
     stems = [Path(name).name.split(".")[0].replace(" ", "_") for scans in sets for name in scans.source.names]
     names = [stem if stems.count(stem) == 1 else f"{stem}_{stems[:i].count(stem) + 1}" for i, stem in enumerate(stems)]
     images = [torch.from_numpy(scans.source[i]) for scans in sets for i in range(len(scans))]

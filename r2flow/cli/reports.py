@@ -165,7 +165,7 @@ def completion(
     """Mask scans and complete them by models and by interpolation: errors against evaluations."""
     import numpy as np
 
-    from r2flow.data.opening import own_reading, parse, scale_of
+    from r2flow.data.opening import own_reading
     from r2flow.generators import TransferFlow
     from r2flow.inversion import real_scans
     from r2flow.lidar.sensors import named_sensor
@@ -198,8 +198,7 @@ def completion(
     masks = re.split(r"\s*,\s*(?=[a-z]+:)|\s+", tasks.strip()) if tasks else list(TASKS)
     for task in masks:
         measured_by(task, first.sensor, 0)
-    scale = reflectance_scale or scale_of(parse(real)[0], first.sensor.reflectance_scale)
-    scans = real_scans(first, [real], scale, num, need_reflectance=False)
+    scans = real_scans(first, [real], reflectance_scale, num, need_reflectance=False)
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
     check(truths, f"{real}: no scan has a return, so there is nothing to hide.")
     prepare_folder(out)
@@ -238,7 +237,7 @@ def paper(
         checkpoint = load_checkpoint(model, where)
         check(checkpoint.generator.draws, f"{model} does not generate scans from noise.")
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
-    scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
+    scans = None if real is None else open_scans(real, reading_for([real], runs[0].checkpoint))
     prepare_folder(out)
     page = paper_page(runs, rows, scans, num, steps, where)
     finish(page, out, page.text[:1])

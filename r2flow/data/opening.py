@@ -211,14 +211,14 @@ def reading_for(
         raise InputError(f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out.")
     reading = replace(reading, sensor=reading.sensor if model else chosen)
     for spec in specs:  # before anything is read
-        options, _ = parse(spec)
-        if options.name == FOLDER:
+        options, file = parse(spec)
+        if options.name == FOLDER and file is None:
             refuse_other_samples(Path(options.folder), reading.sensor)
     if reflectance_scale is not None or not specs:
         return reading
     scale = reading.sensor.reflectance_scale
     if not estimate_scale or stored or name != FOLDER:
-        scale = scale_of(parse(specs[0])[0], scale)
+        scale = scale_of(parse(specs[0])[0], scale or reading.reflectance_scale)
     return replace(reading, reflectance_scale=scale)
 
 

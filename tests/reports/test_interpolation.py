@@ -1,17 +1,22 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.inversion import interpolate_scans, real_scans
 from r2flow.lidar.encoding import Encoding, ModelSpace
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.interpolation import interpolation, interpolation_figure
 from r2flow.reports.pictures import figure_pixels
 from r2flow.samplers import build_sampler
+from r2flow.store import Store
 from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
 
 
@@ -76,3 +81,18 @@ def test_a_range_image_is_limited_to_the_range_of_the_sensor(tmp_path):
     assert name == "image"
     np.testing.assert_allclose(seen[0].flatten(), [0, 1.45, 40, 80, 0, 0, 0, 0])
     np.testing.assert_allclose(seen[1].flatten(), [0, 0.5, 0, 1, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(("of_sensor", "trained"), [(255.0, 1.0), (255.0, 255.0), (None, 255.0)])
+def test_reflectance_is_scaled_by_who_wrote_the_file(tmp_path, of_sensor, trained):
+    image, checkpoint = scans(1)[0], flow()
+    own, raw = tmp_path / "own" / "a.ply", tmp_path / "raw" / "a.ply"
+    Store(own.parent, "samples", {"reading": Reading(SENSOR).described()}).begin()
+    xyz, reflectance = image_to_points(image.numpy(), SENSOR.rays())
+    write_points(own, xyz, reflectance)
+    write_points(raw, xyz, 255 * reflectance)
+    sensor = replace(SENSOR, reflectance_scale=of_sensor)
+    checkpoint.generator.space = ModelSpace(sensor, Encoding(sensor), sensor.rays())
+    checkpoint.config["data"] = {"name": "folder", "reading": {"reflectance_scale": trained}}
+    for found in real_scans(checkpoint, [raw, own]):
+        torch.testing.assert_close(found.image, image, atol=1e-3, rtol=1e-4)
