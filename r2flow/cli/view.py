@@ -90,6 +90,7 @@ def view(
 
     The cursor links points and range image; labels next to the scans are shown.
     """
+    from r2flow.data.opening import own_reading
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.view import Panel, write_page
@@ -107,15 +108,17 @@ def view(
     counts = numbers("steps", steps) if steps else []
     check(not times or len(counts) <= 1, f"--times takes one number of --steps, found {steps}.")
     panels: list[Panel] = []
+    loaded = {spec: load_checkpoint(spec, choose_device(device)) for spec in models}
+    first = None if how.sensor or how.size else next(iter(loaded.values()), None)
     for spec in what:
-        if spec not in models:
-            new = list(scan_panels(spec, how.reading([spec], estimate_scale=True), num or SCANS))
+        if spec not in loaded:
+            reading = how.reading([spec], None if own_reading(spec) else first, estimate_scale=True)
+            new = list(scan_panels(spec, reading, num or SCANS))
             new = [in_turn(new, spec)] if sequence and len(new) > 1 else new
         elif times:
-            model = load_checkpoint(spec, choose_device(device))
-            new = way_panels(model, spec, num or SAMPLES, seed, counts[0] if counts else None, times)
+            new = way_panels(loaded[spec], spec, num or SAMPLES, seed, counts[0] if counts else None, times)
         else:
-            new = sample_panels(load_checkpoint(spec, choose_device(device)), spec, num or SAMPLES, seed, counts)
+            new = sample_panels(loaded[spec], spec, num or SAMPLES, seed, counts)
         panels += new
     title = ", ".join(Path(spec).name or spec for spec in what)
     path = write_page(out or Path(mkdtemp(prefix="r2flow-"), "view.html"), panels, title)

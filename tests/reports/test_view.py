@@ -17,6 +17,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import Draws
 from r2flow.reports.view import MOST, Panel, page
 from r2flow.simulator import simulate
+from r2flow.simulator.folder import SimulatedFolder
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
 RAYS = SENSOR.rays()
@@ -183,6 +184,16 @@ class TestTheVerb:
         expected = load(saved[0]).sample(2, steps=3)
         for frame in range(2):
             assert np.abs(unpacked(data, 1, frame)[0] - expected[frame, 0].numpy()).max() < 0.0021
+
+    def test_sees_scans_through_the_sensor_of_a_model(self, r2flow, saved, scan, tmp_path):
+        own = SimulatedFolder(tmp_path / "own", SENSORS["vlp16"].resized(16, 64), 0, ("bin",))
+        own.begin()
+        own.simulate(0)
+        wide = scan, saved[0], "--size", "64x1024"
+        for what, rows in (((saved[0], scan, own.folder), [8, 8, 16]), (wide, [64, 8])):
+            assert r2flow("view", *what, "--num", 1, "--out", tmp_path / "a.html")[::2] == (0, "")
+            data = Parsed((tmp_path / "a.html").read_text()).data
+            assert [data["rays"][one["rays"]]["rows"] for one in data["scans"]] == rows
 
     def test_goes_from_noise_to_scan(self, r2flow, saved, tmp_path):
         assert r2flow("view", saved[0], "--num", 1, "--times", 3, "--out", tmp_path / "a.html")[0] == 0
