@@ -210,6 +210,9 @@ def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):
     assert [row["weight"] for row in rows] == pytest.approx([0, 1 / 3, 2 / 3, 1])
     assert [row["evaluations"] for row in rows] == [64, 32, 32, 64]  # the ends go there and back
     assert "4 scans" in said
+    r2flow.said("interpolate", *files, "-c", run, "-o", out, "--frames", 3, "--steps", 5)
+    rows = json.loads((out / "interpolation.json").read_text())["rows"]
+    assert [row["evaluations"] for row in rows] == [10, 5, 10]  # of adams3, one a step
 
 
 def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):

@@ -107,19 +107,20 @@ def interpolate(
 ) -> None:
     """Interpolate between two real scans in noise space: a figure and a point cloud per frame.
 
-    Default solver: dopri5 with tolerance 1e-4.
+    Default solver: dopri5 with tolerance 1e-4; with --steps or --grid, the flow's own.
     """
-    from r2flow.generators import as_flow
+    from r2flow.generators.flow import as_flow, ode_sampler
     from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.interpolation import interpolation
     from r2flow.reports.pages import prepare_folder, write_page
-    from r2flow.samplers import build_sampler
+    from r2flow.samplers import Adaptive, build_sampler
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
-    given = sampling.given
-    sampler = build_sampler(given if "name" in given else {"name": "dopri5", "tolerance": 1e-4, **given})
-    sampler.check(as_flow(loaded.generator, "interpolation"))
+    given, flow = sampling.given, as_flow(loaded.generator, "interpolation")
+    usual = ode_sampler(flow) if given.keys() & {"steps", "grid"} else Adaptive(tolerance=1e-4)
+    sampler = build_sampler(given) if "name" in given else usual.changed(**given)
+    sampler.check(flow)
     ends = real_scans(loaded, [first, last], reflectance_scale)
     check(len(ends) == 2, f"give two scans, found {len(ends)}.")
     prepare_folder(out)
