@@ -160,7 +160,7 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         raise InputError(f"{len(xyz)} returns are too few for an estimate: give scans with at least {FEWEST_RETURNS}.")
     beams = find_beams(*scans)
     steps = steps_of_a_turn(scans, beams.of_point)
-    elevations = beams.elevations.astype(float).round(3).tolist()
+    elevations = (beams.elevations.astype(float).round(3) + 0.0).tolist()  # no -0.0
     for row in range(1, len(elevations)):  # equal after rounding
         elevations[row] = min(elevations[row], round(elevations[row - 1] - 1e-3, 3))
     near, middle, far = np.quantile(np.linalg.norm(xyz, axis=1), [1e-4, 0.5, 1 - 1e-4])

@@ -142,6 +142,11 @@ def test_range_limits_include_all_but_stray_returns():
     assert estimate_sensor([Points(xyz / 20)]).sensor.min_range == math.floor(r.min() / 2) / 10  # 0.3 m
 
 
+def test_a_level_beam_is_not_at_minus_zero():
+    level = Sensor("level", (4.0, 2.0, -2e-4, -2.0, -4.0), columns=192)
+    assert str(estimate_sensor([scan(level, RINGS)]).sensor.elevations) == "(4.0, 2.0, 0.0, -2.0, -4.0)"
+
+
 def test_what_no_sensor_is_estimated_from_is_refused():
     with pytest.raises(InputError, match="too few"):
         estimate_sensor([Points(np.ones((1, 3), np.float32))])
