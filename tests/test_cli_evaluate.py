@@ -191,8 +191,8 @@ def plugged_in(monkeypatch):
 
 
 def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, plugged_in):
-    options = ("--metrics", "mine,frechet_means,kid_means", *QUICK[2:], "--bootstrap", 5, "--json", tmp_path / "e.json")
-    said = r2flow.said("evaluate", real, generated, *options)
+    options = ("--metrics", "mine,frechet_means,kid_means,panel", *QUICK[2:], "--bootstrap", 5)
+    said = r2flow.said("evaluate", real, generated, *options, "--json", tmp_path / "e.json")
     ranges = [scans[:, 0][(scans[:, 0] > 0) & (scans[:, 0] < 63)].mean() for scans in (images(12, 1), images(10, 2))]
     both = (Scans(torch.from_numpy(scans), SENSOR) for scans in (images(12, 1), images(10, 2)))
     rows = [Summary().features(scans).double().numpy() for scans in both]
@@ -203,6 +203,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
     assert found[1]["figures"] == {"frechet_means": pytest.approx(frechet, rel=1e-4)}
     assert "mine" in found[0]["intervals"]
     assert "kid_means" in said
+    assert "\n  kid_means, panel: no bootstrap interval.\n" in said
 
 
 def test_a_scan_is_no_place_for_figures(r2flow, real, generated):

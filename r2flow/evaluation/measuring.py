@@ -198,7 +198,7 @@ def measure(
         settings = {**described, **asdict(metric.protocol), "sizes": sizes}
         intervals: dict[str, tuple[float, float]] = {}
         if draws and not metric.resamples:
-            remarks.append(f"{name} has no bootstrap interval.")
+            remarks.append("no bootstrap interval.")
         elif draws:
             settings["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
             with bar("resampling", draws, "sets") as advance:

@@ -211,7 +211,7 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
                 remarks.setdefault(remark, {}).setdefault(comparison.title, []).append(result.metric)
     for remark, where in remarks.items():
         metrics = list(dict.fromkeys(name for names in where.values() for name in names))
-        about = [] if len(where) == len(comparisons) else [", ".join(where)]
+        about = [] if len(where) == len(comparisons) or remark.startswith("no bootstrap") else [", ".join(where)]
         if len(metrics) < len(comparisons[0].measured) and not remark.startswith(tuple(metrics)):
             about.append(", ".join(metrics))
         lines.append(f"{'; '.join(about)}: {remark}" if about else remark)
