@@ -1,10 +1,8 @@
-from itertools import product
-
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-from r2flow.metrics.extractors.sparse import Sparse, SparseConv3d, VoxelGrid, offsets
+from r2flow.metrics.extractors.sparse import SparseConv3d, offsets
 from r2flow.metrics.extractors.voxels import SPVCNN, MinkowskiNet
 
 
@@ -31,36 +29,6 @@ def dense_kernel(kernel: torch.Tensor, size: int) -> torch.Tensor:
 def at(dense: torch.Tensor, coords: torch.Tensor) -> torch.Tensor:
     x, y, z = coords.T
     return dense[0, :, x, y, z].T
-
-
-def test_the_order_of_the_weights_is_torchsparse_s():
-    # Its get_kernel_offsets by hand: odd sizes are centred and count x fastest, even ones start at 0 and count z.
-    assert offsets(3)[:4] == [(-1, -1, -1), (0, -1, -1), (1, -1, -1), (-1, 0, -1)]
-    assert offsets(3)[13] == (0, 0, 0)
-    assert offsets(2) == [(0, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1)]
-    assert offsets(1) == [(0, 0, 0)]
-    # A voxel at the origin, one behind it in x and one above it: weight k is k, so that a sum says which were used.
-    coords = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    x = Sparse(torch.tensor([[1.0], [10.0], [100.0]]), VoxelGrid(coords))
-    odd, down = SparseConv3d(1, 1, 3), SparseConv3d(1, 1, 2)
-    odd.kernel.data = torch.arange(27.0).view(27, 1, 1)
-    down.kernel.data = torch.arange(8.0).view(8, 1, 1)
-    # +x is offset 14 and +z offset 22; the origin is 12 from the first and 4 from the second; and so on.
-    assert odd(x).features.flatten().tolist() == [
-        13 * 1 + 14 * 10 + 22 * 100,
-        13 * 10 + 12 * 1 + 21 * 100,
-        13 * 100 + 4 * 1 + 5 * 10,
-    ]
-    assert down(x).features.flatten().tolist() == [0 * 1 + 4 * 10 + 1 * 100]
-
-
-def test_cells_outside_the_bounding_box_are_not_voxels():
-    coords = torch.tensor([[3, 5, 1], [0, 5, 0], [0, 0, 0], [2, 4, 1]])
-    grid, where = VoxelGrid(coords), coords.tolist()
-    for offset in product((-1, 0, 1), repeat=3):
-        cells = coords + torch.tensor(offset)
-        assert grid.find(cells).tolist() == [where.index(cell) if cell in where else -1 for cell in cells.tolist()]
-    assert sorted(grid.coarser().coords.tolist()) == [[0, 0, 0], [0, 2, 0], [1, 2, 0]]
 
 
 class Dense:
