@@ -5,15 +5,21 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow.callbacks.ema import EMA, averaged_weights, ema_decay
+from r2flow.callbacks.ema import DECAYS, EMA, averaged_weights
 from tests.conftest import quiet_trainer
+from tests.reference import load_case
 
 
-def test_the_decay_is_the_reference_s(shared):
-    reference = torch.load(shared / "oracle" / "training.pt", weights_only=False)["ema"]
-    for step, decay in reference["decay_at_step_after10000"].items():
-        # That table is of a counter that stands one past the step.
-        assert ema_decay(max(step - 1, 0), 10_000, reference["beta"]) == pytest.approx(decay, abs=1e-6)
+def test_the_decays_are_the_published(shared):
+    case = load_case(shared, "lidm_diffusion.pt")["ema"]
+    found = [DECAYS["ratio"](step, 0, 0.9999) for step in range(len(case["decay"]))]
+    assert found == pytest.approx(case["decay"].tolist(), abs=1e-6)
+
+
+def test_decays_begin_behind_the_warm_up_and_are_bounded():
+    """LiDARGen's is constant, LiDM's (1 + n) / (10 + n) from n = 1."""
+    assert [DECAYS["constant"](step, 2, 0.9) for step in (1, 2, 3)] == [0, 0.9, 0.9]
+    assert [DECAYS["ratio"](step, 2, 0.26) for step in (1, 2, 3, 9)] == pytest.approx([0, 2 / 11, 0.25, 0.26])
 
 
 class Scripted(L.LightningModule):

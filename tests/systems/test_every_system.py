@@ -3,7 +3,7 @@
 import json
 import os
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.callbacks.ema import DECAYS, ema_decay
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
-from tests.reference import assert_near, load_case
 from tests.training.conftest import hold_at, in_process, let_go, start, wait_for
 
 SENSOR = {"name": "hdl64e", "rows": 8, "columns": 32}
@@ -152,41 +150,6 @@ def test_a_killed_system_ends_as_the_one_left_alone(tmp_path: Path, family: str)
     if family == "latent":  # its autoencoder stays as it is
         first = load_checkpoint(tmp_path / "first").generator.first_stage_model
         assert_equal(first.state_dict(), load_checkpoint(tmp_path / "alone").generator.first_stage_model.state_dict())
-
-
-def averages(shared: Path, name: str) -> Iterator[tuple[float, Tensor, Tensor]]:
-    """The decay of each step, the weights after it, and the published average."""
-    if name == "lidargen":
-        case = load_case(shared, "lidargen_objective.pt")["ema"]
-        for step, pair in enumerate(zip(case["online"][1:], case["ema"][1:], strict=True)):
-            yield DECAYS["constant"](step, 0, case["mu"]), *pair
-    elif name == "lidm":
-        case = load_case(shared, "lidm_diffusion.pt")["ema"]
-        for step, expected in enumerate(case["decay"]):
-            decay = DECAYS["ratio"](step, 0, 0.9999)
-            assert decay == pytest.approx(expected.item(), abs=1e-6)
-            yield decay, case["online"][step + 1], case["ema"][step + 1]
-    else:
-        case = load_case(shared, "r2dm_schedules.pt")["ema"]
-        for call, (online, expected) in enumerate(zip(case["online"], case["ema"], strict=True)):
-            due = call % case["update_every"] == 0
-            settings = case["update_after_step"], case["beta"], case["power"]
-            yield ema_decay(call, *settings) if due else 1.0, online, expected
-
-
-FIRST_AVERAGES = {
-    "lidargen": ("lidargen_objective.pt", "ema"), "lidm": ("lidm_diffusion.pt", "ema"),
-    "r2dm": ("r2dm_schedules.pt", "online"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "tolerance"), [("lidargen", 1e-6), ("lidm", 1e-5), ("r2dm", 1e-6)])
-def test_the_average_of_the_weights_is_the_published(shared: Path, name: str, tolerance: float):
-    file, key = FIRST_AVERAGES[name]
-    average = load_case(shared, file)["ema"][key][0]
-    for decay, online, expected in averages(shared, name):
-        average = torch.lerp(online, average, decay)
-        assert_near(average, expected, tolerance)
 
 
 def garble(part: str, **changes: Any) -> Callable[[Any], None]:
