@@ -452,15 +452,19 @@ def test_a_masked_autoencoder_drops_what_its_mask_denies():
     torch.testing.assert_close(reconstruction_loss(x, raw, mask, 0.5), expected)
 
 
-FULL = {"lidargen": 29_694_082, "lidm_autoencoder": 15_070_361}
+FULL = {
+    "lidargen": ([], 29_694_082), "lidm_autoencoder": ([], 15_070_361),
+    "r2dm": (["encoding.reflectance=true"], 31_099_650),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FULL)
 def test_a_published_recipe_is_built(name: str, tmp_path: Path):
-    config = compose([f"experiment={name}", "data.root=/nowhere", "trainer.accelerator=cpu", f"run_dir={tmp_path}"])
-    config = check(config)
+    given, count = FULL[name]
+    options = [*given, "data.root=/nowhere", "trainer.accelerator=cpu", f"run_dir={tmp_path}"]
+    config = check(compose([f"experiment={name}", *options]))
     with torch.device("meta"):
-        assert sum(p.numel() for p in build_generator({**config}).parameters()) == FULL[name]
+        assert sum(p.numel() for p in build_generator({**config}).parameters()) == count
 
 
 def test_the_published_recipe_with_positions_starts_from_its_autoencoder(tmp_path: Path):
