@@ -195,33 +195,25 @@ def test_two_devices_make_the_pairs_that_one_makes(chained: tuple[Path, str], tm
 
 
 ALL_LINKS = ("data.batch_size=2", "data.validation.share=0.1", "+trainer.x=1")
+OF_SCANS = ("data.augment.flip=true", "data.a_key_of_tomorrow=1", "data.validation.data.root=x", "sensor=vlp16")
 
 
-def test_links_take_what_concerns_them():
+def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone():
     chain = {
         "rf1": {"experiment": None, "trainer": {"max_steps": 5}},
         "rf2": {"experiment": "reflow", "init": "rf1", "stage": {"loss": "mse"}},
     }
     given = ["experiment=demo", "name=x", "chain.rf1.trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3",
-             "data.pairs.num=9", *ALL_LINKS, "backbone.depths=[1]"]  # fmt: skip
+             *OF_SCANS, "data.pairs.num=9", *ALL_LINKS, "backbone.depths=[1]", "+chain.rf2.seed=2"]  # fmt: skip
     first, second = links_of(chain, "runs/x", given)
     assert first.overrides == (
-        "trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3", *ALL_LINKS,
+        "trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3", *OF_SCANS, *ALL_LINKS,
         "backbone.depths=[1]", "trainer.max_steps=5", "run_dir='runs/x/rf1'",
     )  # fmt: skip
     assert second.overrides == (
         "experiment=reflow", "stage.loss=mse", "stage.init='runs/x/rf1'", "seed=3", "data.pairs.num=9",
-        *ALL_LINKS, "run_dir='runs/x/rf2'",
+        *ALL_LINKS, "seed=2", "run_dir='runs/x/rf2'",
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "given", ["data.augment.flip=true", "data.a_key_of_tomorrow=1", "data.validation.data.root=x", "sensor=vlp16"]
-)
-def test_what_concerns_scans_goes_to_the_link_that_reads_them(given: str):
-    first, second = links_of({"rf1": {}, "rf2": {"experiment": "reflow", "init": "rf1"}}, "runs", [given])
-    assert given in first.overrides
-    assert given not in second.overrides
 
 
 def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
@@ -251,21 +243,10 @@ def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path
     assert "data.scenes=9" in child.overrides
 
 
-def test_what_is_given_to_one_link_wins_over_what_is_given_to_all():
-    given = ["chain.rf1.trainer.max_steps=5", "trainer.max_steps=9", "+chain.rf2.seed=2"]
-    first, second = links_of({"rf1": {"trainer": {"max_steps": 5}}, "rf2": {"init": "rf1", "seed": 2}}, "runs", given)
-    assert first.overrides[:3] == ("trainer.max_steps=5", "trainer.max_steps=9", "trainer.max_steps=5")
-    assert second.overrides[-2:] == ("seed=2", "run_dir='runs/rf2'")
-
-
-def test_a_link_s_stage_has_its_own_options():
-    (link,) = links_of({"td4": {"stage": {"name": "distill", "steps": 4, "init": "runs/old"}}}, "runs/x", [])
-    assert compose(link.overrides)["stage"]["steps"] == 4
-
-
-def test_a_chain_can_begin_at_a_flow_that_is_there():
-    chain = {"rf2": {"experiment": "reflow", "stage": {"init": "runs/old"}}}
+def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_options():
+    chain = {"td4": {"stage": {"name": "distill", "steps": 4, "init": "runs/old"}}}
     (link,) = links_of(chain, "runs/x", ["data.pairs.num=5", "data.root=scans"])
+    assert compose(link.overrides)["stage"]["steps"] == 4
     assert "data.pairs.num=5" in link.overrides
     assert "data.root=scans" not in link.overrides
 
