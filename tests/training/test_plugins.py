@@ -12,56 +12,18 @@ from hydra.core.config_store import ConfigStore
 from r2flow import plugins
 from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import Checkpoint, checkpoints_of, load_checkpoint, save_checkpoint
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from r2flow.plugins import load_plugins, made_with, take_plugins
 from r2flow.registry import Registry
 from r2flow.reports.compare import read_runs
 from r2flow.runs.composing import REGISTRIES, choices, compose
-from r2flow.runs.folder import read_config, write_config
+from r2flow.runs.folder import write_config
 from r2flow.stages import STAGES
 from r2flow.training import build
-from tests.training.conftest import Run, in_process, tiny
+from tests.extension.conftest import FAMILIES, GAN, TINY, loaded
+from tests.training.conftest import in_process
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "street"
-
-STAGE = '''
-from r2flow.stages import STAGES
-from r2flow.stages.rectify import Rectify
-
-
-class Eager(Rectify):
-    """Takes its own steps, and clips for itself.
-
-    Args:
-        pace: Nothing.
-    """
-
-    def __init__(self, generator, pace: int = 3, **options):
-        super().__init__(generator, **options)
-        self.automatic_optimization = False
-        self.clipped = []
-
-    def training_step(self, batch, batch_idx):
-        (optimizer,) = self.own_optimizers()
-        loss = super().training_step(batch, batch_idx)
-        optimizer.zero_grad()
-        self.manual_backward(loss)
-        self.clip_gradients(optimizer, self.gradient_clip_val, "norm")
-        optimizer.step()
-
-
-STAGES.add("eager", Eager)
-'''
-
-
-@pytest.fixture
-def eager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file with a stage of its own, forgotten again after the test."""
-    path = tmp_path / "eager.py"
-    path.write_text(STAGE)
-    monkeypatch.setattr(plugins, "_loaded", dict(plugins._loaded))
-    monkeypatch.setattr(STAGES, "_entries", dict(STAGES._entries))
-    return path
 
 
 @pytest.fixture(autouse=True)
@@ -85,17 +47,6 @@ def choices_before() -> Iterator[None]:
 )
 def test_a_plugin_stands_anywhere_on_the_command_line(line: list[str], rest: list[str], names: list[str]):
     assert take_plugins(line) == (rest, names)
-
-
-def test_a_stage_of_ones_own_needs_no_yaml_trains_and_resumes(eager: Path, train: Run, tmp_path: Path):
-    options = ["stage=eager", "stage.pace=5", "name=own", f"--plugin={eager}"]
-    train(*options, "trainer.max_steps=4")
-    run = tmp_path / "runs" / "own"
-    config = read_config(run)
-    assert config is not None
-    assert config["plugins"] == [str(eager)]
-    assert (config["stage"]["pace"], config["stage"]["loss"], config["stage"]["init"]) == (5, "mse", None)
-    assert [int(path.stem[-8:]) for path in checkpoints_of(run)] == [4, 2]
 
 
 @pytest.mark.parametrize("wanted", ["stage=eager", "+callbacks.mine={}"])
@@ -123,29 +74,30 @@ def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path, 
         load_checkpoint(tmp_path / "deep.safetensors")
 
 
-def test_a_stage_that_takes_its_own_steps_clips_for_itself(eager: Path, scans: Path):
-    load_plugins([str(eager)])
-    config = compose(tiny(scans, "stage=eager", "trainer.gradient_clip_val=0.5"))
-    run = build(config)
-    assert run.stage.gradient_clip_val == 0.5
-    assert run.trainer.gradient_clip_val is None
-    config["trainer"]["accumulate_grad_batches"] = 2
-    with pytest.raises(InputError, match="stage=eager takes its own optimiser steps"):
-        build(config)
+def test_a_stage_that_takes_its_own_steps_clips_for_itself():
+    with loaded(GAN):
+        config = compose([*TINY, *GAN.choices, "trainer.gradient_clip_val=0.5"])
+        run = build(config)
+        assert run.stage.gradient_clip_val == 0.5
+        assert run.trainer.gradient_clip_val is None
+        config["trainer"]["accumulate_grad_batches"] = 2
+        with pytest.raises(InputError, match="stage=toy_gan takes its own optimiser steps"):
+            build(config)
 
 
-def test_a_plugin_is_not_imported_because_a_file_names_it(eager: Path, tmp_path: Path):
-    made = made_with({"plugins": [str(eager)]}, "it")
-    with pytest.raises(InputError, match=f"no stage named 'eager'; .* give --plugin {eager}"), made:
-        STAGES["eager"]
+def test_a_plugin_is_not_imported_because_a_file_names_it(tmp_path: Path):
+    theirs = FAMILIES / "toy_gan.py"
+    made = made_with({"plugins": [str(theirs)]}, "it")
+    with pytest.raises(InputError, match=f"no stage named 'toy_gan'; .* give --plugin {theirs}"), made:
+        STAGES["toy_gan"]
     folder = tmp_path / "conf" / "experiment"
     folder.mkdir(parents=True)
-    of_a_sweep = f"hydra:\n  sweeper:\n    params:\n      plugins: '[{eager}]'"
-    for text, flags in ((f"plugins: [{eager}]", ()), (of_a_sweep, ("-m",))):
+    of_a_sweep = f"hydra:\n  sweeper:\n    params:\n      plugins: '[{theirs}]'"
+    for text, flags in ((f"plugins: [{theirs}]", ()), (of_a_sweep, ("-m",))):
         (folder / "theirs.yaml").write_text(f"# @package _global_\n{text}\n")
         done = in_process(tmp_path, ["--config-dir", str(folder.parent), *flags, "experiment=theirs"], check=False)
-        assert f"never in a file: give --plugin {eager}" in done.refusal
-    assert "eager" not in STAGES
+        assert f"never in a file: give --plugin {theirs}" in done.refusal
+    assert "toy_gan" not in STAGES
 
 
 def test_one_file_is_imported_once_however_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
