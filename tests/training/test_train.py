@@ -151,62 +151,39 @@ def test_a_run_goes_on_with_other_workers_and_threads(
     torch.testing.assert_close(weights(alone[0]), weights(copied), rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("odd", ["cut", "empty", "weights alone", "other shapes", "other names", "a pipe", "a folder"])
-def test_an_odd_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, str], copied: Path, odd: str):
+def test_odd_later_checkpoints_are_passed_over_and_set_aside(train: Run, alone: tuple[Path, str], copied: Path):
     newest, older = checkpoints_of(copied)
-    whole, content = newest.read_bytes(), torch.load(newest, weights_only=True)
+    cut, whole = newest.read_bytes()[:1000], torch.load(newest, weights_only=True)
     newest.unlink()
-    name, value = next(item for item in content["state_dict"].items() if item[1].ndim > 1)
-    if odd == "cut":
-        newest.write_bytes(whole[:1000])
-    elif odd == "a pipe":
-        os.mkfifo(newest.with_name("step-00000011.ckpt"))
-    elif odd == "a folder":
-        newest.with_name("step-00000011.ckpt").mkdir()
-    else:
-        if odd == "empty":
-            content = {}
-        elif odd == "weights alone":
-            del content["optimizer_states"]
-        elif odd == "other shapes":
-            content["state_dict"][name] = value[None]
-        elif odd == "other names":
-            content["state_dict"]["foo"] = content["state_dict"].pop(name)
-        torch.save(content, newest)
+    state = whole["state_dict"]
+    name, value = next(item for item in state.items() if item[1].ndim > 1)
+    others = {key: part for key, part in state.items() if key != name}
+    odd = {
+        "empty": {},
+        "weights alone": {key: part for key, part in whole.items() if key != "optimizer_states"},
+        "other shapes": {**whole, "state_dict": {**others, name: value[None]}},
+        "other names": {**whole, "state_dict": {**others, "foo": value}},
+    }
+    places = [newest.with_name(f"step-{step:08d}.ckpt") for step in range(13, 20)]
+    for content, place in zip(odd.values(), places, strict=False):
+        torch.save(content, place)
+    places[4].write_bytes(cut)
+    os.mkfifo(places[5])
+    places[6].mkdir()
     done = train("name=copied")
     assert f"resuming from {older.relative_to(copied.parents[1])}" in done.stdout
     assert_bit_equal(alone[0], copied)
+    assert checkpoints_of(copied) == [newest, older]
+    assert len([*newest.parent.glob("*.damaged")]) == 5  # the pipe and the folder are no checkpoints
 
 
-def test_damaged_checkpoints_of_later_steps_are_set_aside(train: Run, copied: Path):
-    newest, older = checkpoints_of(copied)
-    for step in (20, 22):
-        newest.with_name(f"step-{step:08d}.ckpt").write_bytes(b"half")
-    newest.unlink()
-    train("name=copied")
-    assert (checkpoints_of(copied), len([*newest.parent.glob("*.damaged")])) == ([newest, older], 2)
-
-
-@pytest.mark.parametrize(("before", "keep", "options"), [(20, 1, []), (3, 2, ["callbacks.requeue=null"])])
-def test_a_run_resumes_with_fewer_checkpoints(
-    train: Run, tmp_path: Path, before: int, keep: int, options: list[str], recwarn: pytest.WarningsRecorder
-):
-    command, run = ["run_dir=run", "trainer.max_steps=8", "samples.num=0", *options], tmp_path / "run"
-    train(*command, f"callbacks.checkpoint.keep={before}")
-    checkpoints_of(run)[0].unlink()
-    train(*command, f"callbacks.checkpoint.keep={keep}")
-    assert [step_of(path) for path in checkpoints_of(run)] == [8, 6][:keep]
-    checkpoints_of(run)[0].unlink()
-    train(*command, "callbacks.checkpoint.every=1")
-    assert [step_of(path) for path in checkpoints_of(run)][:2] == [8, 7]
+def test_a_run_resumes_with_fewer_checkpoints(train: Run, tmp_path: Path, recwarn: pytest.WarningsRecorder):
+    command, run = ["run_dir=run", "trainer.max_steps=8", "samples.num=0", "callbacks.requeue=null"], tmp_path / "run"
+    for options, kept in (("keep=20", [8, 6, 4, 2]), ("keep=2", [8, 6]), ("keep=1", [8]), ("every=1", [8, 7])):
+        train(*command, f"callbacks.checkpoint.{options}")
+        assert [step_of(path) for path in checkpoints_of(run)] == kept
+        checkpoints_of(run)[0].unlink()
     assert not [one for one in recwarn if "ckpt_path" in str(one.message)]
-
-
-def test_a_moved_run_goes_on(train: Run, alone: tuple[Path, str], copied: Path):
-    moved = copied.rename(copied.parent / "moved")
-    checkpoints_of(moved)[0].unlink()  # as if killed before the last step
-    train("name=moved")
-    assert_bit_equal(alone[0], moved)
 
 
 def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
