@@ -79,7 +79,8 @@ def test_growth_beyond_float32_is_flagged(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_an_empty_interval_returns_the_start_without_evaluations(method):
+def test_an_empty_interval_or_batch_returns_the_start_without_evaluations(method):
+    assert solve(Gaussian(), torch.zeros(0, 4), method=method).x.shape == (0, 4)
     for t in (0.0, 1.0):
         solution = solve(Gaussian(), X_0, t, t, method=method, global_error=True)
         assert torch.equal(solution.x, X_0)
@@ -204,11 +205,6 @@ def test_a_point_mass_needs_an_euler_step_at_the_end():
     unfinished = solve(problem, x_0, method="dopri5", tolerance=1e-3)
     assert not unfinished.converged.any()
     torch.testing.assert_close(unfinished.x, torch.full_like(x_0, 0.5), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_an_empty_batch_is_solved(method):
-    assert solve(Gaussian(), torch.zeros(0, 4), method=method).x.shape == (0, 4)
 
 
 def most_alive(method: str, steps: int, tolerance: float) -> tuple[int, int]:
