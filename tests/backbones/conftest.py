@@ -1,5 +1,5 @@
 import pytest
-from plain_backbone import Plain
+from tiny_backbones import Plain
 
 from r2flow.backbones import BACKBONES
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 import torch
-from plain_backbone import Plain
+from tiny_backbones import Plain
 from torch import nn
 
 from r2flow.backbones import build_backbone, configurations
