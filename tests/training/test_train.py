@@ -102,13 +102,13 @@ def test_a_killed_run_ends_as_the_one_left_alone(
 
 
 @pytest.mark.parametrize(
-    ("by", "code", "workers"), [(signal.SIGTERM, 143, 2), pytest.param(signal.SIGINT, 130, 2, marks=pytest.mark.slow)]
+    ("by", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
 )
 def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(
-    train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, by: int, code: int, workers: int
+    train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, by: int, code: int
 ):
     # The regular checkpoints are those of steps 4, 8 and 12.
-    options = ["name=stopped", f"data.workers={workers}", "callbacks.checkpoint={every: 4, keep: 3}"]
+    options = ["name=stopped", "data.workers=2", "callbacks.checkpoint={every: 4, keep: 3}"]
     options += ["data.memory_gib=0", *hold_at(5, tmp_path / "held")]
     found, said = stop_held(tmp_path / "held", by, tiny(scans, *options))
     assert found == code, said
