@@ -53,15 +53,6 @@ def test_a_range_that_is_none_is_no_point(r):
     np.testing.assert_array_equal(np.sort(reflectance), image[1, 0, ::2])
 
 
-def test_a_pixel_keeps_the_nearest_return_in_any_order():
-    points = np.array([point(r, -5, 20) for r in (30, 12, 50)])
-    for order in ([0, 1, 2], [1, 0, 2], [2, 0, 1]):
-        image = project(points[order], np.array([0.3, 0.1, 0.5])[order], HDL64E)
-        assert image[0].max() == pytest.approx(12, rel=1e-6)
-        assert image[1].max() == pytest.approx(0.1)
-        assert (image[0] > 0).sum() == 1
-
-
 def test_a_return_too_near_does_not_hide_what_is_behind_it():
     points = np.array([point(1.0, -5, 20), point(30, -5, 20)])
     assert project(points, np.ones(2), HDL64E)[0].max() == pytest.approx(30, rel=1e-6)
@@ -242,21 +233,6 @@ def test_rings_stored_from_behind_on_are_refused():
     from_behind = np.roll(xyz.reshape(16, 48, 3), 24, axis=1).reshape(-1, 3)
     with pytest.raises(InputError, match="from azimuth 0 on"):
         project(from_behind, None, sensor, "unfolding")
-
-
-def test_a_real_scan_of_whole_firings(shared):
-    # 64 x 2048 in order: the row of a point is its number modulo 64.
-    (path,) = (shared / "real" / "other_sensors" / "rellis_os1_64").glob("*.bin")
-    xyz = read_points(path).xyz
-    sensor = SENSORS["os1_64"].resized(columns=2048)
-    r = np.linalg.norm(xyz, axis=1)
-    image = project(xyz, r, sensor, "unfolding")
-    counted = np.bincount(np.arange(len(xyz))[(r >= 0.8) & (r <= 120)] % 64, minlength=64)
-    filled = (image[0] > 0).sum(axis=1)
-    assert (filled <= counted).all()
-    assert filled.sum() > 0.98 * counted.sum()  # a few share a column with a neighbour
-    for row in (5, 20, 40, 63):
-        assert set(image[1, row][image[0, row] > 0].tolist()) <= set(r[row::64].astype(np.float32).tolist())
 
 
 def test_a_real_scan_unfolds_by_ring_and_by_firing_alike(shared):

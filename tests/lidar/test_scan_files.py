@@ -181,36 +181,3 @@ def test_a_refused_write_leaves_the_old_file(tmp_path, name, change, word):
         write_points(path, **({"xyz": np.array(XYZ), "reflectance": np.array(REFLECTANCE)} | change))
     assert path.read_bytes() == b"old"
     assert len(list(tmp_path.iterdir())) == 1
-
-
-# --- real sensors ---
-
-OTHER = {  # points, ring count, whether there is a reflectance: from the sensors' own file sizes
-    "nuscenes_hdl32e/*.pcd.bin": (693760 // 20, 32, True),
-    "rellis_os1_64/*.bin": (64 * 2048, None, True),
-    "rellis_vlp32c/*.bin": (597344 // 16, None, True),
-    "vlp16/000000.pcd": (22988, None, False),
-    "vlp16/000200.pcd": (19993, None, False),
-    "vlp16/000400.pcd": (14294, None, False),
-}
-
-
-@pytest.mark.parametrize("pattern", OTHER)
-def test_scans_of_other_sensors_are_read(shared, pattern):
-    count, rings, has_reflectance = OTHER[pattern]
-    (path,) = (shared / "real" / "other_sensors").glob(pattern)
-    points = read_points(path)
-    assert points.xyz.shape == (count, 3)
-    assert points.dropped == 0
-    assert np.linalg.norm(points.xyz, axis=1).max() < 300
-    assert (points.reflectance is not None) == has_reflectance
-    assert (None if points.ring is None else len(np.unique(points.ring))) == rings
-
-
-def test_every_hdl64_scan_is_read(shared):
-    paths = [p for p in sorted((shared / "real").rglob("*.bin")) if "other_sensors" not in p.parts]
-    assert len(paths) > 50
-    for path in paths:
-        points = read_points(path)
-        assert len(points.xyz) == path.stat().st_size // 16
-        assert 0 <= points.reflectance.min() <= points.reflectance.max() < 1

@@ -289,27 +289,6 @@ def test_wrong_headers_and_rows_are_refused(tmp_path, case):
     assert read_bytes(tmp_path, *WRONG[case]) is None
 
 
-def test_rows_of_five_or_four_are_told_apart(tmp_path):
-    for name, rows, other in (("bin", np.column_stack([TABLE, RING])[:5], "pcd.bin"), ("pcd.bin", TABLE[:6], "KITTI")):
-        (tmp_path / f"a.{name}").write_bytes(rows.tobytes())
-        with pytest.raises(InputError, match=other):
-            read_points(tmp_path / f"a.{name}")
-
-
-@pytest.mark.parametrize(
-    "array",
-    [
-        np.zeros((2, 64, 1024), np.float32), np.zeros((4, 100), np.float32), np.zeros((100, 5), np.float32),
-        np.zeros((0, 3), np.float32), np.float32(3), np.ones((100, 3), np.complex64),
-        np.ones(100, [("x", "f4"), ("y", "f4"), ("w", "f4")]), np.array([["x", "y", "z"]]),
-    ],
-    ids=lambda array: f"{array.shape} {array.dtype}",
-)  # fmt: skip
-def test_arrays_that_are_not_points_are_refused(tmp_path, array):
-    np.save(tmp_path / "a.npy", array)
-    assert read(tmp_path / "a.npy") is None
-
-
 def test_a_pickle_in_a_npy_is_never_run(tmp_path):
     np.save(tmp_path / "a.npy", np.array([Trap()], dtype=object), allow_pickle=True)
     assert read(tmp_path / "a.npy") is None
