@@ -82,15 +82,6 @@ def test_two_returns_of_each_ray_are_of_one_beam():
     assert found.firing == SENSORS["vlp16"].firing
 
 
-def test_an_estimated_sensor_projects_its_scans_like_the_true_one():
-    sensor = SENSORS["vlp32c"].resized(columns=192)
-    points = scan(sensor, FIRINGS)
-    mine = estimate_sensor([points]).sensor
-    for projection in ("spherical", "unfolding"):
-        expected = project(points.xyz, points.reflectance, sensor, projection)
-        np.testing.assert_array_equal(project(points.xyz, points.reflectance, mine, projection), expected)
-
-
 @pytest.mark.parametrize("first", [0, 1])
 def test_ring_numbers_by_laser_give_the_firing_order(first):
     sensor = SENSORS["vlp16"].resized(columns=192)
@@ -205,7 +196,7 @@ def test_every_beam_of_a_real_unit_has_its_own_row(shared):
 def test_the_height_of_simulated_scans_is_found(name):
     """Beams close to the horizon meet more hedges and cars than ground."""
     sensor = SENSORS[name].resized(columns=256)
-    scans = [Points(*image_to_points(simulate(sensor, 3, index).image, sensor.rays())) for index in range(8)]
+    scans = [Points(*image_to_points(simulate(sensor, 3, index).image, sensor.rays())) for index in range(4)]
     assert estimate_sensor(scans).sensor.height == pytest.approx(sensor.height, abs=0.2)
 
 
@@ -242,7 +233,7 @@ def refuse_wrong_answers(scans: list[Points], true: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in SENSORS if name != "hdl64e"])
 def test_every_pair_of_sensors_is_told_apart(name: str):
-    sensor = SENSORS[name].resized(columns=384)
+    sensor = SENSORS[name].resized(columns=192)
     for how in (RINGS, RING_AFTER_RING):
         refuse_wrong_answers([scan(sensor, how, seed) for seed in range(2)], name)
 

@@ -47,7 +47,8 @@ def rows_with_beams(elevations, target: Sensor) -> set[int]:
 @pytest.mark.parametrize("source", list(SENSORS))
 def test_the_rows_are_measured_that_a_beam_looks_into(source, target):
     beams = SENSORS[source].elevations
-    seen = points_through(wall(fired(beams)), fired(beams), target)
+    firing = fired(beams, 600)
+    seen = points_through(wall(firing), firing, target)
     expected = rows_with_beams(beams, target)
     measured = np.flatnonzero((seen.state != Ray.UNKNOWN).any(axis=1))
     # float32 coordinates may put a beam that looks along an edge to either side of it
