@@ -47,16 +47,6 @@ def test_ranks_share_every_global_batch(ranks):
         assert len({len(share) for share in shares}) == 1
 
 
-def test_an_item_depends_on_its_number_alone():
-    dataset = FlowDataset(SCANS, Encoding(SENSOR), 0, "training")
-    first = dataset[(17, 3)]
-    dataset[(18, 3)]
-    again = dataset[(17, 3)]
-    assert all(torch.equal(first[name], again[name]) for name in first)
-    assert not torch.equal(first["x_0"], dataset[(18, 3)]["x_0"])
-    assert torch.equal(first["x_1"], dataset[(18, 3)]["x_1"])
-
-
 def test_workers_change_nothing():
     def batches(workers):
         dataset = FlowDataset(SCANS, Encoding(SENSOR), 0, "training")

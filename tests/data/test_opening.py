@@ -49,11 +49,6 @@ def numbers(scans) -> list[int]:
 class TestNames:
     """Every name that the README knows opens as numbered images."""
 
-    def test_a_file_and_a_folder(self, numbered: Path):
-        assert numbers(open_scans(numbered / "000003.bin", READING)) == [3]
-        assert numbers(open_scans(numbered, READING)) == list(range(12))
-        assert open_scans(numbered, READING).spread(3).source.names == ["000002.bin", "000006.bin", "000010.bin"]
-
     def test_a_usual_sensor_is_the_data_set_s(self):
         assert reading_for(["nuscenes:x"]) == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)
         assert reading_for(["kitti_raw:x"]) == Reading(SENSORS["hdl64e"])

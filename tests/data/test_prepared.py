@@ -209,21 +209,6 @@ def test_scans_without_reflectance_give_shards_without_it(tmp_path: Path):
         prepared_in(tmp_path / "out", SMALL)
 
 
-def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: Path):
-    make(tmp_path / "out", plan_of(kitti_360, layout="kitti_360", shard_scans=4))
-    for options in ({"split": "train"}, {"split": "test"}, {"drives": [10, "2013_05_28_drive_0002_sync"]}, {}):
-        drives = find_drives("kitti_360", kitti_360, **options)
-        raw = ScanFiles([p for d in drives for p in d.scans], Reading(SMALL, reflectance=True), kitti_360)
-        prepared = prepared_in(tmp_path / "out", SMALL, **options)
-        assert prepared.names == raw.names
-        for index in (0, len(raw) - 1):
-            assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
-    with pytest.raises(InputError, match=r"no split named 'best'; known: train, test"):
-        prepared_in(tmp_path / "out", SMALL, split="best")
-    with pytest.raises(InputError, match="no drive named '7'"):
-        prepared_in(tmp_path / "out", SMALL, drives=[7])
-
-
 @pytest.mark.parametrize(
     ("changes", "options", "said"),
     [

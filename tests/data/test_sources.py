@@ -1,13 +1,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import InMemory, ScanFiles, holdout_block
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from tests.conftest import numbers, write_scan
 
@@ -46,25 +44,10 @@ def test_when_all_are_bad_it_ends(numbered: Path):
         files(numbered, on_bad_scan="skip")[0]
 
 
-def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, caplog):
-    rows = np.array([[10, 0, -1, 0.5], [np.nan, 0, 0, 0.5], [10, np.inf, 0, 0.5]] + [[11, 2, -1, 0.5]] * 5, np.float32)
-    rows.tofile(tmp_path / "scan.bin")
-    image = read_image(tmp_path / "scan.bin", STRICT)
-    assert "infinite or beyond 10000 m are dropped (2 points; reported once per folder)" in caplog.text
-    assert (image[0] > 0).sum() == 2
-
-
 def test_a_scan_out_of_range_says_its_numbers(tmp_path: Path):
     write_scan(tmp_path / "far.bin", 200)
     with pytest.raises(InputError, match=r"far.bin: none of its 1 points lies within 1.45-80 m .* 205-205 m"):
         read_image(tmp_path / "far.bin", STRICT)
-
-
-def test_missing_reflectance_names_the_key(tmp_path: Path):
-    write_points(tmp_path / "scan.ply", np.array([[10, 0, -1]], np.float32))
-    with pytest.raises(InputError, match=r"scan.ply has no reflectance.* model of range alone \(in training encoding"):
-        read_image(tmp_path / "scan.ply", STRICT)
-    assert read_image(tmp_path / "scan.ply", replace(STRICT, reflectance=False)).shape == (1, 16, 64)
 
 
 def test_reflectance_out_of_scale_names_the_key(tmp_path: Path):
