@@ -22,6 +22,8 @@ from tests.conftest import CONFIG as FLOW
 from tests.simulator.test_folder import write_folder
 from tests.stages.test_transfer_flow import CONFIG
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
 
 @pytest.fixture(scope="module")
 def checkpoint() -> Checkpoint:

@@ -13,6 +13,7 @@ from r2flow.noise import Draws
 from r2flow.reports.curvature import curvature_page, curvature_rows, measure_paths, summary
 from tests.fields import Field
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
 SENSOR = SENSORS["hdl64e"].resized(4, 16)
 STEPS = 16
 

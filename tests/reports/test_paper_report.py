@@ -15,6 +15,8 @@ from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II
 from tests.conftest import write_run
 from tests.test_sampling import network
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
