@@ -43,12 +43,6 @@ def test_lasers_of_an_hdl64e_fall_by_a_third_of_a_degree_above_and_half_below():
     assert lasers_of(SENSOR.resized(32, 256)) is HDL64E
 
 
-def test_other_sensors_fire_along_their_rows():
-    lasers = lasers_of(VLP16)
-    np.testing.assert_allclose(np.rad2deg(lasers.elevation), VLP16.elevations)
-    assert lasers.straight
-
-
 def test_a_wall_is_measured_to_within_the_noise_in_steps():
     scan, ahead = wall("plaster")
     e, a = VLP16.rays().numpy().astype(float)
