@@ -46,7 +46,8 @@ AHEAD = {"drop_wrong": 0.6, "chamfer_m": 1.0, "mae_all_m": 1.0}  # of interpolat
 @pytest.mark.parametrize(
     ("name", "size", "task", "most"),
     [
-        *(("hdl64e", size, task, AHEAD) for size in ((64, 1024), (32, 256)) for task in ("rows:4", "points:0.1")),
+        ("hdl64e", (64, 1024), "rows:4", AHEAD),
+        ("hdl64e", (32, 256), "points:0.1", AHEAD),
         *((name, size, "rows:2", {**AHEAD, "drop_wrong": 1.0})
           for name, size in (("os1_64", (64, 1024)), ("vlp32c", (32, 1800)), ("hdl32e", (32, 1024)))),
     ],

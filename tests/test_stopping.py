@@ -35,7 +35,6 @@ TRAIN = f"runpy.run_path({str(ROOT / 'train.py')!r}, run_name='__main__')"
         (VERB, ["r2flow", "sample", "x", "-o", "out"], "torch"),
         (VERB, ["r2flow", "train", "name=x"], "hydra"),
         (TRAIN, ["train.py", "name=x"], "hydra"),
-        (TRAIN, ["train.py", "name=x"], "torch"),
         (TRAIN, ["train.py", "name=x"], "lightning"),
     ],
 )
