@@ -219,8 +219,8 @@ def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> floa
 def full_reflectance(scans: Sequence[Points], usual: float | None = None) -> float | None:
     """Estimate the value of full reflectance; None if a file has no reflectance, or only 0.
 
-    It is `usual`, if given, unless more than 1 % of the values exceed it; else the first common value that at most one
-    in 10,000 exceeds, or the highest value, rounded up, if that is below a tenth of it.
+    It is `usual`, if given, unless more than 1 % of the values exceed it; else 1 if at most one in 10,000 exceeds 1, or
+    the first common value that none exceeds, or the highest value, rounded up, if that is below a tenth of it.
     """
     if any(scan.reflectance is None for scan in scans):
         return None
@@ -230,7 +230,8 @@ def full_reflectance(scans: Sequence[Points], usual: float | None = None) -> flo
         return None
     if usual and np.mean(values > usual) <= 0.01:
         return usual
-    common = min((full for full in FULL_REFLECTANCE if np.mean(values > full * 1.001) <= OUTLIERS), default=math.inf)
+    few = np.mean(values > 1.001) <= OUTLIERS  # bytes above 100 are retroreflectors, and as few
+    common = 1.0 if few else next((full for full in FULL_REFLECTANCE if highest <= full * 1.001), math.inf)
     if highest >= 0.1 * common:  # else the values would fill less than a tenth of the scale
         return common
     return float(f"{highest:.1g}") if float(f"{highest:.1g}") >= highest else float(f"{highest * 1.05:.2g}")

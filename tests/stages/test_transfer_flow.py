@@ -362,7 +362,7 @@ def test_a_stage_that_tells_nothing_refuses_it(other):
 
 
 def test_it_draws_nothing_from_noise_alone_and_needs_a_backbone_for_any_size(flow):
-    with pytest.raises(InputError, match="begins at a scan"):
+    with pytest.raises(InputError, match="completes scans"):
         flow(torch.zeros(1, 2, 8, 32))
     with pytest.raises(InputError, match="backbone=local"):
         built(backbone=tiny_options("hdit"))
