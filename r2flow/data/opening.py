@@ -216,9 +216,10 @@ def reading_for(
             refuse_other_samples(Path(options.folder), reading.sensor)
     if reflectance_scale is not None or not specs:
         return reading
-    scale = reading.sensor.reflectance_scale
+    trained = reading.reflectance_scale  # 1: also of scans that were scaled before the training
+    scale = trained if model and trained != 1 else reading.sensor.reflectance_scale
     if not estimate_scale or stored or name != FOLDER:
-        scale = scale_of(parse(specs[0])[0], scale or reading.reflectance_scale)
+        scale = scale_of(parse(specs[0])[0], scale)
     return replace(reading, reflectance_scale=scale)
 
 

@@ -217,7 +217,7 @@ class PreparedScans(ScanSource):
                 left_out = set(store.head(shard)["left_out"])
             except FileNotFoundError:
                 raise InputError(f"{store.folder} is not finished: the same r2flow prepare command resumes.") from None
-            except Damaged as error:
+            except (Damaged, KeyError) as error:
                 raise self._damaged(shard, error) from None
             rows = [number for number in numbers_of_shard if number not in left_out]
             entries |= {number: (number, shard, row) for row, number in enumerate(rows)}

@@ -37,8 +37,9 @@ LAYOUT = "labels of little-endian uint32, one a point"
 def labels_beside(scan: str | Path) -> Path | None:
     """The label file of a scan: `000000.label` next to it, or `../labels/000000.label` of `velodyne/000000.bin`."""
     file = Path(scan).with_suffix(".label")
-    raw = file.parent.name == "velodyne" and not file.with_name("manifest.json").exists()  # not written by r2flow
-    files = [file, file.parent.parent / "labels" / file.name][: 1 + raw]
+    folder = file.parent.resolve()
+    raw = folder.name == "velodyne" and not (folder / "manifest.json").exists()  # not written by r2flow
+    files = [file, folder.parent / "labels" / file.name][: 1 + raw]
     return next((path for path in files if path.exists() or path.is_symlink()), None)  # reading a broken link raises
 
 

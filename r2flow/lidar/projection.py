@@ -181,7 +181,7 @@ def image_to_points(
     check(image.ndim == 3 and image.shape[1:] == rays.shape[1:],
           f"the image is {image.shape}, its rays are {tuple(rays.shape)}: give (2 or 1, H, W), and the rays of as many "
           "pixels.")  # fmt: skip
-    r = torch.from_numpy(np.ascontiguousarray(np.nan_to_num(image[:1], posinf=0)))[None]
+    r = torch.from_numpy(np.ascontiguousarray(np.nan_to_num(np.asarray(image[:1]), posinf=0)))[None]
     xyz = unproject(r, rays)[0].numpy()
     if measured is not None:
         xyz = np.where(measured.any(axis=0), measured, xyz)

@@ -331,6 +331,7 @@ def swapped(path: Path) -> None:
 DAMAGES = {
     "cut": lambda path: path.write_bytes(path.read_bytes()[:-100]),
     "swapped": swapped,
+    "renamed": lambda path: path.write_bytes(path.read_bytes().replace(b"left_out", b"left_0ut")),
     "missing": Path.unlink,
     "dangling": lambda path: (path.unlink(), path.symlink_to(path.with_name("nowhere"))),
     "folder": lambda path: (path.unlink(), path.mkdir()),
@@ -343,7 +344,7 @@ def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_pat
     make(tmp_path, plan)
     whole, path = files(tmp_path), tmp_path / "scans-000001.safetensors"
     DAMAGES[damage](path)
-    said = "scans-000001.safetensors is da" if damage in ("cut", "swapped") else "is not finished"
+    said = "scans-000001.safetensors is da" if damage in ("cut", "swapped", "renamed") else "is not finished"
     with pytest.raises(InputError, match=said):
         prepared_in(tmp_path)
     if damage == "folder":

@@ -103,6 +103,7 @@ def test_ring_numbers_by_laser_give_the_firing_order(first):
         (np.arange(101), 100),
         (np.arange(236), 255),
         (np.arange(257), 256),
+        (np.append(np.tile(np.arange(101), 300), [180, 240]), 255),  # a Velodyne's few retroreflectors
         (np.arange(301), 300),  # an Ouster's counts of photons
         (np.linspace(0, 3000, 50), 3000),
         (np.linspace(0, 7000, 50), 65535),

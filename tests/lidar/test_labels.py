@@ -50,9 +50,13 @@ def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Pa
     np.testing.assert_array_equal(read_labels(beside, scan), IDS)
 
 
-def test_labels_are_not_those_of_other_scans_next_to_the_folder(scan: Path, label: Path):
+def test_labels_are_not_those_of_other_scans_next_to_the_folder(scan: Path, label: Path, tmp_path: Path):
     assert labels_beside(scan) == label
     assert labels_beside(scan.parent.with_name("thinned") / scan.name) is None
+    (linked := tmp_path / "scans").symlink_to(scan.parent)
+    assert labels_beside(linked / scan.name).samefile(label)
+    (scan.parent / "manifest.json").touch()  # completed scans are not the labelled ones
+    assert labels_beside(scan) is None
     scan.with_suffix(".label").touch()
     assert labels_beside(scan) == scan.with_suffix(".label")
 

@@ -83,7 +83,7 @@ def test_a_range_image_is_limited_to_the_range_of_the_sensor(tmp_path):
     np.testing.assert_allclose(seen[1].flatten(), [0, 0.5, 0, 1, 0, 0, 0, 0])
 
 
-@pytest.mark.parametrize(("of_sensor", "trained"), [(255.0, 1.0), (255.0, 255.0), (None, 255.0)])
+@pytest.mark.parametrize(("of_sensor", "trained"), [(255.0, 1.0), (255.0, 255.0), (None, 255.0), (100.0, 255.0)])
 def test_reflectance_is_scaled_by_who_wrote_the_file(tmp_path, of_sensor, trained):
     image, checkpoint = scans(1)[0], flow()
     own, raw = tmp_path / "own" / "a.ply", tmp_path / "raw" / "a.ply"

@@ -174,7 +174,7 @@ def test_odd_later_checkpoints_are_passed_over_and_set_aside(train: Run, alone: 
     assert f"resuming from {older.relative_to(copied.parents[1])}" in done.stdout
     assert_bit_equal(alone[0], copied)
     assert checkpoints_of(copied) == [newest, older]
-    assert len([*newest.parent.glob("*.damaged")]) == 5  # the pipe and the folder are no checkpoints
+    assert len([*newest.parent.glob("*.damaged")]) == 5  # the pipe and the folder are not checkpoints
 
 
 def test_a_run_resumes_with_fewer_checkpoints(train: Run, tmp_path: Path, recwarn: pytest.WarningsRecorder):
