@@ -39,7 +39,7 @@ class VoxelGrid:
 
     def __init__(self, coords: Tensor, finer: Self | None = None) -> None:
         self.coords, self.finer = coords, finer
-        self.sizes = (coords.amax(0) + 3).tolist()  # a margin of one cell on each side
+        self.sizes = (coords.amax(0) + 2).tolist()  # a free cell between rows, before the first and after the last
         assert math.prod(self.sizes) < 2**63, self.sizes
         self.keys, self.order = self._keys(coords).sort()
         assert (self.keys.diff() > 0).all(), "voxels are distinct"
@@ -48,7 +48,7 @@ class VoxelGrid:
         return len(self.coords)
 
     def _keys(self, coords: Tensor) -> Tensor:
-        """Indices of cells in the bounding box and its margin, with the last axis fastest."""
+        """Indices of cells in the bounding box and its free cells, with the last axis fastest."""
         x, y, z = (coords + 1).unbind(-1)
         return (x * self.sizes[1] + y) * self.sizes[2] + z
 
