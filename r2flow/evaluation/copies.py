@@ -27,7 +27,7 @@ from r2flow.metrics.base import Protocol
 from r2flow.metrics.scans import Scans
 
 CELLS = (16, 128)  # maximum rows and columns of cells
-SAME = 5e-3  # largest distance of equal scans: rounding makes it 3e-4; other frames have 0.1
+SAME = 5e-3  # largest distance of equal scans, whose files may be rounded; other frames have 0.1
 PAIRS = {"cpu": 1024, "cuda": 131072}  # pairs per block, by device: sized for the CPU's cache
 
 
@@ -57,11 +57,10 @@ class Nearest:
         usable = x.isfinite().flatten(1).all(1)
         check(usable.any(), f"none of the {len(scans)} scans of {scans.label} has a return to compare.")
         self.scans, self.numbers, x = scans, np.flatnonzero(usable.cpu().numpy()), x[usable]
-        self.width, self.elements = x.shape[2], x[0].numel()
-        self.size = x.square().sum((1, 2))
+        self.x, self.width = x, x.shape[2]
         self.spectra = -2 * torch.fft.rfft(x).conj().permute(2, 0, 1).contiguous()  # (K, N, h)
-        self.squared = torch.full_like(self.size, torch.inf)
-        self.neighbours, self.turns = (torch.zeros_like(self.size, dtype=torch.long) for _ in range(2))
+        self.squared = x.new_full((len(x),), torch.inf)
+        self.neighbours, self.turns = (torch.zeros_like(self.squared, dtype=torch.long) for _ in range(2))
 
     def approach(self, y: Tensor, first: int) -> None:
         """Update with training scans `first`, `first + 1`, ..., (M, h, w); a scan of NaN is never nearest."""
@@ -73,9 +72,11 @@ class Nearest:
             at = slice(start, start + block)
             d = torch.fft.irfft(self.spectra[:, at] @ spectra, n=self.width, dim=0)  # -2 c(u), (w, n, 2 M)
             curve, turn = d.min(0)
-            least, place = (curve + energy).min(1)
-            squared = ((least + self.size[at]) / self.elements).clamp(min=0)
+            place = (curve + energy).argmin(1)
             turn = turn.gather(1, place[:, None])[:, 0]
+            columns = (turn[:, None, None] + torch.arange(self.width, device=y.device)) % self.width
+            turned = both[place].gather(2, columns.expand(-1, y.shape[1], -1))
+            squared = (self.x[at] - turned).square().mean((1, 2))  # the curve of a copy has 1e-8, by rounding
             closer = squared < self.squared[at]
             for stored, new in (
                 (self.squared, squared), (self.neighbours, first + place % m),

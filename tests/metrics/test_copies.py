@@ -52,15 +52,14 @@ def test_each_has_its_nearest_over_turns_and_mirror_and_copies_are_found(sets, m
         for i, image in enumerate(made[name]):
             d = by_hand(image, made["training"])
             assert int(one.neighbours[i]) == d.argmin()
-            assert one.distances[i] == pytest.approx(math.sqrt(d.min()), abs=1e-3)
+            assert one.distances[i] == pytest.approx(math.sqrt(d.min()), rel=1e-5)
     one, real = found["generated"], found["held"]
-    assert set(np.argsort(one.distances)[:3]) == {3, 4, 5}
+    assert one.distances[3:].tolist() == [0, 0, 0]
     assert (one.turns[3:] < 0).tolist() == [False, False, True]
     for place in (3, 4, 5):  # the figure draws the training scan as the sample shows it
         np.testing.assert_array_equal(one.match(place, sets["training"])[0], made["generated"][place][0])
     result = copies_result(one, real, 9)
     count = (one.distances < min(real.distances)).sum()
-    assert count >= 3
     assert f"{count} of 6 scans" in result.remarks[0]
     assert result.figures["copies"] == np.median(one.distances)
     wins = np.mean([a < b for a in one.distances for b in real.distances])
