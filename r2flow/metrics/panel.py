@@ -132,8 +132,8 @@ def rate_distance(a: np.ndarray, b: np.ndarray) -> float:
     """Mean |x - y| over bins, x and y the rates of counts (missing, all, of images), 0 without; at least `lacking`."""
     sets = a.reshape(3, -1), b.reshape(3, -1)
     (x, p), (y, q) = ((lost / np.maximum(rays, 1), rays / pixels) for lost, rays, pixels in sets)
-    # Share of a set's rays in bins of which the other has less than 1 %: 1 if it has none.
-    lacking = [u[v < u / 100].sum() / u.sum() for u, v in ((p, q), (q, p)) if u.any()]
+    # Share of a set's rays beyond 100 times the other's in their bin, which have no rate to compare: 1 if it has none.
+    lacking = [np.maximum(u - 100 * v, 0).sum() / u.sum() for u, v in ((p, q), (q, p)) if u.any()]
     return float(max([np.abs(x - y).mean(), *lacking]))
 
 
@@ -218,7 +218,7 @@ class Panel(SumMetric):
     name = "panel"
     representation = "range image"
     settings: ClassVar[Mapping[str, Any]] = {
-        "members": list(PANEL), "distance": "Jensen-Shannon distance of histograms, |a - b| of rates or share lacking"
+        "members": list(PANEL), "distance": "Jensen-Shannon distance of histograms, |a - b| of rates or a over 100 b"
     }  # fmt: skip
     width = int(ENDS[-1])
     uses_reflectance = True
