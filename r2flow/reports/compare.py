@@ -164,7 +164,7 @@ def _common_label(runs: Sequence[ComparedRun]) -> str:
 
 
 def rows_of(groups: Groups) -> list[dict[str, Any]]:
-    """One row per group: means, with standard deviation and n for several runs."""
+    """One row per group: means, with standard deviation for several runs, and the number of runs that have a value."""
     rows = []
     for label, runs in groups.items():
         row: dict[str, Any] = {"name": label, "n": len(runs)}
@@ -175,20 +175,20 @@ def rows_of(groups: Groups) -> list[dict[str, Any]]:
             values = [run.values[column] for run in runs if run.values[column] is not None]
             row[column] = fmean(values) if values else None
             several = len(values) > 1 and all(map(math.isfinite, values))
-            row[f"{column}_spread"] = stdev(values) if several else None
+            row[f"{column}_spread"], row[f"{column}_n"] = stdev(values) if several else None, len(values)
         rows.append(row)
     return rows
 
 
 def cell(row: Mapping[str, Any], column: str) -> str:
-    """Format a value: '0.243 ± 0.004' over several runs, '-' if missing, 'nan' if a run has diverged."""
+    """Format a value: '0.243 ± 0.004 of 2' over several runs if some lack it, '-' if missing, 'nan' if one diverged."""
     value, deviation = row.get(column), row.get(f"{column}_spread")
-    if value is None:
-        return "-"
-    if value != value:
-        return "nan"
+    if value is None or value != value:
+        return "-" if value is None else "nan"
     text = f"{value:,}" if isinstance(value, int) else shown(value)
-    return text if deviation is None else f"{text} ± {shown(deviation)}"
+    text += "" if deviation is None else f" ± {shown(deviation)}"
+    have = row.get(f"{column}_n", row["n"])
+    return text if have == row["n"] else f"{text} of {have}"
 
 
 def tables(groups: Groups) -> dict[str, tuple[list[list[str]], list[str]]]:
@@ -205,7 +205,7 @@ def tables(groups: Groups) -> dict[str, tuple[list[list[str]], list[str]]]:
 NOTES = (
     "Losses are those that were logged: of validation, with the averaged weights; compare them only between runs with "
     "the same loss and the same data. Bend is the last `curvature/s_normalised`, s(t) over the squared path length; an "
-    "untrained flow is straight too. Several seeds: mean ± standard deviation."
+    "untrained flow is straight too. Several seeds: mean ± standard deviation, `of` those with a value."
 )
 
 
