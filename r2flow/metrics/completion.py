@@ -30,7 +30,7 @@ def errors(truth: np.ndarray, answer: np.ndarray, hidden: np.ndarray, sensor: Se
     `mae_all_m` follows LiDARGen and RangeLDM: all pixels of the image, measured ones included, with 0 m for missing
     returns. `iou`, `chamfer_m` and `chamfer_m2` use the points of the whole scan, including measured points, as TULIP
     does, but without its points at the origin for missing returns; Chamfer sums the mean distances to the nearest point
-    of the other scan in both directions.
+    of the other scan in both directions, infinite if one scan is empty.
     """
     r, s = truth[0], answer[0]
     both = hidden & (r > 0) & (s > 0)
@@ -82,8 +82,7 @@ def spread_errors(truth: np.ndarray, answers: np.ndarray, hidden: np.ndarray) ->
 
 def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not len(a) or not len(b):
-        undefined = np.full(1, np.nan)
-        return undefined, undefined
+        return (np.full(1, np.nan if len(a) == len(b) else np.inf),) * 2
     return cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
 
 

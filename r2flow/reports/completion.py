@@ -78,7 +78,7 @@ def completion_rows(
             row["mae_common_m"] = common[name]
             scans = list(zip(truths, of_method, masks, strict=True))
             off = means([means([errors(x, y, ~mask, sensor) for y in images]) for x, images, mask in scans])
-            row |= {key: value for key, value in off.items() if np.isfinite(value)}
+            row |= {key: value for key, value in off.items() if not math.isnan(value)}
             row["panel"] = mean_distance(distances(panel(np.stack(firsts[name]), sensor), reference))
             if num > 1 and name in cost:
                 row |= means([spread_errors(x, images, ~mask) for x, images, mask in scans])
@@ -88,7 +88,7 @@ def completion_rows(
 def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Mean of each column without NaN; NaN if all are NaN."""
     columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
-    return {key: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for key, x in columns.items()}
+    return {key: float("nan") if np.isnan(x).all() else float(np.nanmean(x)) for key, x in columns.items()}
 
 
 def completion_page(rows: Sequence[Mapping[str, Any]], figure: Figure, about: str, seed: int, device: str) -> Page:

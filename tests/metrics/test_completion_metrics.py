@@ -45,10 +45,12 @@ def test_an_equal_scan_has_no_error():
 
 
 def test_an_empty_scan_has_no_figures_that_do_not_exist():
-    found = errors(scan([[0] * 4] * 2), scan([[0] * 4] * 2), np.ones((2, 4), dtype=bool), SENSOR)
-    assert found["drop_wrong"] == 0
-    assert math.isnan(found["mae_m"])
-    assert math.isnan(found["iou"])
+    empty, hidden = scan([[0] * 4] * 2), np.ones((2, 4), dtype=bool)
+    found = errors(empty, empty, hidden, SENSOR)
+    assert found.pop("drop_wrong") == found.pop("mae_all_m") == 0
+    assert all(map(math.isnan, found.values()))
+    found = errors(scan([[10] * 4] * 2), empty, hidden, SENSOR)  # far away: means would leave NaN out
+    assert (found["iou"], found["chamfer_m"], found["chamfer_m2"]) == (0, math.inf, math.inf)
 
 
 @pytest.mark.parametrize("dropped", [0, 0.24, 1])
