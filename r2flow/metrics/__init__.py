@@ -24,7 +24,6 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
     jsd=lazy(f"{__name__}.jsd_mmd:JSD"),
     mmd=lazy(f"{__name__}.jsd_mmd:MMD"),
-    mmd_unbiased=lazy(f"{__name__}.jsd_mmd:MMDUnbiased"),
     jsd_lidm=lazy(f"{__name__}.lidm:JSDLiDM"),
     mmd_lidm=lazy(f"{__name__}.lidm:MMDLiDM"),
     panel=lazy(f"{__name__}.panel:Panel"),
@@ -48,7 +47,7 @@ for _network in EXTRACTORS:
 def default_metrics(reflectance: bool) -> tuple[str, ...]:
     """Default metrics, which need no downloads; the headline first.
 
-    KID and the unbiased MMD, which are unbiased for few scans, accompany the usual Frechet distance and MMD.
+    KID, which is unbiased for few scans, accompanies the usual Frechet distance.
     """
     features = "handcrafted" if reflectance else "handcrafted_range"
-    return ("panel", f"kid_{features}", f"frechet_{features}", "jsd", "mmd", "mmd_unbiased")
+    return ("panel", f"kid_{features}", f"frechet_{features}", "jsd", "mmd")

@@ -71,25 +71,6 @@ class MMD(ScanMetric):
         return mean_kernel(real, real), mean_kernel(generated, generated), mean_kernel(real, generated)
 
 
-class MMDUnbiased(MMD):
-    """MMD without the bias of the published estimate, which is large for few scans.
-
-    Both means exclude pairs of a scan with itself (Gretton et al. 2012): for two sets of one distribution the
-    expectation is 0 at any size, and values may be negative. The published estimate for 1000 against 1000 scans of the
-    same simulator is nearly all bias.
-    """
-
-    name = "mmd_unbiased"
-    settings: ClassVar[Mapping[str, Any]] = {**MMD.settings, "estimate": "unbiased"}
-    resamples = False  # repeated scans would form pairs of equal scans and bias the estimate
-    fewest = 2
-
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        real, generated, between = self.terms(weights)
-        n, m = (self.count(side) for side in SIDES)
-        return {self.name: real * n / (n - 1) + generated * m / (m - 1) - 2 * between}
-
-
 def mean_kernel(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
     """Weighted mean of k(p, q) - 1 over scans p of one set and q of another, for each draw of weights, (R,).
 
