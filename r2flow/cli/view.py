@@ -1,6 +1,5 @@
 """`r2flow view` and `r2flow show`: scans in a browser and as pictures."""
 
-import logging
 import os
 import sys
 import webbrowser
@@ -16,8 +15,6 @@ from r2flow.cli.app import app
 from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, choose_device, grouped, numbers
 from r2flow.errors import InputError, check
 
-log = logging.getLogger(__name__)
-
 SCANS, SAMPLES = 16, 4  # default numbers per folder and per generator
 MOST = 256  # largest number of each per page
 
@@ -29,7 +26,6 @@ def show(
     out: OutOption,
     how: ReadingOptions,
     most: Annotated[int, typer.Option("--num", min=1, help="Maximum number of scans per folder.")] = SCANS,
-    labels: Annotated[bool, typer.Option("--labels", help="Also draw classes of .label files.")] = False,
     format: Annotated[
         Literal["png", "pdf", "npy"], typer.Option(help="png, pdf: pictures; npy: range images, (2, H, W).")
     ] = "png",
@@ -42,10 +38,9 @@ def show(
     if out.suffix.lower() in (".png", ".pdf", ".npy"):
         raise InputError(f"--out must be a folder, for a file per scan, found {out}.")
     names: list[str] = []
-    panels = (
-        panel for spec in scans for panel in scan_panels(spec, how.reading([spec], estimate_scale=True), most, labels)
-    )
-    for caption, (image,), rays, classes, _ in panels:
+    readings = ((spec, how.reading([spec], estimate_scale=True)) for spec in scans)
+    panels = (panel for spec, reading in readings for panel in scan_panels(spec, reading, most, labelled=False))
+    for caption, (image,), rays, *_ in panels:
         file = Path(caption)
         names.append(next(s for n in count(1) if (s := file.stem if n == 1 else f"{file.stem}_{n}") not in names))
         path = out / f"{names[-1]}.{format}"
@@ -54,9 +49,7 @@ def show(
             size, returns = " x ".join(map(str, image.shape)), (image[0] > 0).mean()
             print(f"{path}: {size}, {returns:.1%} returns")
             continue
-        if labels and classes is None:
-            log.warning("%s: no .label file next to it", caption)
-        print(save_figure(scan_figure(image, rays, file.name, None if classes is None else classes[0]), path))
+        print(save_figure(scan_figure(image, rays, file.name), path))
 
 
 @app.command(epilog="Example: r2flow view street velodyne/0000000100.bin --steps 1,2,4,32 --out page.html")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import ListedColormap, hsv_to_rgb, to_hex, to_rgb
+from matplotlib.colors import ListedColormap, hsv_to_rgb, to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from torch import Tensor
@@ -27,10 +27,10 @@ HEIGHTS = (-2.8, 3.0)  # metres over which height is coloured, sensor frame
 RANGES = (2.0, 80.0)  # metres over which range is coloured, on a logarithmic scale
 
 
-def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.ndarray | None = None) -> Figure:
-    """Draw one scan, with an extra row for semantic ids of pixels, (H, W)."""
-    figure = Figure((WIDTH, 4.6 if labels is None else 5.2), facecolor="white")
-    strips = len(image) + (labels is not None)
+def scan_figure(image: np.ndarray, rays: Tensor, title: str = "") -> Figure:
+    """Draw one scan: its images above, bird's-eye view and perspective below."""
+    figure = Figure((WIDTH, 4.6), facecolor="white")
+    strips = len(image)
     grid = figure.add_gridspec(
         strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.28, wspace=0.04,
         left=0.01, right=0.925, top=0.89, bottom=0.01, width_ratios=[1, 1.45],
@@ -38,8 +38,6 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.nda
     draw_range(figure.add_subplot(grid[0, :]), image)
     if len(image) > 1:
         draw_reflectance(figure.add_subplot(grid[1, :]), image)
-    if labels is not None:
-        draw_labels(figure.add_subplot(grid[strips - 1, :]), image, labels)
     xyz, _ = image_to_points(image, rays)
     draw_birds_eye(figure.add_subplot(grid[strips, 0]), xyz)
     draw_perspective(figure.add_subplot(grid[strips, 1]), xyz)
@@ -158,23 +156,6 @@ def _show(axes: Any, values: np.ndarray, title: str, cmap: Any, ticks: Mapping[f
     _strip(axes, title)
     if title:
         _bar(axes, drawn, ticks)
-
-
-def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
-    """Draw semantic ids, (H, W), named as in `class_colours`; dropped rays black."""
-    returned = image[0] > 0
-    shown = np.zeros((*labels.shape, 3))
-    entries: dict[str, Any] = {}
-    for label, (name, colour) in class_colours(labels[returned]).items():
-        shown[returned & (labels == label)] = to_rgb(colour)
-        entries.setdefault(name, colour)
-    axes.imshow(shown, aspect="auto", interpolation="nearest")
-    _strip(axes, "labels")
-    x = 0.07
-    for name, colour in list(entries.items())[:9]:  # as many as fit, most frequent first
-        axes.text(x, 1.03, name, transform=axes.transAxes, color=colour, fontsize=7, va="bottom",
-                  bbox={"facecolor": "0.25", "edgecolor": "none", "pad": 0.8})  # fmt: skip
-        x += 0.012 + 0.0082 * len(name)
 
 
 def class_colours(labels: np.ndarray, most: int | None = None) -> dict[int, tuple[str, str]]:

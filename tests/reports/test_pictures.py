@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.pictures import completed_figure, contact_sheet, figure_pixels, save_figure, scan_figure
 
@@ -83,21 +82,3 @@ def test_a_wall_on_the_left_is_drawn_on_the_left():
     middle = drawn.shape[1] // 2
     assert drawn[:, : middle - 20].sum() > 50
     assert drawn[:, middle + 20 :].sum() == 0
-
-
-def test_labels_are_a_row_of_their_classes_colours():
-    labels = np.where(A > 0, 40, 70)
-    labels[:8] = 0
-    plain, labelled = (
-        figure_pixels(scan_figure(image(np.full_like(E, 10.0)), SENSOR.rays(), labels=given))
-        for given in (None, labels)
-    )
-
-    def shown(pixels: np.ndarray, name: int) -> int:
-        colour = np.array([int(CLASSES[name][1][i : i + 2], 16) for i in (1, 3, 5)])
-        return int((pixels == colour).all(-1).sum())
-
-    road, plants, nothing = (shown(labelled, name) for name in (40, 70, 0))
-    assert road == pytest.approx(plants, rel=0.1)
-    assert nothing == pytest.approx(road + plants, rel=0.1)
-    assert shown(plain, 40) + shown(plain, 70) + shown(plain, 0) < 20
