@@ -79,7 +79,7 @@ def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):
     assert any("2 generated scans" in remark for remark in metric["remarks"])
     assert "none" in said
     assert {path.name for path in (tmp_path / "page").iterdir()} == {
-        f"evaluation.{ending}" for ending in ("csv", "json", "md", "html")
+        f"evaluation.{ending}" for ending in ("json", "md", "html")
     }
 
 

@@ -246,9 +246,7 @@ def paper(
 @app.command(epilog="Example: r2flow compare runs/sweep --group --out reports")
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of runs (a chain, a sweep).")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for compare.md, .csv, .json and .png.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for compare.md, .json and .png.")] = None,
     group: Annotated[
         bool, typer.Option("--group", help="Aggregate seeds of one configuration: mean ± spread.")
     ] = False,

@@ -1,7 +1,5 @@
-"""Writing of reports: figures, CSV, JSON and Markdown, each with its provenance."""
+"""Writing of reports: figures, JSON and Markdown, each with its provenance."""
 
-import csv
-import io
 import json
 import math
 import os
@@ -52,7 +50,7 @@ class Page:
     Attributes:
         name: Stem of the files, such as `solvers`.
         text: Paragraphs and tables of Markdown.
-        rows: One row per measurement, for the CSV and the `rows` of the JSON.
+        rows: One row per measurement, for the `rows` of the JSON.
         figures: Figures by name, written as `NAME.png` and `NAME.pdf`.
         seeds: All seeds, by purpose.
         device: Device of the networks.
@@ -70,15 +68,14 @@ class Page:
 
 
 def write_page(page: Page, out: str | Path) -> list[Path]:
-    """Write `out/NAME.png ...`, `NAME.pdf`, `NAME.csv`, `NAME.json` and `NAME.md` atomically; returns the files."""
+    """Write `out/NAME.png ...`, `NAME.pdf`, `NAME.json` and `NAME.md` atomically; returns the files."""
     out, origin = Path(out), provenance(page)
     written = [
         save_figure(figure, out / f"{name}.{ending}", title=page.title, about=json.dumps(origin))
         for name, figure in page.figures.items()
         for ending in ("png", "pdf")
     ]
-    contents = ("csv", _csv(page.rows, origin)), ("json", _json(page, origin)), ("md", _markdown(page, origin))
-    for ending, content in contents:
+    for ending, content in ("json", _json(page, origin)), ("md", _markdown(page, origin)):
         written.append(out / f"{page.name}.{ending}")
         write_file(written[-1], content)
     return written
@@ -128,17 +125,6 @@ def few_log_ticks(axis: Any) -> None:
     axis.set_minor_locator(LogLocator(subs=(2, 5)))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda value, _: f"{value:g}")
-
-
-def _csv(rows: Sequence[Row], origin: Mapping[str, Any]) -> str:
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    # Provenance as comments: pandas reads the file with comment="#".
-    text.writelines(f"# {key}: {_one_line(value)}\n" for key, value in origin.items())
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def _json(page: Page, origin: Mapping[str, Any]) -> str:

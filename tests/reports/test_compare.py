@@ -204,7 +204,7 @@ def test_the_page_is_written_with_its_picture(tmp_path):
     make_run(tmp_path / "runs" / "bare", {"stage.learning_rate": 2e-3})
     groups = group_runs(read_runs([tmp_path / "runs"]))
     written = {path.name: path for path in write_page(compare_page(groups), tmp_path / "out")}
-    assert set(written) == {"compare.md", "compare.csv", "compare.json", "compare.png", "compare.pdf"}
+    assert set(written) == {"compare.md", "compare.json", "compare.png", "compare.pdf"}
     said = written["compare.md"].read_text()
     for words in ("| bare | 1 | rectify | simulated | hdit |", "| run | train loss, last tenth |"):
         assert words in said, words

@@ -99,7 +99,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):
     how = ("-o", out, "--steps", 4, "--num", 2)
     said = r2flow.said("report", "curvature", path, copy, *how)
     figures = {f"{name}.{end}" for name in ("curvature", "trajectories") for end in ("png", "pdf")}
-    names = figures | {"curvature.csv", "curvature.json", "curvature.md"}
+    names = figures | {"curvature.json", "curvature.md"}
     assert {file.name for file in out.iterdir()} == names
     assert str(out / "curvature.md") in said
     content = json.loads((out / "curvature.json").read_text())

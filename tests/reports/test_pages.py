@@ -1,4 +1,3 @@
-import csv
 import json
 import math
 import struct
@@ -27,9 +26,9 @@ def page(**changes) -> Page:
     return Page(**{**given, **changes})
 
 
-def test_a_page_is_a_figure_a_csv_a_json_and_markdown(tmp_path):
+def test_a_page_is_a_figure_a_json_and_markdown(tmp_path):
     written = write_page(page(), tmp_path / "new")
-    assert [path.name for path in written] == ["speed.png", "speed.pdf", "speed.csv", "speed.json", "speed.md"]
+    assert [path.name for path in written] == ["speed.png", "speed.pdf", "speed.json", "speed.md"]
     assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(written)  # no temporary file stays
     png = written[0].read_bytes()
     assert png.startswith(b"\x89PNG")
@@ -49,10 +48,6 @@ def test_every_file_says_where_it_comes_from(tmp_path, monkeypatch):
 
 def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
     write_page(page(more={"paths": [{"values": [1.0, math.inf]}]}), tmp_path)
-    lines = (tmp_path / "speed.csv").read_text().splitlines()
-    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
-    assert rows[0] == {"solver": "euler", "evaluations": "4", "error": "0.5", "note": ""}
-    assert rows[1]["solver"] == "a|b, c"
     content = json.loads((tmp_path / "speed.json").read_text(), parse_constant=pytest.fail)
     assert content["rows"] == [ROWS[0], {**ROWS[1], "error": None}]
     assert content["paths"] == [{"values": [1.0, None]}]

@@ -98,7 +98,7 @@ def assert_alike(first: Path, second: Path) -> None:
 
 def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
     run, said = chained
-    for name in ("report/chain.png", "report/chain.md", "report/chain.csv", "report/chain.json", "report/000000.ply"):
+    for name in ("report/chain.png", "report/chain.md", "report/chain.json", "report/000000.ply"):
         assert (run / name).is_file(), name
     for words in ("[1/3] rf1", "[2/3] rf2", "[3/3] td2", "8 pairs", "evaluations a pair", "pairs/s", "r2flow sample"):
         assert words in said
