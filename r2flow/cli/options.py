@@ -149,7 +149,7 @@ class SamplerOptions:
         str | None,
         typer.Option(
             help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: dopri5, "
-            "auto, torchdiffeq; stochastic: sde; flow maps: jump, chord, renoise; completion: mmps, replace, repaint. "
+            "torchdiffeq; stochastic: sde; flow maps: jump, chord, renoise; completion: mmps, replace, repaint. "
             "For other systems see docs/systems.md."
         ),
     ] = None

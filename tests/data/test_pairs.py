@@ -80,7 +80,7 @@ def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, ca
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("parent", "abd"), ("seed", 1), ("sampler", {"name": "auto", "tolerance": 1e-3}), ("batch_size", 8),
+        ("parent", "abd"), ("seed", 1), ("sampler", {"name": "exprb43", "tolerance": 1e-3}), ("batch_size", 8),
         ("precision", "bf16-mixed"),
     ],
 )  # fmt: skip

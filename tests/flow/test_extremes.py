@@ -173,14 +173,13 @@ def test_a_network_that_is_being_trained_can_be_solved(method):
     assert network.weight.grad.abs().max() > 0
 
 
-@pytest.mark.parametrize("method", ["exprb43", "auto"])
-def test_exponential_steps_refuse_to_lose_a_gradient(method):
+def test_exponential_steps_refuse_to_lose_a_gradient():
     for weight, x in ((torch.ones(1, requires_grad=True), X_0), (torch.ones(1), X_0.clone().requires_grad_())):
         velocity = partial(lambda weight, t, x: weight * StiffLinear(1e6)(t, x), weight)
         with pytest.raises(InputError, match=r"no gradient: solve with dopri5 or under torch.no_grad\(\)"):
-            solve(velocity, x, method=method)
+            solve(velocity, x, method="exprb43")
         with torch.no_grad():
-            assert solve(velocity, x, method=method).converged.all()
+            assert solve(velocity, x, method="exprb43").converged.all()
 
 
 @pytest.mark.parametrize("method", ["dopri5", "torchdiffeq:dopri5"])
@@ -262,22 +261,6 @@ def test_noise_in_a_velocity_is_no_jacobian():
     assert solution.x.abs().max() < 10
 
 
-def test_auto_hands_damped_oscillations_over():
-    damped = torch.tensor([[-200.0, 2000.0], [-2000.0, -200.0]], dtype=torch.float64)
-    start = torch.ones(1, 2, dtype=torch.float64)
-    # x' = A x + b cos t with b = (1, 1) ends on Re(c e^it), (i - A) c = b; the transient e^-200 is gone.
-    system = 1j * torch.eye(2, dtype=torch.complex128) - damped
-    exact = (torch.linalg.solve(system, torch.ones(2, dtype=torch.complex128)) * complex(math.cos(1), math.sin(1))).real
-
-    found = {
-        method: solve(lambda t, x: x @ damped.T + torch.cos(t).reshape(-1, 1), start, method=method, tolerance=1e-5)
-        for method in ("auto", "dopri5")
-    }
-    assert found["auto"].converged.item()
-    assert (found["auto"].x - exact).abs().max() < 1e-5
-    assert found["auto"].evaluations.item() < found["dopri5"].evaluations.item() / 2
-
-
 @pytest.mark.parametrize("x_0", [-12.0, -9.0, -8.2, 8.2, 9.0, 12.0])
 def test_exact_ends_of_a_mixture_in_the_far_tail(x_0: float):
     """A mixture of two equal Gaussians is one Gaussian, whose flow is x_1 = mean + std x_0."""
@@ -315,11 +298,11 @@ def verdict(name: str, method: str, tolerance: float, state=torch.float64, netwo
 
 @pytest.mark.slow  # every problem by every solver takes minutes on a busy machine
 def test_only_failures_on_the_jet_are_silent():
-    methods = [name for name in SOLVERS if SOLVERS[name].adapts and name not in ("auto", "exprb43")]
+    methods = [name for name in SOLVERS if SOLVERS[name].adapts and name != "exprb43"]
     cells = list(product(PROBLEMS, methods, (1e-3, 1e-5), PRECISIONS))
     found = {cell: verdict(*cell[:3], *cell[3]) for cell in cells}
     assert {name for (name, *_), seen in found.items() if seen == "silent"} == {JET}
     assert sum(seen in ("failed", "silent") for seen in found.values()) > 30  # so that there is something to judge
     smooth = [seen for (name, *_), seen in found.items() if name in ("straight", "gaussian", "two_modes", "rotating")]
     assert "flagged" not in smooth
-    assert verdict("stiff_1e4", "auto", 1e-3) == verdict("gaussian", "auto", 1e-3) == "solved"
+    assert verdict("stiff_1e4", "exprb43", 1e-3) == verdict("gaussian", "exprb43", 1e-3) == "solved"

@@ -117,7 +117,7 @@ def test_the_finish_is_one_euler_step(method):
     assert made.evaluations.tolist() == [len(calls)] * 3 == [sampler.evaluations(flow)] * 3
 
 
-@pytest.mark.parametrize("method", ["dopri5", "auto", "torchdiffeq:bosh3"])
+@pytest.mark.parametrize("method", ["dopri5", "exprb43", "torchdiffeq:bosh3"])
 def test_the_global_error_is_estimated_and_its_cost_counted(method):
     asked = {"method": method, "tolerance": 1e-4}
     plain, owned = solve(logistic, X_0, **asked), solve(logistic, X_0, **asked, global_error=True)

@@ -32,7 +32,6 @@ SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
     adams3=FixedStep(Adams3, order=3, evaluations=1, multistep=True),
     dopri5=dopri5,
     exprb43=ExponentialMethod(),
-    auto=ExponentialMethod(start=dopri5),
 )
 # For the error estimate, the tolerance is divided by this. At 10, sometimes at 30, the second solution's error is as
 # large as the first's if the velocity jumps in time; at 100, more scenes exceed their budget of evaluations.
@@ -65,8 +64,8 @@ def solve(
         velocity: v(t, x) with t of shape () in a fixed-step method, (B,) in an adaptive one, where B shrinks as scenes
             finish; a velocity that differs between scenes has a method `select` (see `Evaluations`).
         x: State at t_0, (B, ...).
-        method: A name in `SOLVERS`, or `torchdiffeq:NAME`. `auto` is dopri5, and exprb43 for scenes once they become
-            stiff; exprb43 is not differentiable and does not search for pulses and jumps.
+        method: A name in `SOLVERS`, or `torchdiffeq:NAME`. exprb43 is not differentiable and does not search for pulses
+            and jumps.
         steps: Steps of a fixed-step method on a named grid; ignored by adaptive methods.
         tolerance: Absolute and relative tolerance of an adaptive method, for the local error e of a step:
             (mean |e / (tolerance + tolerance |x|)|^6)^(1/6) <= 1 over a scene's elements. It does not bound the error

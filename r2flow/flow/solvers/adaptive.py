@@ -7,7 +7,6 @@ are copied to the host, and the times and sizes of the next step back.
 
 import logging
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,10 +35,8 @@ def attainable(limits: Limits, dtype: torch.dtype) -> float:
     return max(limits.tolerance, least) / limits.tighter
 
 
-def advance(
-    v: Evaluations, x: Tensor, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits
-) -> tuple[Tensor, np.ndarray]:
-    """The last state of every scene of x, (B, ...), from t_0 to t_1 by its own steps, and the time reached, (B,)."""
+def advance(v: Evaluations, x: Tensor, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits) -> Tensor:
+    """The last state of every scene of x, (B, ...), from t_0 to t_1 by its own steps."""
     control = StepController(v, t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
     results = x.clone()
     k_1 = v(control.now(x), x)
@@ -56,7 +53,7 @@ def advance(
             x, k_1 = rows(x, remaining), rows(k_1, remaining)
             control.keep(remaining)
             if not len(remaining):
-                return results, control.times
+                return results
         x, k_1 = _step(control, x, k_1, tolerance)
 
 

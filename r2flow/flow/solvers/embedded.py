@@ -47,7 +47,7 @@ class EmbeddedMethod:
         """Solve every scene of x, (B, ...), from the first time to the last with its own steps."""
         from r2flow.flow.solvers.adaptive import advance
 
-        return v.solution(advance(v, x, float(times[0]), float(times[-1]), self, limits)[0])
+        return v.solution(advance(v, x, float(times[0]), float(times[-1]), self, limits))
 
     @property
     def stages(self) -> int:

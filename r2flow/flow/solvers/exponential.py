@@ -1,4 +1,4 @@
-"""Exponential Rosenbrock method for stiff scenes, and automatic switching to it.
+"""Exponential Rosenbrock method for stiff scenes.
 
 pexprb43: Luan, Ostermann, Parallel exponential Rosenbrock methods, 2016, order 4 with an estimate of order 3. The
 Jacobian J of (t, x) -> (1, v) is never formed: functions of J are computed in Krylov spaces by Arnoldi's method (Saad,
@@ -17,9 +17,8 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import check
-from r2flow.flow.solvers.adaptive import advance, attainable
+from r2flow.flow.solvers.adaptive import attainable
 from r2flow.flow.solvers.batched import norms, powered, unpowered
-from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Spent
 
 LARGEST = 40  # dimension of a Krylov space; if that is not enough, the step is halved
@@ -29,27 +28,18 @@ SAFETY, SHRINK, GROW = 0.8, 0.2, 8.0
 
 @dataclass(frozen=True)
 class ExponentialMethod:
-    """An exponential method.
-
-    Attributes:
-        start: Explicit method for scenes that are not stiff; None: treat all scenes as stiff.
-    """
+    """An exponential method."""
 
     adapts: ClassVar[bool] = True  # whether step sizes follow from a tolerance
 
     order: int = 4
-    start: EmbeddedMethod | None = None
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
-        """Solve every scene of x, (B, ...), from t_0 to t_1; stiff scenes one after another."""
-        t_0, t_1 = float(times[0]), float(times[-1])
-        ends, reached, left = x.clone(), np.full(len(x), t_0), np.ones(len(x), dtype=bool)
-        if self.start is not None:
-            ends, reached = advance(v, x, t_0, t_1, self.start, limits._replace(until_stiff=True))
-            left = v.stiff & ~v.converged
-        for place in left.nonzero()[0]:
+        """Solve every scene of x, (B, ...), from t_0 to t_1, one after another."""
+        ends = x.clone()
+        for place in range(len(x)):
             v.only(np.array([place]))
-            scene = _Scene(v, ends[place], float(reached[place]), t_0, t_1, limits)
+            scene = _Scene(v, x[place], float(times[0]), float(times[-1]), limits)
             v.converged[place] = scene.solve()
             ends[place] = scene.u.view(x.shape[1:])
         return v.solution(ends)
@@ -58,9 +48,9 @@ class ExponentialMethod:
 class _Scene:
     """State of one scene; vectors are (n + 1,), the elements of x followed by t."""
 
-    def __init__(self, v: Evaluations, x: Tensor, t: float, t_0: float, t_1: float, limits: Limits) -> None:
+    def __init__(self, v: Evaluations, x: Tensor, t_0: float, t_1: float, limits: Limits) -> None:
         self.v, self.shape, self.limits = v, x.shape, limits
-        self.u, self.t = x.flatten(), t
+        self.u, self.t = x.flatten(), t_0
         self.direction = math.copysign(1.0, t_1 - t_0)
         self.length, self.t_0, self.t_end = abs(t_1 - t_0), t_0, t_1
         kind = x.device.type

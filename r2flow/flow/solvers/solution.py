@@ -51,7 +51,6 @@ class Limits(NamedTuple):
         max_evaluations: Budget per scene.
         tighter: Divisor of the attainable tolerance.
         max_step: Longest step as a share of the interval.
-        until_stiff: Whether to stop a scene once it is stiff.
         knots: Number of inner states to keep, in a fixed-step method.
     """
 
@@ -59,7 +58,6 @@ class Limits(NamedTuple):
     max_evaluations: int
     tighter: float = 1.0
     max_step: float = 1.0
-    until_stiff: bool = False
     knots: int = 0
 
 

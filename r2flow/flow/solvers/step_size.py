@@ -13,17 +13,14 @@ SHRINK = 0.2  # smallest factor between one step size and the next
 MEMORY = 0.04  # beta of the PI controller, the weight of the previous error: steadier steps at a stability limit
 REMEMBERED = 3  # steps for which a rejection makes a jump likely
 STIFF_AFTER, SMOOTH_AFTER = 15, 6  # Hairer: stiff after 15 touching steps without 6 other steps in a row between them
-# Eigenvalues near the imaginary axis limit steps at a smaller |h lambda|, where accuracy can limit them as well: only
-# with `until_stiff`, and after more such steps, does a scene count as stiff.
-OSCILLATING, OSCILLATING_AFTER = 1.0, 200
 FAR, DECADES = 0.02, 3  # share of its size that x moves in a step; number of powers of ten of h that indicate a pole
 
 
 class StepController:
     """Time, step size and step counts of every scene of a batch.
 
-    The arrays have one entry per scene still in the batch, `v.scenes`, except `times`, the times reached by all.
-    Progress is measured as a length from t_0, which makes forward and backward in time equal.
+    The arrays have one entry per scene still in the batch, `v.scenes`. Progress is measured as a length from t_0, which
+    makes forward and backward in time equal.
     """
 
     def __init__(
@@ -38,11 +35,8 @@ class StepController:
         self.eps = eps
         self.reached, self.h, self.grow = np.zeros(n), np.full(n, self.length), np.full(n, method.grow)
         self.last_error = np.full(n, 1e-4)  # dopri5.f
-        # Steps at each of the two bounds of stability, and other steps in a row since.
-        self.bounds = np.array([[method.stability], [OSCILLATING]])
-        self.touched, self.calm = np.zeros((2, n), int), np.zeros((2, n), int)
+        self.touched, self.calm = np.zeros((2, n), int)  # steps at the bound of stability, others in a row since
         self.arrived, self.leaving = np.zeros(n, bool), np.zeros(n, bool)
-        self.times = np.full(n, t_0)
         # A jump of the velocity: its bracket, as lengths from t_0, and the step size after it.
         self.begin, self.end, self.resume = np.full(n, np.inf), np.full(n, np.inf), np.zeros(n)
         self.crossing = np.zeros(n, bool)
@@ -140,8 +134,7 @@ class StepController:
         self.crossing = (self.begin - self.reached <= self.shortest()) & ~spent
         self.arrived = good & (self.reached >= self.length) & ~self.crossing
         stuck = (self.h < self.shortest()) & ~good & (self.begin == np.inf)
-        handed_over = self.v.stiff[self.v.scenes] & self.limits.until_stiff & ~self.crossing
-        self.leaving = self.arrived | stuck | spent | handed_over
+        self.leaving = self.arrived | stuck | spent
 
     def note_pole(self, places: np.ndarray, h: np.ndarray, share: np.ndarray, back: np.ndarray) -> None:
         """Give up scenes whose path does not shorten with the step, which indicates a pole.
@@ -187,20 +180,17 @@ class StepController:
         """Detect steps limited by stability: h |dk| / |dy|, an estimate of |h lambda|, stays at the boundary of the
         stability region (Hairer, Wanner, Solving Ordinary Differential Equations II, IV.2)."""
         with np.errstate(invalid="ignore", over="ignore"):
-            touching = good & (self.h * dk > self.bounds * dy)
+            touching = good & (self.h * dk > self.method.stability * dy)
         self.calm = np.where(touching, 0, self.calm + (good & ~touching))
         self.touched = np.where(self.calm >= SMOOTH_AFTER, 0, self.touched + touching)
-        touched, oscillated = self.touched
-        oscillates = self.limits.until_stiff & (oscillated >= OSCILLATING_AFTER)
-        self.v.stiff[self.v.scenes] |= (touched >= STIFF_AFTER) | oscillates
+        self.v.stiff[self.v.scenes] |= self.touched >= STIFF_AFTER
 
     def keep(self, rest: np.ndarray) -> None:
-        """Keep these scenes in the batch; record convergence and time of all."""
+        """Keep these scenes in the batch; record convergence of all."""
         self.v.converged[self.v.scenes] |= self.arrived
-        self.times[self.v.scenes] = self.time(self.reached)
         self.v.only(self.v.scenes[rest])
         for name in (
             "reached", "h", "grow", "last_error", "touched", "calm", "arrived", "leaving", "begin", "end",
             "resume", "crossing", "rough", "troubled", "factor", "decades",
         ):  # fmt: skip
-            setattr(self, name, getattr(self, name)[..., rest])
+            setattr(self, name, getattr(self, name)[rest])
