@@ -28,6 +28,7 @@ from r2flow.store import Damaged, Store, checksum
 log = logging.getLogger(__name__)
 
 FORMAT = 5  # increment if statistics change for the same scans and protocol
+NO_INTERVAL = "no bootstrap interval."  # baselines have none in any case
 # Metrics of single-scan histograms use this many real scans, by a fixed shuffle; metrics of features use all.
 REAL_SCANS = 10_000
 
@@ -198,7 +199,7 @@ def measure(
         settings = {**described, **asdict(metric.protocol), "sizes": sizes}
         intervals: dict[str, tuple[float, float]] = {}
         if draws and not metric.resamples:
-            remarks.append("no bootstrap interval.")
+            remarks.append(NO_INTERVAL)
         elif draws:
             settings["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
             with bar("resampling", draws, "sets") as advance:

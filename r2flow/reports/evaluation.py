@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
+from r2flow.evaluation.measuring import NO_INTERVAL
 from r2flow.evaluation.sets import AS_MANY, HALVES
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.pictures import draw_range
@@ -210,7 +211,7 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
                 remarks.setdefault(remark, {}).setdefault(comparison.title, []).append(result.metric)
     for remark, where in remarks.items():
         metrics = list(dict.fromkeys(name for names in where.values() for name in names))
-        about = [] if len(where) == len(comparisons) or remark.startswith("no bootstrap") else [", ".join(where)]
+        about = [] if len(where) == len(comparisons) or remark == NO_INTERVAL else [", ".join(where)]
         if len(metrics) < len(comparisons[0].measured) and not remark.startswith(tuple(metrics)):
             about.append(", ".join(metrics))
         lines.append(f"{'; '.join(about)}: {remark}" if about else remark)
