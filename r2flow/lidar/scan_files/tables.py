@@ -109,7 +109,7 @@ def read_text(path: Path) -> Table:
         named = (line for line in comments if len(line) == width and {"x", "y", "z"} <= {word.lower() for word in line})
         names = next(named, None)
     try:
-        table = np.loadtxt(rows, delimiter=apart, comments=None, ndmin=2)
+        table = np.loadtxt(rows, delimiter=apart, comments=None, quotechar='"', ndmin=2)
     except ValueError:
         if apart is None:
             raise
