@@ -10,6 +10,7 @@ An item depends only on the recipe and on its number: two processes that make th
 written under a temporary name and renamed when complete, so that a killed command can resume.
 """
 
+import errno
 import hashlib
 import json
 import logging
@@ -275,21 +276,23 @@ def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         content: dict[str, Any] = read_json(path)
+        if "checksum" not in content:  # a common name: of a data set, say
+            raise FileNotFoundError(errno.ENOENT, "r2flow did not write it; give another folder", str(path))
         format_name, _ = content["format"], content["recipe"]
         damaged = content.pop("checksum", None) != checksum(content)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         damaged = True
     if damaged:
-        raise InputError(f"{path} is damaged. Delete {folder} and make it again.")
+        raise InputError(f"{path} is damaged. If r2flow wrote {folder}, remove it and make it again.")
     if kind is not None and format_name != f"r2flow {kind}":
         raise InputError(f"{folder} holds {format_name.removeprefix('r2flow ')}, not {kind}; give another folder.")
     return content
 
 
 def manifest_of(folder: str | Path) -> dict[str, Any]:
-    """The manifest of a folder; empty if the folder has none."""
+    """The manifest that r2flow wrote in a folder; empty if there is none."""
     try:
         return read_manifest(Path(folder).expanduser())
     except (FileNotFoundError, NotADirectoryError):

@@ -14,7 +14,7 @@ from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
 from r2flow.errors import InputError, warn_odd
 from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS, scan_ending
-from r2flow.store import MANIFEST
+from r2flow.store import manifest_of
 
 log = logging.getLogger(__name__)
 
@@ -175,7 +175,7 @@ def folder(root: Path) -> list[Drive]:
     would be taken for measurements.
     """
     below = sorted(Path(place) for place, _ in _walk(root))
-    made = {place for place in below if place != root and (place / MANIFEST).is_file()}
+    made = {place for place in below if place != root and manifest_of(place)}
     own = [place for place in below if made.isdisjoint((place, *place.parents))]
     for endings in (FIRM_ENDINGS, LOOSE_ENDINGS):
         for places in (own, below):
@@ -184,7 +184,7 @@ def folder(root: Path) -> list[Drive]:
                 if len(places) < len(below):
                     warn_odd(min(made), "left out, since r2flow wrote it, as are other such folders below the scans")
                 mixed = [place for place, drive in zip(places, drives, strict=True) if drive.scans]
-                mixed = [place for place in mixed if endings is FIRM_ENDINGS and not (place / MANIFEST).is_file()]
+                mixed = [place for place in mixed if endings is FIRM_ENDINGS and not manifest_of(place)]
                 left = sum(len(_files(place, (".csv",))) for place in mixed)
                 if left:
                     warn_odd(root, f"{left} .csv files left out: scan files of other formats are next to them")

@@ -116,6 +116,8 @@ def open_scans(
         refuse_other_samples(file.parent, reading.sensor)
     elif not own_size:
         warn_of_other_sensor([file], reading, file)
+    if manifest_of(file.parent):  # its reflectance is in [0, 1]
+        reading = replace(reading, reflectance_scale=1.0)
     if own_size and image is not None:
         reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
     if reading.reflectance == AUTO:
@@ -210,10 +212,6 @@ def reading_for(
         expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
         raise InputError(f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out.")
     reading = replace(reading, sensor=reading.sensor if model else chosen)
-    for spec in specs:  # before anything is read
-        options, file = parse(spec)
-        if options.name == FOLDER and file is None:
-            refuse_other_samples(Path(options.folder), reading.sensor)
     if reflectance_scale is not None or not specs:
         return reading
     trained = reading.reflectance_scale  # 1: also of scans that were scaled before the training

@@ -8,7 +8,7 @@ import math
 import os
 import shlex
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cached_property
@@ -25,7 +25,7 @@ from r2flow.errors import InputError, warn_odd
 from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.store import MANIFEST
+from r2flow.store import MANIFEST, manifest_of
 
 log = logging.getLogger(__name__)
 
@@ -99,11 +99,18 @@ def made_here(root: str | Path) -> bool:
     folder = Path(root).expanduser()
     if folder.is_file():
         folder = folder.parent
-    if not folder.is_dir() or (folder / MANIFEST).is_file():
+    if not folder.is_dir() or manifest_of(folder):
         return folder.is_dir()
     with os.scandir(folder) as entries:  # knows folders without a system call per file
-        below = [Path(entry.path, MANIFEST) for entry in entries if entry.is_dir() or scan_ending(entry.name)]
-    return bool(below) and all(manifest.is_file() for manifest in below)
+        below = [entry.path for entry in entries if entry.is_dir() or scan_ending(entry.name)]
+    return bool(below) and all(map(manifest_of, below))
+
+
+def readable(paths: Sequence[str | Path], columns: Sequence[str] | None) -> Iterator[Points]:
+    """The points of the files that hold points."""
+    for path in paths:
+        with suppress(InputError):
+            yield read_points(path, columns)
 
 
 def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> Doubt | None:
@@ -121,10 +128,7 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path)
             return None
         seen, known = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}", theirs.name in SENSORS
         return Doubt(seen, theirs.name if known else None, sure=known)
-    scans = []
-    for number in spread(len(paths), LOOKED_AT):
-        with suppress(InputError):
-            scans.append(read_points(paths[number], reading.columns))
+    scans = [*readable([paths[number] for number in spread(len(paths), LOOKED_AT)], reading.columns)]
     mismatch = other_sensor(scans, reading.sensor) if scans else None
     if not scans or (mismatch and mismatch.hopeless):
         return mismatch

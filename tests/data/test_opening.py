@@ -92,15 +92,18 @@ class TestSamples:
         assert open_scans(tmp_path).source.places() == {str(tmp_path / "samples" / "000000.npy")}
 
     def test_a_folder_that_says_nothing_is_read_as_asked_for(self, tmp_path: Path):
-        write_image(tmp_path / "000000.npy", 2)
+        for place in (tmp_path, tmp_path / "drive"):
+            write_image(place / "000000.npy", 2)
+            (place / "manifest.json").write_text('{"name": "a data set of mine"}')
         assert own_reading(tmp_path) is None
+        assert len(open_scans(tmp_path)) == 2
         with pytest.raises(InputError, match="give --size 8x32"):
             open_scans(tmp_path).source[0]
         assert open_scans(tmp_path / "000000.npy", own_size=True).sensor.shape == (8, 32)
 
     def test_a_damaged_note_is_one_line(self, tmp_path: Path):
         self.samples(tmp_path)
-        for content in ("{", "[]", '{"reading": {}}', '{"recipe": {"reading": {"sensor": {"name": "a"}}}}'):
+        for content in ("{", "1", '{"checksum": ""}', '{"checksum": "", "recipe": {"reading": {"sensor": {}}}}'):
             (tmp_path / "manifest.json").write_text(content)
             with pytest.raises(InputError, match=r"manifest.json is damaged") as error:
                 open_scans(tmp_path)
@@ -120,7 +123,8 @@ class TestWhatR2FlowWrote:
         image = simulate(sensor, 3, 5).image
         np.testing.assert_allclose(open_scans(tmp_path, reading).source[0], image, atol=1e-5)
         wrong_scale = replace(reading, reflectance_scale=255.0)
-        np.testing.assert_allclose(open_scans(tmp_path, wrong_scale).source[0], image, atol=1e-5)
+        for name in (tmp_path, tmp_path / "000005.ply"):
+            np.testing.assert_allclose(open_scans(name, wrong_scale).source[0], image, atol=1e-5)
         scan = r2flow.read(tmp_path / "000005.ply")
         assert (scan.dtype, scan.shape) == (torch.float32, (2, 16, 64))
         np.testing.assert_allclose(scan.numpy(), image, atol=1e-5)
