@@ -62,11 +62,16 @@ def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_p
 def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_path):
     for number, image in enumerate(images(3, 1)):
         xyz, reflectance = image_to_points(image, SENSOR.rays())
-        write_points(tmp_path / "g" / f"{number}.ply", xyz, 255 * reflectance)
+        for name, scale in (("g", 255), ("one", 1)):
+            write_points(tmp_path / name / f"{number}.ply", xyz, scale * reflectance)
     assert r2flow("evaluate", real, tmp_path / "g", *QUICK)[0] == 0
     options = ("--metrics", "frechet_handcrafted", *QUICK[2:], "--json", tmp_path / "e.json")
     assert "--reflectance-scale 255" in r2flow.refusal("evaluate", real, tmp_path / "g", *options)
     assert r2flow("evaluate", real, tmp_path / "g", *options, "--generated-scale", 255)[0] == 0
+    for sets in ((tmp_path / "g", tmp_path / "one"), (tmp_path / "one", tmp_path / "g")):  # the same scans
+        assert r2flow("evaluate", *sets, *options, "--reflectance-scale", 255)[0] == 0
+        (metric,) = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"]
+        assert metric["figures"]["frechet_handcrafted"] == pytest.approx(0, abs=1e-6)
 
 
 def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):

@@ -19,7 +19,7 @@ from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.errors import InputError, naming
-from r2flow.lidar.estimation import FULL_REFLECTANCE, full_reflectance, other_sensor
+from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.transfer import (
@@ -131,7 +131,7 @@ def _files(
         if not as_own:
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
-        if not (scale or stored) and full != usual and (of_sensor or full not in FULL_REFLECTANCE):
+        if not (scale or stored) and full != usual and (of_sensor or full not in SURE):
             log.warning("%s: %s", spec, DIVIDED % full)
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)

@@ -24,7 +24,7 @@ from safetensors import safe_open
 from r2flow.config import at_most_three, differences
 from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, find_levels, fits, range_codes, reflectance_codes
-from r2flow.data.reading import Reading, lacks_reflectance, stored_reflectance
+from r2flow.data.reading import Reading, lacks_reflectance, scale_within, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError, check
 from r2flow.lidar.scan_files import read_range_image
@@ -108,7 +108,8 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
             reflectance = stored_reflectance(paths[index], reading.columns)
             if reflectance is not None:
                 is_image = read_range_image(paths[index]) is not None  # with reflectance in [0, 1]
-                samples.append(reflectance / np.float32(1.0 if is_image else scale))
+                own = 1.0 if is_image else scale_within(paths[index], reflectance, scale)
+                samples.append(reflectance / np.float32(own))
                 images |= is_image
     values = np.concatenate(samples) if samples else np.zeros(0)
     if not values.any():

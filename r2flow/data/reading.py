@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from r2flow.errors import InputError, naming, warn_odd
-from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, full_reflectance
+from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
@@ -128,22 +128,35 @@ def _no_reflectance(path: str | Path) -> InputError:
     )
 
 
+def estimated_scale(path: str | Path, scans: Iterable[Points]) -> float:
+    """Full reflectance estimated from scans, 1 without any; warns of a value that other scans may exceed."""
+    scale = full_reflectance(scans) or 1.0
+    if scale not in SURE:
+        warn_odd(Path(path), DIVIDED % scale)
+    return scale
+
+
+def scale_within(path: str | Path, values: np.ndarray, scale: float) -> float:
+    """`scale`, or, with a warning, 1 for stored fractions of 1, which are not values of a common larger scale."""
+    if scale in FULL_REFLECTANCE[1:] and values.max(initial=0) <= 1 and (values % 1).any():
+        warn_odd(Path(path), f"reflectance is not divided by {scale:g}: its values are fractions of 1")
+        return 1.0
+    return scale
+
+
 def scaled_reflectance(path: str | Path, points: Points, scale: float | None, strict: bool = True) -> np.ndarray:
     """The reflectance of points, scaled to [0, 1]; None estimates the scale. Unless `strict`, all beyond is clipped."""
     if points.reflectance is None:
         raise _no_reflectance(path)
     highest = float(np.nan_to_num(points.reflectance).max(initial=0))
-    if scale is None:
-        scale = full_reflectance([points]) or 1.0
-        if scale not in FULL_REFLECTANCE:
-            warn_odd(Path(path), DIVIDED % scale)
+    scale = scale_within(path, points.reflectance, estimated_scale(path, [points]) if scale is None else scale)
     if 0 < highest < FAINT * scale:
         warn_odd(Path(path), DARK)
     scaled = points.reflectance / np.float32(scale)
     # NaN compares false and is refused, too.
     if strict and not (np.count_nonzero(scaled > 1.001) <= OUTLIERS * len(scaled) and scaled.min(initial=0) >= 0):
         raise InputError(
-            f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
+            f"{path}: reflectance must lie in [0, {scale:g}], found {points.reflectance.min():g} to {highest:g}. "
             "Give the value of full reflectance, often 255: data.reading.reflectance_scale=255, that of "
             "its part of data.parts, or --reflectance-scale 255."
         )

@@ -1,7 +1,7 @@
 """Estimate a sensor from its scans, and judge whether scans are of a sensor."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import product
 from typing import NamedTuple
@@ -17,6 +17,7 @@ from r2flow.lidar.unfolding import elevations_of
 FEWEST_RETURNS = 200  # minimum for an estimate
 COLUMNS = 64  # image widths are multiples of it, so that every backbone can halve them
 FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full reflectance
+SURE = (1.0, 255.0, 256.0, 65535.0)  # bytes up to 100 may be of 255: above it are retroreflectors alone
 OUTLIERS = 1e-4  # share of values that may exceed one of them
 IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
 OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
@@ -216,16 +217,14 @@ def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> floa
     return 360 / step
 
 
-def full_reflectance(scans: Sequence[Points], usual: float | None = None) -> float | None:
-    """Estimate the value of full reflectance; None if a file has no reflectance, or only 0.
+def full_reflectance(scans: Iterable[Points], usual: float | None = None) -> float | None:
+    """Estimate the value of full reflectance; None if no file has reflectance, or only 0.
 
     It is `usual`, if given, unless more than 1 % of the values exceed it; else 1 if at most one in 10,000 exceeds 1, or
     the first common value that none exceeds, or the highest value, rounded up, if that is below a tenth of it.
     """
-    if any(scan.reflectance is None for scan in scans):
-        return None
-    values = np.concatenate([scan.reflectance for scan in scans])
-    highest = float(values.max())
+    values = np.concatenate([np.zeros(0), *(scan.reflectance for scan in scans if scan.reflectance is not None)])
+    highest = float(values.max(initial=0))
     if highest <= 0:
         return None
     if usual and np.mean(values > usual) <= 0.01:

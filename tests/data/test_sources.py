@@ -1,11 +1,13 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import InMemory, ScanFiles, holdout_block
 from r2flow.errors import InputError
+from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from tests.conftest import numbers, write_scan
 
@@ -26,18 +28,10 @@ def test_skipping_takes_the_next_good_scan_of_the_same_block(numbered: Path, cap
     assert caplog.text.count("left out") == 3  # each is said once
     # A block never reaches into its neighbour: scan 11 is not replaced by scan 0 of the training block.
     assert numbers(source.subset(range(9, 12))) == [9, 10, 9]
-
-
-def test_memory_holds_what_the_files_give(numbered: Path):
-    # The same length and order either way, or a run could not go on with other memory.
-    (numbered / "000003.bin").write_bytes(b"")
-    source = files(numbered, on_bad_scan="skip")
+    # The same length and order in memory, or a run could not go on with other memory.
     kept = InMemory(source.batch(range(12)).numpy(), source.names)
-    assert numbers(kept) == numbers(source) == [0, 1, 2, 4, 4, 5, 6, 7, 8, 9, 10, 11]
-    assert numbers(kept.subset([2, 3])) == [2, 4]
-
-
-def test_when_all_are_bad_it_ends(numbered: Path):
+    assert numbers(kept) == numbers(source)
+    assert numbers(kept.subset([2, 3])) == [2, 5]
     for path in numbered.glob("*.bin"):
         path.write_bytes(b"")
     with pytest.raises(InputError, match="all 12 scans were left out"):
@@ -51,10 +45,11 @@ def test_a_scan_out_of_range_says_its_numbers(tmp_path: Path):
 
 
 def test_reflectance_out_of_scale_names_the_key(tmp_path: Path):
-    write_scan(tmp_path / "scan.bin", 0, reflectance=235.0)
-    with pytest.raises(InputError, match=r"found up to 235.*reflectance_scale=255"):
-        read_image(tmp_path / "scan.bin", STRICT)
-    image = read_image(tmp_path / "scan.bin", replace(STRICT, reflectance_scale=255))
+    for stored, found in ((-1, "-1 to 0"), (235, "235 to 235")):
+        write_points(tmp_path / "scan.ply", np.array([[10, 0, -1]]), np.array([stored]))
+        with pytest.raises(InputError, match=rf"in \[0, 1\], found {found}\..*reflectance_scale=255"):
+            read_image(tmp_path / "scan.ply", STRICT)
+    image = read_image(tmp_path / "scan.ply", replace(STRICT, reflectance_scale=255))
     assert image[1].max() == pytest.approx(235 / 255)
 
 

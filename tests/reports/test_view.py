@@ -13,6 +13,7 @@ import torch
 from r2flow import load
 from r2flow.errors import InputError
 from r2flow.lidar.labels import CLASSES
+from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import Draws
 from r2flow.reports.view import MOST, Panel, page
@@ -167,6 +168,13 @@ class TestTheVerb:
         r, _ = unpacked(data, 0)
         e = SENSORS["hdl64e"].rays()[0].numpy()
         np.testing.assert_allclose(r[40:60], (-1.73 / np.sin(e))[40:60], atol=0.003)
+
+    def test_a_folder_has_one_scale_of_reflectance(self, r2flow, tmp_path):
+        for name, highest in (("a", 80), ("b", 204)):
+            write_points(tmp_path / "in" / f"{name}.ply", np.array([[10.0, 0, 0]]), np.array([highest]))
+        assert r2flow("show", tmp_path / "in", "--format", "npy", "--out", tmp_path / "out")[0] == 0
+        found = [np.load(tmp_path / "out" / f"{name}.npy")[1].max() for name in "ab"]
+        assert found == pytest.approx([80 / 255, 0.8])
 
     def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path):
         for name, image in zip("ab", images(2), strict=True):

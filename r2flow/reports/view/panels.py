@@ -12,9 +12,9 @@ import torch
 
 from r2flow.data.opening import find_drives, open_scans, own_reading, parse
 from r2flow.data.options import FOLDER, SIMULATED
-from r2flow.data.reading import Reading, read_labelled_scan
+from r2flow.data.reading import Reading, estimated_scale, read_labelled_scan
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread, warn_of_other_sensor
+from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, readable, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.generators import as_flow
 from r2flow.generators.flow import ode_sampler
@@ -53,6 +53,9 @@ def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -
         _print_choice(spec, len(paths), most)
         chosen = [paths[index] for index in spread(len(paths), most)]
         warn_of_other_sensor(chosen, reading, spec)
+        if reading.reflectance_scale is None:
+            scale = estimated_scale(chosen[0], readable(chosen, reading.columns))
+            reading = replace(reading, reflectance_scale=scale)
         views = [(path, open_scans(path, reading, own_size=True), 0) for path in chosen]
     else:
         opened = open_scans(spec, reading)
