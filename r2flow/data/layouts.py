@@ -185,8 +185,7 @@ def folder(root: Path) -> list[Drive]:
                     warn_odd(min(made), "left out, since r2flow wrote it, as are other such folders below the scans")
                 mixed = [place for place, drive in zip(places, drives, strict=True) if drive.scans]
                 mixed = [place for place in mixed if endings is FIRM_ENDINGS and not manifest_of(place)]
-                left = sum(len(_files(place, (".csv",))) for place in mixed)
-                if left:
+                if left := sum(len(_files(place, (".csv",))) for place in mixed):
                     warn_odd(root, f"{left} .csv files left out: scan files of other formats are next to them")
                 return drives
     return []

@@ -46,12 +46,9 @@ def numbers(scans) -> list[int]:
     return of_source(scans.source)
 
 
-class TestNames:
-    """Every name that the README knows opens as numbered images."""
-
-    def test_a_usual_sensor_is_the_data_set_s(self):
-        assert reading_for(["nuscenes:x"]) == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)
-        assert reading_for(["kitti_raw:x"]) == Reading(SENSORS["hdl64e"])
+def test_a_usual_sensor_is_the_data_set_s():
+    assert reading_for(["nuscenes:x"]) == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)
+    assert reading_for(["kitti_raw:x"]) == Reading(SENSORS["hdl64e"])
 
 
 class TestSamples:

@@ -288,6 +288,10 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tm
     for index, number in enumerate((0, 2, 6, 7, 8, 9)):
         assert np.array_equal(prepared[index][1], raw[number][1])
     assert prepared_in(tmp_path / "out", SMALL, drives=["drive1"]).names == raw.names[6:]
+    for path in root.rglob("*.bin"):
+        path.write_bytes(b"no scan")
+    with pytest.raises(InputError, match="all 10 scans were left out as unusable"):
+        make(tmp_path / "none", plan_of(root), on_bad_scan="skip")
 
 
 def test_a_scan_that_has_no_reflectance_among_others_is_a_bad_one(tmp_path: Path):
@@ -295,13 +299,6 @@ def test_a_scan_that_has_no_reflectance_among_others_is_a_bad_one(tmp_path: Path
         write_cloud(tmp_path / "scans" / f"{number:02d}.ply", number, levels=None if number == 1 else 100)
     with pytest.raises(InputError, match=r"01.ply has no reflectance"):
         make(tmp_path / "out", plan_of(tmp_path / "scans"))
-
-
-def test_no_usable_scan_at_all(tmp_path: Path):
-    (tmp_path / "scans").mkdir()
-    (tmp_path / "scans" / "1.bin").write_bytes(b"no scan")
-    with pytest.raises(InputError, match="all 1 scans were left out as unusable"):
-        make(tmp_path / "out", plan_of(tmp_path / "scans"), on_bad_scan="skip")
 
 
 # At any number of attempts, by any number of processes; test_pairs.py has stores that several commands share
