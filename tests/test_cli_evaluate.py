@@ -115,11 +115,11 @@ def points(r2flow, real, tmp_path):
 
 
 def test_several_samplers_and_steps_make_a_set_each(points, saved, tmp_path):
-    rows, page = points(saved[0], "--sampler", "euler,heun2", "--steps", "1,2", "--bootstrap", 8)
+    rows, page = points(saved[0], "--sampler", "euler,heun2", "--steps", "1,2")
     assert [(row["flow"].partition(", ")[2], row["evaluations"]) for row in rows] == [
         ("euler", 1), ("euler", 2), ("heun2", 2), ("heun2", 4),
     ]  # fmt: skip
-    assert all(row["jsd/jsd low"] < row["jsd/jsd high"] and row["seconds"] > 0 for row in rows)
+    assert all(row["jsd/jsd"] > 0 and row["seconds"] > 0 for row in rows)
     assert f"{saved[0].name}, heun2, 2 steps" in page
     assert (tmp_path / "evaluation_speed.png").stat().st_size > 10_000
 
@@ -196,7 +196,7 @@ def plugged_in(monkeypatch):
 
 
 def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, plugged_in):
-    options = ("--metrics", "mine,frechet_means,kid_means,panel", *QUICK[2:], "--bootstrap", 5)
+    options = ("--metrics", "mine,frechet_means,kid_means,panel", *QUICK[2:])
     said = r2flow.said("evaluate", real, generated, *options, "--json", tmp_path / "e.json")
     ranges = [scans[:, 0][(scans[:, 0] > 0) & (scans[:, 0] < 63)].mean() for scans in (images(12, 1), images(10, 2))]
     both = (Scans(torch.from_numpy(scans), SENSOR) for scans in (images(12, 1), images(10, 2)))
@@ -206,9 +206,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
     found = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"]
     assert found[0]["figures"] == {"mine": pytest.approx(abs(ranges[0] - ranges[1]), rel=1e-4)}
     assert found[1]["figures"] == {"frechet_means": pytest.approx(frechet, rel=1e-4)}
-    assert "mine" in found[0]["intervals"]
     assert "kid_means" in said
-    assert "\n  kid_means, panel: no bootstrap interval.\n" in said
 
 
 def test_a_scan_is_no_place_for_figures(r2flow, real, generated):

@@ -65,7 +65,6 @@ class EvaluateOptions:
         str | None, typer.Option(help=f"Training scans, to detect copies by nearest-neighbour distances: {SETS}.")
     ] = None
     train_split: Annotated[str | None, typer.Option(help="Part of TRAIN's standard split.")] = None
-    bootstrap: Annotated[int, typer.Option(min=0, help="Bootstrap resamples for 95 % intervals; 0: no intervals.")] = 0
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Recompute the statistics of the real scans.")] = False
     num: Annotated[
         int | None, typer.Option(min=1, help="Scans to sample or simulate (1000), or to read per folder (all).")
@@ -90,7 +89,6 @@ class EvaluateOptions:
     def check(self, named: Sequence[str], sampled: Sequence[str]) -> None:
         """Refuse incompatible options before reading any scan."""
         check(named or self.reference or self.baselines, "nothing to compare with: give GENERATED or --reference.")
-        check(self.bootstrap not in (1, 2, 3), f"an interval needs --bootstrap of at least 4, found {self.bootstrap}.")
         if self.json is not None and (self.json.is_dir() or self.json.suffix.lower() != ".json"):
             raise InputError(f"--json must be a file that ends in .json, found {self.json}.")
         if not sampled and any(getattr(self, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
@@ -121,6 +119,7 @@ def evaluate(
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
+    from r2flow.metrics import METRICS
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.processes import joined, place
     from r2flow.reports.pages import prepare_folder
@@ -131,7 +130,7 @@ def evaluate(
     options.check(named, sampled)
     with joined(choose_device(options.device)) as device:
         names = None if options.metrics in (None, "all") else options.metrics.split(",")
-        chosen = names and {name: _build(name, options, device) for name in dict.fromkeys(names)}
+        chosen = names and {name: METRICS[name]().to(device) for name in dict.fromkeys(names)}
         flows = {name: load_checkpoint(name, device) for name in sampled}
         if len({(flow.sensor.shape, flow.sensor.elevations) for flow in flows.values()}) > 1:
             raise InputError(f"{', '.join(flows)} have different sensors or image sizes; measure each by itself.")
@@ -176,7 +175,7 @@ def _compare(
 
     work = Work(options.batch_size, options.workers)
     rules, cache = PROTOCOLS[options.protocol], None if options.no_cache else Cache()
-    compare = Comparer(metrics, work, rules, options.bootstrap, cache, options.out and options.out / "results", device)
+    compare = Comparer(metrics, work, rules, cache, options.out and options.out / "results", device)
     pairs = pairs_of(truth, judged, options.reference, options.baselines)
     comparisons = with_equal_panels([compare(*pair) for pair in pairs])
     if place()[0] > 0:
@@ -186,9 +185,7 @@ def _compare(
         nearest = find_nearest({**judged, REAL: truth}, training, work, device)
         real = nearest.pop(REAL)
         comparisons = with_copies(comparisons, nearest, real, len(training))
-    seeds = {"bootstrap": 0} if options.bootstrap else {}
-    if any(scans.source.drawn for scans in judged.values()):
-        seeds["sampled scans"] = options.seed
+    seeds = {"sampled scans": options.seed} if any(scans.source.drawn for scans in judged.values()) else {}
     page = evaluation_page(comparisons, device, seeds, nearest, training)
     print_comparisons(comparisons)
     if options.json is not None:
@@ -272,12 +269,6 @@ def _samplers(
     return chosen
 
 
-def _build(name: str, options: EvaluateOptions, device: str) -> "ScanMetric":
-    from r2flow.metrics import METRICS
-
-    return METRICS[name](keep=options.bootstrap > 0).to(device)
-
-
 def _build_possible(reflectance: bool, options: EvaluateOptions, device: str) -> "dict[str, ScanMetric]":
     """Build the default metrics, or all, that can be computed here; warn about the others."""
     from r2flow.metrics import METRICS, default_metrics
@@ -286,7 +277,7 @@ def _build_possible(reflectance: bool, options: EvaluateOptions, device: str) ->
     left_out: dict[str, list[str]] = {}
     for name in METRICS if options.metrics == "all" else default_metrics(reflectance):
         try:
-            metric = _build(name, options, device)
+            metric = METRICS[name]().to(device)
         except InputError:
             left_out.setdefault("their weights are not installed (r2flow weights)", []).append(name)
             continue

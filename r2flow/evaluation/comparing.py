@@ -72,14 +72,12 @@ def with_equal_panels(comparisons: Sequence[Comparison]) -> list[Comparison]:
 class Comparer:
     """Measures pairs of sets; statistics of a real set are gathered once.
 
-    `draws` bootstrap resamples, not of baselines, need metrics built with `keep=True`. Results of sampled sets are
-    stored in `folder`, if given, in files named by a hash of everything that these depend on.
+    Results of sampled sets are stored in `folder`, if given, in files named by a hash of all that they depend on.
     """
 
     metrics: Mapping[str, ScanMetric]
     work: Work
     rules: Rules
-    draws: int
     cache: Cache | None
     folder: Path | None
     device: str
@@ -93,8 +91,7 @@ class Comparer:
         if results is None:
             if id(real) not in self._statistics:
                 self._statistics[id(real)] = gather_real(self.metrics, real, self.work, self.cache, self.rules)
-            draws = 0 if kind == "baseline" else self.draws
-            results = measure(self.metrics, self._statistics[id(real)], other, self.work, draws, self.rules)
+            results = measure(self.metrics, self._statistics[id(real)], other, self.work, self.rules)
             if other.source.drawn:
                 results.append(speed_result(real, other))
             if path is not None and place()[0] == 0:
@@ -106,7 +103,7 @@ class Comparer:
         if self.folder is None or not other.source.drawn:
             return None
         recipe = {
-            "real": real.identity or [real.label, len(real)], "sampled": other.about, "bootstrap": self.draws,
+            "real": real.identity or [real.label, len(real)], "sampled": other.about,
             "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
             "protocol": self.rules.name, "plugins": plugin_digests(), "device": self.device,
         }  # fmt: skip

@@ -18,7 +18,6 @@ from r2flow.evaluation.protocols import R2FLOW, WORDS, Rules
 from r2flow.evaluation.sets import SampledScans
 from r2flow.files import cache_folder
 from r2flow.metrics.base import Protocol, ScanMetric
-from r2flow.metrics.bootstrap import LEVEL, bootstrap
 from r2flow.metrics.scans import Scans
 from r2flow.plugins import plugin_digests
 from r2flow.processes import place, summed
@@ -27,8 +26,7 @@ from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)
 
-FORMAT = 5  # increment if statistics change for the same scans and protocol
-NO_INTERVAL = "no bootstrap interval."  # baselines have none in any case
+FORMAT = 6  # increment if statistics change for the same scans and protocol
 # Metrics of single-scan histograms use this many real scans, by a fixed shuffle; metrics of features use all.
 REAL_SCANS = 10_000
 
@@ -80,7 +78,7 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
     """
     parts = {
         "format": FORMAT, "scans": scans.identity, "subset": rule, "protocol": asdict(metric.protocol),
-        "keeps": metric.keeps, "plugins": plugin_digests(), "device": torch.device(metric.device).type,
+        "plugins": plugin_digests(), "device": torch.device(metric.device).type,
     }  # fmt: skip
     return json.dumps(parts, sort_keys=True)
 
@@ -106,7 +104,6 @@ class MetricResult:
     figures: Mapping[str, float]  # by name; NaN if undefined, with a remark
     protocol: Mapping[str, Any]  # the metric's, plus set sizes and choice of real scans
     remarks: Sequence[str] = ()
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # (low, high), if requested
 
 
 def real_rule(metric: ScanMetric, real: ScanSet, protocol: Rules = R2FLOW) -> tuple[Sequence[int] | None, str]:
@@ -159,16 +156,9 @@ def measure(
     real: Mapping[str, Statistics],
     generated: ScanSet,
     work: Work,
-    draws: int = 0,
     protocol: Rules = R2FLOW,
 ) -> list[MetricResult]:
-    """Compute all metrics of a generated set.
-
-    Args:
-        metrics: Built with `keep=True` if `draws` > 0.
-        real: Statistics from `gather_real` under the same protocol.
-        draws: Bootstrap resamples for 95 % intervals; 0: no intervals.
-    """
+    """Compute all metrics of a generated set; `real` are statistics from `gather_real` under the same protocol."""
     for name, metric in metrics.items():
         metric.reset()
         metric.load_real_state(real[name].states)
@@ -197,14 +187,7 @@ def measure(
             "generated": len(generated), "generated_empty": empty,
         }  # fmt: skip
         settings = {**described, **asdict(metric.protocol), "sizes": sizes}
-        intervals: dict[str, tuple[float, float]] = {}
-        if draws and not metric.resamples:
-            remarks.append(NO_INTERVAL)
-        elif draws:
-            settings["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
-            with bar("resampling", draws, "sets") as advance:
-                intervals = bootstrap(metric, draws, advance=advance)
-        results.append(MetricResult(name, figures, settings, remarks, intervals))
+        results.append(MetricResult(name, figures, settings, remarks))
     return results
 
 

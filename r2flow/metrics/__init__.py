@@ -1,6 +1,6 @@
 """Registry of distances between real and generated scans; each name stands for one protocol.
 
-`METRICS[name](keep=..., sensor=...)` builds a metric. Importing this module does not import metrics, networks or torch.
+`METRICS[name](sensor=...)` builds a metric. Importing this module does not import metrics, networks or torch.
 
 Not implemented: LiDARGen's JSD and MMD, which keep returns up to 70 m (scans are masked to 63 m here), and
 UltraLiDAR's, which compare voxel centres of real scans with points of generated scans.

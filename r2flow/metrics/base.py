@@ -1,6 +1,5 @@
 """Base class of metrics between two sets of scans, and the protocol of their results."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Self
@@ -63,13 +62,10 @@ class ScanMetric(Metric):
         name, representation, mask, settings: As in `Protocol`.
         needs_reflectance, uses_reflectance: Whether scans without reflectance are refused; whether reflectance is
             used if present.
-        keeping: Whether rows are always stored in memory, float32.
-        resamples: Whether bootstrap intervals exist; they require rows stored by `keep=True`.
-        fewest: Minimum number of scans per set for `resampled`.
-        highest: Largest possible value.
+        keeping: Whether rows are stored in memory, float32.
+        fewest: Minimum number of scans per set for `distance`.
 
     Args:
-        keep: Store rows for bootstrap intervals.
         sensor: Sensor of images passed to `update` as tensors.
         options: Options of torchmetrics' Metric: process_group, sync_on_compute, ...
     """
@@ -84,22 +80,17 @@ class ScanMetric(Metric):
     needs_reflectance: bool = False
     uses_reflectance: ClassVar[bool] = False
     keeping: ClassVar[bool] = False
-    resamples: ClassVar[bool] = True
     fewest: ClassVar[int] = 2
-    highest: ClassVar[float] = math.inf
 
-    def __init__(
-        self, keep: bool = False, *, sensor: Sensor | None = None, name: str | None = None, **options: Any
-    ) -> None:
+    def __init__(self, *, sensor: Sensor | None = None, name: str | None = None, **options: Any) -> None:
         # Not cached: torchmetrics would return the value from before `merge_state`.
         super().__init__(**{"compute_with_cache": False, **options})
         self.name = name or type(self).name
         self.sensor = sensor
-        self.keeps = self.keeping or (keep and self.resamples)
         for side in SIDES:
             self.add_state(f"{side}_scans", torch.tensor(0), dist_reduce_fx="sum")
             self.add_state(f"{side}_left_out", torch.tensor(0), dist_reduce_fx="sum")
-            if self.keeps:  # N times a scan number and its row; flat, since a process without rows has no width
+            if self.keeping:  # N times a scan number and its row; flat, since a process without rows has no width
                 self.add_state(f"{side}_rows", [], dist_reduce_fx="cat")
         # Distinguishes metrics in a MetricCollection, which updates only one of those with equal states.
         self.add_state(f"name_{self.name}", torch.tensor(0), dist_reduce_fx="sum")
@@ -117,15 +108,13 @@ class ScanMetric(Metric):
         """Add finite rows to the statistics of a side."""
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        """Compute values by name, and remarks, from the states; default: `resampled` with weights 1."""
+        """Compute values by name, and remarks, from the states; default: `distance`."""
         if any(self.count(side) < self.fewest for side in SIDES):
             return {self.name: float("nan")}, [f"{self.name} needs {self.fewest} or more scans of each set."]
-        weights: dict[Side, Tensor] = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
-        return {name: float(value) for name, value in self.resampled(weights).items()}, []
+        return {self.name: float(self.distance(self.kept("real"), self.kept("generated")))}, []
 
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Values for resampled sets, (R,) per name with intervals; `weights` are the weights of the stored scans,
-        (R, N), all 1 unless the metric `resamples`."""
+    def distance(self, real: Tensor, generated: Tensor) -> Tensor:
+        """The value for the stored rows of two sets, (N, D) and (M, D) float32."""
         raise NotImplementedError
 
     def update(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> None:
@@ -134,7 +123,7 @@ class ScanMetric(Metric):
         Args:
             scans: `Scans`, or images (B, 2 or 1, H, W) of the metric's `sensor`: range in metres, reflectance in
                 [0, 1], 0 without a return. Metrics of the same network run it once per `Scans` object.
-            first: Number of the first scan: stored rows are sorted by number, so that intervals do not depend on the
+            first: Number of the first scan: stored rows are sorted by number, so that values do not depend on the
                 order of batches. Default: the number of scans so far.
         """
         side: Side = "real" if real else "generated"
@@ -158,7 +147,7 @@ class ScanMetric(Metric):
         getattr(self, f"{side}_scans").add_(len(rows))
         getattr(self, f"{side}_left_out").add_(int((~whole).sum()))
         self.accumulate(rows[whole], side)
-        if self.keeps and whole.any():
+        if self.keeping and whole.any():
             numbered = torch.cat([first + whole.nonzero(), rows[whole]], 1)
             getattr(self, f"{side}_rows").append(numbered.flatten().float().to(self.device))
 

@@ -1,12 +1,13 @@
 """Metrics on a network's features of scans: kernel distance, precision and recall, classifier two-sample test."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, Protocol, ScanMetric, Side, blocks
+from r2flow.metrics.base import SIDES, Protocol, ScanMetric, blocks
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor, weights_hash
 from r2flow.metrics.scans import Scans
@@ -27,13 +28,13 @@ class FeatureMetric(ScanMetric):
     kind: ClassVar[str]
     names: ClassVar[Mapping[str, str]] = {}
 
-    def __init__(self, extractor: Extractor | str, keep: bool = False, **options: Any) -> None:
+    def __init__(self, extractor: Extractor | str, **options: Any) -> None:
         network = EXTRACTORS[extractor].trained() if isinstance(extractor, str) else extractor.eval()
         if isinstance(extractor, str) and network.weights == "random":  # a plug-in's own `trained`
             network.weights = weights_hash(network)
         name = f"{self.kind}_{network.name}"
         name = f"{name}_random" if network.weights == "random" else self.names.get(network.name, name)
-        super().__init__(keep, name=name, **options)
+        super().__init__(name=name, **options)
         self.extractor = network
         self.needs_reflectance = network.needs_reflectance
 
@@ -65,11 +66,9 @@ class KernelDistance(FeatureMetric):
     kind = "kid"
     settings: ClassVar[Mapping[str, Any]] = {"kernel": "(a b / D + 1)^3", "estimate": "unbiased, all pairs"}
     keeping = True
-    resamples = False  # repeated scans would form pairs of equal scans and bias the estimate
 
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        x, y = (self.kept(side) for side in SIDES)
-        return {self.name: _mean(x, x) + _mean(y, y) - 2 * _mean(x, y)}
+    def distance(self, real: Tensor, generated: Tensor) -> Tensor:
+        return _mean(real, real) + _mean(generated, generated) - 2 * _mean(real, generated)
 
 
 def _mean(x: Tensor, y: Tensor) -> Tensor:
@@ -93,16 +92,12 @@ class Manifold(FeatureMetric):
     generated scan, over k (it may exceed 1 and is robust to outliers), coverage the share of real balls that contain a
     generated scan.
 
-    There are no bootstrap intervals: balls around repeated scans have radius 0, and with fixed balls, 95 % intervals
-    had a coverage of 76 to 81 %.
-
     The values are named `precision_<network>` and so on.
     """
 
     kind = "manifold"
     settings: ClassVar[Mapping[str, Any]] = {"neighbours": NEIGHBOURS, "distance": "Euclidean"}
     keeping = True
-    resamples = False
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         names = [f"{name}_{self.name.removeprefix('manifold_')}" for name in NAMES]
@@ -151,8 +146,8 @@ class TwoSample(FeatureMetric):
     """Area under the ROC curve of a logistic regression between two sets (Lopez-Paz and Oquab 2017).
 
     Each contiguous half of both sets is scored by the classifier trained on the other half, so that neighbouring scans
-    of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always distinguished. The interval resamples
-    the scored scans for these two classifiers: it contains the mean over new sets of 30 to 100 scans in 70 to 86 %.
+    of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always distinguished. `_low` and `_high` are a
+    95 % interval for other scans judged by these two classifiers, not for classifiers trained on other scans.
     """
 
     kind = "auc"
@@ -160,29 +155,28 @@ class TwoSample(FeatureMetric):
     settings: ClassVar[Mapping[str, Any]] = {"classifier": "logistic regression, ridge 1", "folds": "two halves"}
     keeping = True
     fewest = 4  # two to train on, two to test
-    highest = 1.0
 
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+    def figures(self) -> tuple[dict[str, float], list[str]]:
+        names = [f"{self.name}{end}" for end in ("", "_low", "_high")]
+        if any(self.count(side) < self.fewest for side in SIDES):
+            return dict.fromkeys(names, float("nan")), [f"{self.name} needs {self.fewest} or more scans of each set."]
         real, generated = (self.kept(side).double() for side in SIDES)
-        areas = []
+        judged = []
         for turn in (1, -1):
             (learn_real, judge_real), (learn_made, judge_made) = (_halves(len(x))[::turn] for x in (real, generated))
             score = _classifier(real[learn_real], generated[learn_made])
-            areas.append(
-                area(
-                    score(real[judge_real]), score(generated[judge_made]),
-                    weights["real"][:, judge_real], weights["generated"][:, judge_made],
-                )
-            )  # fmt: skip
-        return {self.name: torch.stack(areas).mean(0)}
+            judged.append(area(score(real[judge_real]), score(generated[judge_made])))
+        value, error = sum(a for a, _ in judged) / 2, math.sqrt(sum(v for _, v in judged)) / 2
+        ends = value, max(value - 1.96 * error, 0.0), min(value + 1.96 * error, 1.0)
+        return dict(zip(names, ends, strict=True)), []
 
 
-def area(negative: Tensor, positive: Tensor, weights: Tensor, others: Tensor) -> Tensor:
-    """P(positive > negative) + P(equal) / 2, (R,), for scores (N,) and (M,) with weights (R, N) and (R, M)."""
+def area(negative: Tensor, positive: Tensor) -> tuple[float, float]:
+    """P(positive > negative) + P(equal) / 2 for scores (N,) and (M,), and its variance (DeLong et al. 1988)."""
     difference = positive[None] - negative[:, None]
     equal = difference.abs() < SAME * (1 + positive.abs())  # features of a scan differ by rounding between batches
     above = torch.where(equal, 0.5, (difference > 0).double())
-    return ((weights @ above) * others).sum(1) / (weights.sum(1) * others.sum(1))
+    return float(above.mean()), sum(float(above.mean(k).var() / above.shape[1 - k]) for k in (0, 1))
 
 
 def _halves(count: int) -> tuple[slice, slice]:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
+from r2flow.metrics.base import ScanMetric, blocks
 from r2flow.metrics.birds_eye import BINS, PROTOCOL, js_distance
 from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
@@ -61,33 +61,26 @@ class MMD(ScanMetric):
     def rows(self, scans: Scans) -> Tensor:
         return histograms(scans)
 
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        real, generated, between = self.terms(weights)
-        return {self.name: (real + generated - 2 * between).clamp(min=0)}
-
-    def terms(self, weights: Mapping[Side, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean kernels minus 1 within real scans, within generated scans and between both, (R,) each."""
-        real, generated = ((self.kept(side), weights[side]) for side in SIDES)
-        return mean_kernel(real, real), mean_kernel(generated, generated), mean_kernel(real, generated)
+    def distance(self, real: Tensor, generated: Tensor) -> Tensor:
+        within = mean_kernel(real, real) + mean_kernel(generated, generated)
+        return (within - 2 * mean_kernel(real, generated)).clamp(min=0)
 
 
-def mean_kernel(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
-    """Weighted mean of k(p, q) - 1 over scans p of one set and q of another, for each draw of weights, (R,).
+def mean_kernel(a: Tensor, b: Tensor) -> Tensor:
+    """Mean of k(p, q) - 1 over histograms p of one set, (N, D), and q of another, (M, D).
 
-    A set consists of stored histograms and their weights, (R, N). The 1 cancels in MMD^2; including it would cost four
-    digits, since k is close to 1. The kernel is computed once for all draws.
+    The 1 cancels in MMD^2; including it would cost four digits, since k is close to 1.
     """
-    (x_rows, x_weights), (y_rows, y_weights) = a, b
-    total = torch.zeros(len(x_weights), dtype=torch.float64)
-    for i, x in blocks(x_rows, BLOCK):
+    total = torch.zeros((), dtype=torch.float64)
+    for i, x in blocks(a, BLOCK):
         used = x.sum(0) > 0
         p = x[:, used] / x.sum(1, keepdim=True)  # over half of the cells are beyond the mask or always empty
-        for j, y in blocks(y_rows, BLOCK):
+        for j, y in blocks(b, BLOCK):
             if a is b and j.start < i.start:
                 continue  # k is symmetric
             q = y / y.sum(1, keepdim=True)
             d = p.square().sum(1)[:, None] + q.square().sum(1) - 2 * p @ q[:, used].T
             kernel = torch.expm1(d.clamp_(min=0).div_(-2 * SIGMA**2))
             twice = 2 if a is b and j.start > i.start else 1
-            total += twice * ((x_weights[:, i] @ kernel) * y_weights[:, j]).sum(1)
-    return total / (x_weights.sum(1) * y_weights.sum(1))
+            total += twice * kernel.sum()
+    return total / (len(a) * len(b))

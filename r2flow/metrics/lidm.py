@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
-from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
+from r2flow.metrics.base import ScanMetric, Side, blocks
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
@@ -37,7 +37,7 @@ def occupied(points: Tensor, cell: float) -> Tensor:
 class JSDLiDM(SumMetric):
     """Jensen-Shannon distance (root, natural logarithm) between counts of scans that occupy each 5 cm cell.
 
-    A row lists the occupied cells; the 4 million cells of single scans are not stored, so that it has no intervals.
+    A row lists the occupied cells, since a scan has 4 million.
     """
 
     name = "jsd_lidm"
@@ -47,7 +47,6 @@ class JSDLiDM(SumMetric):
         "cell": FINE, "metres": [-EXTENT, EXTENT], "logarithm": "natural", "root": True
     }  # fmt: skip
     width = round(2 * EXTENT / FINE) ** 2
-    resamples = False
 
     def rows(self, scans: Scans) -> Tensor:
         """Indices of occupied cells, (B, K) float64, filled up with `width`."""
@@ -80,7 +79,6 @@ class MMDLiDM(ScanMetric):
     }  # fmt: skip
     keeping = True
     fewest = 1
-    resamples = False  # the nearest scan is not a smooth function of the scans
 
     def rows(self, scans: Scans) -> Tensor:
         side = round(2 * EXTENT / COARSE)
@@ -92,13 +90,12 @@ class MMDLiDM(ScanMetric):
                 squared[:] = torch.from_numpy(np.rint(distance_transform_edt(free) ** 2)).flatten()
         return maps
 
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        real, generated = (self.kept(side) for side in SIDES)
+    def distance(self, real: Tensor, generated: Tensor) -> Tensor:
         nearest = torch.full((len(real),), torch.inf, dtype=torch.float64)
         for i, x in blocks(real, BLOCK):
             for _, y in blocks(generated, BLOCK):
                 nearest[i] = torch.minimum(nearest[i], _chamfer(x, y).amin(1))
-        return {self.name: nearest.mean() * (COARSE / (2 * EXTENT)) ** 2}
+        return nearest.mean() * (COARSE / (2 * EXTENT)) ** 2
 
 
 def _chamfer(x: Tensor, y: Tensor) -> Tensor:

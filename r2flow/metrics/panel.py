@@ -222,7 +222,6 @@ class Panel(SumMetric):
     }  # fmt: skip
     width = int(ENDS[-1])
     uses_reflectance = True
-    resamples = False  # |a - b| of rates is not smooth for nearly equal sets
 
     def rows(self, scans: Scans) -> Tensor:
         return nan_where_empty(panel_rows(scans), scans)

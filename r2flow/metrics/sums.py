@@ -1,16 +1,13 @@
 """Metrics computed from sums over the scans of a set: histograms, counts."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
-
-BLOCK = 1000  # scans per block
+from r2flow.metrics.base import SIDES, ScanMetric, Side
 
 
 class SumMetric(ScanMetric):
@@ -22,8 +19,8 @@ class SumMetric(ScanMetric):
 
     width: ClassVar[int]
 
-    def __init__(self, keep: bool = False, **options: Any) -> None:
-        super().__init__(keep, **options)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
         for side in SIDES:
             self.add_state(f"{side}_sum", torch.zeros(self.width, dtype=torch.float64), dist_reduce_fx="sum")
 
@@ -40,11 +37,3 @@ class SumMetric(ScanMetric):
         if not all(self.given(side) for side in SIDES):
             return dict.fromkeys(values, float("nan")), []
         return values, []
-
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        sums = {}
-        for side in SIDES:
-            parts = [weights[side][:, at] @ block for at, block in blocks(self.kept(side), BLOCK)]
-            sums[side] = torch.stack(parts).sum(0).numpy()
-        drawn = [self.figures_of(real, generated) for real, generated in zip(*sums.values(), strict=True)]
-        return {name: torch.tensor([values[name] for values in drawn], dtype=torch.float64) for name in drawn[0]}

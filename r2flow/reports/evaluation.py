@@ -12,13 +12,11 @@ from matplotlib.figure import Figure
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
-from r2flow.evaluation.measuring import NO_INTERVAL
 from r2flow.evaluation.sets import AS_MANY, HALVES
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.pictures import draw_range
 from r2flow.reports.tables import print_table, shown, table
 
-ENDS = (" low", " high")  # suffixes of interval limits
 DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
 UNBIASED = ("kid_", "speed")  # do not depend on the number of scans
 ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
@@ -44,10 +42,9 @@ def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
         sizes = result.protocol["sizes"]
         for name, value in result.figures.items():
             title, factor = heading(result.metric, name)
-            low, high = result.intervals.get(name, (None, None))
             rows.append({
                 "comparison": comparison.name, "kind": comparison.kind, "metric": result.metric, "figure": name,
-                "value": value, "low": low, "high": high, "printed_as": title, "printed": value * factor,
+                "value": value, "printed_as": title, "printed": value * factor,
                 "real": sizes["real"], "generated": sizes["generated"], "remarks": "; ".join(result.remarks),
             })  # fmt: skip
     return rows
@@ -157,7 +154,7 @@ def evaluation_page(
     sampled = points(more["comparisons"])
     if len(sampled) > len({row["flow"] for row in sampled}):
         names = [name for name in dict.fromkeys(key for row in sampled for key in row) if "/" in name]
-        figures["evaluation_speed"] = speed_figure(sampled, [name for name in names if not name.endswith(ENDS)])
+        figures["evaluation_speed"] = speed_figure(sampled, names)
     if nearest and training is not None:
         figures["evaluation_copies"] = copies_figure(nearest, training)
     title = "Generated scans against real ones"
@@ -177,10 +174,7 @@ def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]
     """Headings and lines, with published scaling; the longer of comparisons and values runs down."""
     cells: dict[str, dict[tuple[str, str], str]] = {}  # by kind and name, since a judged set may be named "noise"
     for row in rows_of(comparisons):
-        factor = heading(row["metric"], row["figure"])[1]
         text = "none" if math.isnan(row["value"]) else f"{row['printed']:#.4g}"
-        if row["low"] is not None and text != "none":
-            text += f" [{row['low'] * factor:#.3g}, {row['high'] * factor:#.3g}]"
         cells.setdefault(row["printed_as"], {})[row["kind"], row["comparison"]] = text
     sizes = [f"({len(c.generated)} : {len(c.real)})" for c in comparisons]
     if len(comparisons) >= len(cells):
@@ -197,10 +191,6 @@ def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     """Distinct remarks, with their metrics and comparisons."""
     lines = []
-    drawn = [m.protocol["interval"] for c in comparisons for m in c.measured if m.intervals]
-    if drawn:
-        draws = drawn[0]["bootstrap draws"]
-        lines.append(f"In brackets: intervals of {drawn[0]['level']:.0%}, from {draws} bootstrap draws.")
     biased = any(not m.metric.startswith(UNBIASED) for m in comparisons[0].measured)
     if biased and len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:
         lines.append("Distances of fewer scans are larger: compare only sets of equal sizes.")
@@ -211,7 +201,7 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
                 remarks.setdefault(remark, {}).setdefault(comparison.title, []).append(result.metric)
     for remark, where in remarks.items():
         metrics = list(dict.fromkeys(name for names in where.values() for name in names))
-        about = [] if len(where) == len(comparisons) or remark == NO_INTERVAL else [", ".join(where)]
+        about = [] if len(where) == len(comparisons) else [", ".join(where)]
         if len(metrics) < len(comparisons[0].measured) and not remark.startswith(tuple(metrics)):
             about.append(", ".join(metrics))
         lines.append(f"{'; '.join(about)}: {remark}" if about else remark)
@@ -237,7 +227,7 @@ def _plain_comparison(comparison: Comparison) -> dict[str, Any]:
 
 
 def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One row per sampled set of a JSON's `comparisons`: flow, weights, speed, METRIC/FIGURE and interval."""
+    """One row per sampled set of a JSON's `comparisons`: flow, weights, speed and METRIC/FIGURE."""
     rows = []
     for comparison in comparisons:
         if comparison["kind"] != "judged" or comparison["generated"].get("kind") != "sampled":
@@ -251,8 +241,6 @@ def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         for metric in comparison["metrics"]:
             short = "" if metric["metric"] == "speed" else f"{metric['metric']}/"
             row |= {f"{short}{name}": math.nan if value is None else value for name, value in metric["figures"].items()}
-            for name, ends in metric["intervals"].items():
-                row |= {f"{short}{name}{end}": value for end, value in zip(ENDS, ends, strict=True)}
         rows.append(row)
     return rows
 
@@ -272,8 +260,6 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
             line_rows = sorted((row for row in rows if row["flow"] == flow), key=lambda row: row[x])
             at = [row[x] for row in line_rows]
             axes.plot(at, [row.get(name, math.nan) * factor for row in line_rows], **style, ms=5, lw=1.2, label=flow)
-            ends = [[row.get(f"{name}{end}", math.nan) * factor for row in line_rows] for end in ENDS]
-            axes.vlines(at, *ends, color=style["color"], lw=0.8)
         positive = all(row[name] > 0 for row in rows if name in row)
         axes.set(xscale="log", yscale="log" if positive else "linear", xlabel=label, ylabel=title)
         few_log_ticks(axes.xaxis)

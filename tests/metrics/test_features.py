@@ -114,11 +114,23 @@ def test_halves_are_blocks_so_that_neighbours_do_not_help():
     assert auc(x, y) < 0.2
 
 
-def test_the_area_is_a_count_of_pairs_and_weights_are_repeats():
-    negative, positive = torch.tensor([0.1, 0.4, 0.4]).double(), torch.tensor([0.4, 0.9]).double()
-    ones = [torch.ones(1, 3).double(), torch.ones(1, 2).double()]
-    assert float(area(negative, positive, *ones)) == pytest.approx((1 + 0.5 + 0.5 + 3) / 6)
-    twice = area(negative, positive, torch.tensor([[2.0, 0, 1]]).double(), torch.tensor([[1.0, 3]]).double())
-    repeated = [negative[[0, 0, 2]], positive[[0, 1, 1, 1]]]
-    alone = area(*repeated, torch.ones(1, 3).double(), torch.ones(1, 4).double())
-    assert float(twice) == pytest.approx(float(alone))
+def test_the_area_is_a_count_of_pairs_and_its_variance_that_of_the_scores():
+    value, _ = area(torch.tensor([0.1, 0.4, 0.4]).double(), torch.tensor([0.4, 0.9]).double())
+    assert value == pytest.approx((1 + 0.5 + 0.5 + 3) / 6)
+    draw = torch.Generator().manual_seed(7)
+    scores = torch.randn(2000, 70, generator=draw).double()
+    areas, variances = zip(*(area(x[:40], x[40:] + 1) for x in scores), strict=True)
+    assert np.mean(areas) == pytest.approx((1 + math.erf(1 / 2)) / 2, abs=0.005)
+    assert np.mean(variances) == pytest.approx(np.var(areas), rel=0.1)  # the variance of 2,000 has 3 % of error
+
+
+def test_the_interval_is_of_both_halves():
+    draw = torch.Generator().manual_seed(8)
+    low, high = [], []
+    for _ in range(40):  # few features, learned from many scans: the classifiers are as good as the best
+        x, y = torch.randn(400, 1, generator=draw), torch.randn(400, 1, generator=draw) + 1
+        found = given(METRICS["auc"](), x, y)
+        low, high = [*low, found["auc_low"]], [*high, found["auc_high"]]
+    expected, sigma = (1 + math.erf(1 / 2)) / 2, (np.mean(high) - np.mean(low)) / (2 * 1.96)
+    assert np.mean(low) < expected < np.mean(high)
+    assert sigma == pytest.approx(np.std(np.add(low, high) / 2), rel=0.35)  # of 40 sets: 11 % of error

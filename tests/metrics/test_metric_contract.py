@@ -117,13 +117,12 @@ def test_equal_sets_are_at_no_distance(build, sets):
         assert values == pytest.approx([0] * len(values), abs=1e-9)
 
 
-@pytest.mark.parametrize("keep", [False, True])
-def test_statistics_of_the_real_set_replace_its_scans(build, sets, keep):
-    whole = give(build(keep=keep), sets)
-    kept = build(keep=keep)
+def test_statistics_of_the_real_set_replace_its_scans(build, sets):
+    whole = give(build(), sets)
+    kept = build()
     give(kept, {"real": sets["real"]})
     state = {name: value.clone() for name, value in kept.real_state().items()}
-    again = build(keep=keep)
+    again = build()
     for _ in range(2):
         again.reset()
         again.load_real_state(state)
@@ -165,9 +164,9 @@ def test_a_network_runs_once_for_all_metrics_of_it(summary, sets, monkeypatch):
 
 
 def test_a_batch_of_no_scans_changes_nothing(build, sets):
-    metric = build(keep=True)
+    metric = build()
     metric.update(part(sets["real"], slice(0, 0)), real=True)
-    assert give(metric, sets).compute() == give(build(keep=True), sets).compute()
+    assert give(metric, sets).compute() == give(build(), sets).compute()
 
 
 def test_scans_without_reflectance_are_refused_where_it_is_needed(build, sets):
@@ -205,7 +204,7 @@ def test_merged_states_are_those_of_all_scans(build, sets):
     if build().name in ORDERED:
         pytest.skip("the scans of a merged state are numbered from 0 again")
     halves = [{s: part(x, numbers) for s, x in sets.items()} for numbers in (slice(0, 5), slice(5, None))]
-    parts = [told(build(sensor=SMALL, keep=True), half) for half in halves]
+    parts = [told(build(sensor=SMALL), half) for half in halves]
     parts[1].persistent(True)
     for incoming in (parts[1], parts[1].state_dict()):
         metric = parts[0].clone()
@@ -216,12 +215,12 @@ def test_merged_states_are_those_of_all_scans(build, sets):
 
 def test_a_loaded_state_goes_on_where_the_saved_one_was(build, sets, tmp_path):
     expected = give(build(), sets).compute()
-    begun = build(sensor=SMALL, keep=True)
+    begun = build(sensor=SMALL)
     told(begun, {s: part(scans, slice(0, 7)) for s, scans in sets.items()})
     middle = begun.compute()
     begun.persistent(True)
     torch.save(begun.state_dict(), tmp_path / "metric.pt")
-    metric = build(sensor=SMALL, keep=True)
+    metric = build(sensor=SMALL)
     metric.load_state_dict(torch.load(tmp_path / "metric.pt", weights_only=True))
     assert metric.compute() == middle
     told(metric, {s: part(scans, slice(7, None)) for s, scans in sets.items()})

@@ -66,7 +66,7 @@ def test_marginals_are_sums_over_the_other_axis():
 
 def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     figures = {"speed": {"evaluations": 1.0, "seconds": 0.1}, "jsd": {"jsd": 0.25}, "mmd": {"mmd": 1e-4}}
-    metrics = [{"metric": name, "figures": values, "intervals": {}} for name, values in figures.items()]
+    metrics = [{"metric": name, "figures": values} for name, values in figures.items()]
     hashes = weights_hash(load_checkpoint(runs["1-RF"])), "another model"
     sets = [{"kind": "sampled", "set": "a", "weights": weights, "scans": 5} for weights in hashes]
     metrics[0]["protocol"] = {"name": "r2flow", "image": [8, 64]}
