@@ -118,9 +118,11 @@ def is_noted(folder: Path, *links: Link) -> bool:
 
 
 def _record(link: Link) -> dict[str, Any]:
-    """Record of a finished link: its command line, and its last checkpoint's name and size."""
+    """Record of a finished link: its command line without the chain's folder, which may move, and its last checkpoint's
+    name and size."""
     last = next(iter(checkpoints_of(link.run_dir)), None)
-    return {"overrides": list(link.overrides), "checkpoint": last and [last.name, last.stat().st_size]}
+    overrides = [text.replace(f"='{link.run_dir.parent}/", "='") for text in link.overrides]
+    return {"overrides": overrides, "checkpoint": last and [last.name, last.stat().st_size]}
 
 
 def run_process(command: Sequence[str]) -> int:
