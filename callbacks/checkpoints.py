@@ -50,6 +50,7 @@ class Checkpoints(Checkpoint):
 
     def __init__(self, run_dir: str | Path, every: Count = 100, keep: Count = 2) -> None:
         self.run_dir, self.every, self.keep = Path(run_dir), every, keep
+        self._saved = 0
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -59,12 +60,12 @@ class Checkpoints(Checkpoint):
             self.save(trainer)
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if trainer.global_step > 0:
+        if trainer.global_step > self._saved:
             self.save(trainer)
 
     def save(self, trainer: L.Trainer) -> None:
         """Save the current step, and delete old checkpoints."""
-        step = trainer.global_step
+        step = self._saved = trainer.global_step
         trainer.save_checkpoint(self.run_dir / FOLDER / f"step-{step:08d}.ckpt", weights_only=False)
         if trainer.is_global_zero:
             for path in checkpoints_of(self.run_dir):

@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import numpy as np
+from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from r2flow.errors import require
@@ -58,6 +60,18 @@ PICTURES: dict[type, Picture] = {
     MLFlowLogger: lambda log, name, pixels, step: log.experiment.log_image(log.run_id, pixels, key=name, step=step),
 }
 ELSEWHERE = (WandbLogger, MLFlowLogger)  # may be viewed without access to the run's folder
+
+
+class LearningRates(LearningRateMonitor):
+    """Logs the learning rates of each optimiser step, and keeps the loggers' count of steps."""
+
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        if batch_idx % trainer.accumulate_grad_batches == 0:
+            # Lightning counts one step too many after a stop by `trainer.max_time` at the step of a validation.
+            trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
+            super().on_train_batch_start(trainer, pl_module, batch, batch_idx)
 
 
 def build_loggers(names: Sequence[str] | None, run_dir: Path) -> list[Logger]:

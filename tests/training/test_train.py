@@ -1,5 +1,6 @@
 """train.py as a user runs it: from a folder, with overrides."""
 
+import csv
 import os
 import re
 import shutil
@@ -13,6 +14,8 @@ import torch
 import yaml
 from hydra.core.global_hydra import GlobalHydra
 
+from r2flow.callbacks import Progress
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import Sensor, write_sensor
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, step_of
@@ -254,9 +257,29 @@ def test_a_run_shorter_than_the_interval_is_validated_at_its_end(train: Run):
     assert "val/loss" in train("trainer.max_steps=1", "samples.num=0").stdout
 
 
-def test_steps_between_validations_are_of_the_optimiser(train: Run, tmp_path: Path):
-    train("trainer.accumulate_grad_batches=2", "trainer.max_steps=6", "samples.num=0", "run_dir=run")
-    assert list(read_curves(tmp_path / "run")["val/loss"][0]) == [3, 6]
+def test_curves_and_checkpoints_are_of_optimiser_steps_also_after_a_stop(train: Run, tmp_path: Path, monkeypatch):
+    saved: list[int] = []
+    save, update = AtomicCheckpointIO.save_checkpoint, Progress.on_train_batch_end
+
+    def save_checkpoint(self, content, path, storage_options=None):
+        saved.append(step_of(path))
+        save(self, content, path, storage_options)
+
+    def stop(self, trainer, *rest):  # as trainer.max_time does
+        trainer.should_stop |= trainer.global_step == 6
+        update(self, trainer, *rest)
+
+    monkeypatch.setattr(AtomicCheckpointIO, "save_checkpoint", save_checkpoint)
+    command = ["trainer.accumulate_grad_batches=2", "samples.num=0", "callbacks.checkpoint.every=4", "run_dir=run"]
+    with monkeypatch.context() as patch:
+        patch.setattr(Progress, "on_train_batch_end", stop)
+        assert train(*command, check=False).returncode == LATER
+    train(*command)
+    assert saved == [4, 6, 8, 12]
+    files = (tmp_path / "run" / "metrics" / f"version_{n}" / "metrics.csv" for n in range(2))
+    rows = [row for file in files for row in csv.DictReader(file.read_text().splitlines())]
+    assert [int(row["step"]) for row in rows if row["lr-AdamW"]] == [*range(12)]
+    assert [int(row["step"]) + 1 for row in rows if row["val/loss"]] == [3, 6, 9, 12]
 
 
 def test_too_few_scans_for_a_share_of_the_validation_are_one_line(train: Run):
