@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lightning.pytorch.callbacks import Callback, GradientAccumulationScheduler, LearningRateMonitor
+from lightning.pytorch.callbacks import Callback, EarlyStopping, GradientAccumulationScheduler
 
 from r2flow.errors import InputError
 from r2flow.registry import Registry, check_options
@@ -14,6 +14,7 @@ from .checkpoints import Checkpoints
 from .curvature import Curvature
 from .ema import EMA, HalfLifeEMA
 from .guard import Guard
+from .loggers import LearningRates
 from .periodic import SamplePictures
 from .progress import Progress
 from .reflow_pairs import ReflowPairs
@@ -51,8 +52,13 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
             built.append(entry.constructor(*given, **wanted[name]))
     if any(isinstance(callback, GradientAccumulationScheduler) for callback in built):  # the loader needs one number
         raise InputError("leave the GradientAccumulationScheduler out, and give trainer.accumulate_grad_batches.")
+    if any(isinstance(callback, EarlyStopping) for callback in built):  # such a run would count as stopped
+        raise InputError(
+            "a run ends at trainer.max_steps: leave EarlyStopping out, give callbacks.checkpoint.keep, and take the "
+            "checkpoint of the lowest val/loss."
+        )
     if config["loggers"]:
-        built.append(LearningRateMonitor("step"))
+        built.append(LearningRates("step"))
     return built
 
 

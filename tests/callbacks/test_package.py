@@ -3,7 +3,7 @@ import sys
 
 import lightning as L
 import pytest
-from lightning.pytorch.callbacks import GradientAccumulationScheduler
+from lightning.pytorch.callbacks import EarlyStopping, GradientAccumulationScheduler
 
 from r2flow.callbacks import CALLBACKS, build_callbacks
 from r2flow.errors import InputError
@@ -31,9 +31,16 @@ def test_a_class_alone_is_a_callback_of_the_table(monkeypatch):
     assert [one.every for one in built if isinstance(one, Say)] == [2]
 
 
-def test_a_number_of_parts_that_changes_is_refused(monkeypatch):
-    """The loader reads it once: images would repeat, in batches of another size."""
+@pytest.mark.parametrize(
+    ("callback", "option", "message"),
+    [
+        # The loader reads the number of parts once: images would repeat, in batches of another size.
+        (GradientAccumulationScheduler, "scheduling={0: 1, 2: 2}", r"give trainer\.accumulate_grad_batches"),
+        (EarlyStopping, "monitor=val/loss", r"a run ends at trainer\.max_steps"),
+    ],
+)
+def test_callbacks_that_a_run_does_not_support_are_refused(monkeypatch, callback, option: str, message: str):
     monkeypatch.setattr(CALLBACKS, "_entries", dict(CALLBACKS._entries))
-    CALLBACKS.add("parts", GradientAccumulationScheduler)
-    with pytest.raises(InputError, match=r"give trainer\.accumulate_grad_batches"):
-        build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.parts.scheduling={0: 1, 2: 2}"]))
+    CALLBACKS.add("theirs", callback)
+    with pytest.raises(InputError, match=message):
+        build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", f"+callbacks.theirs.{option}"]))
