@@ -121,6 +121,13 @@ class TestCache:
         path.write_bytes(path.read_bytes().replace(recipe, recipe[::-1]))
         assert cache.read("key") is None
 
+    def test_half_precision_is_kept(self, real, tmp_path):
+        metric, scans = CountReturns(), open_scans(str(real), READING)
+        metric.add_state("real_half", torch.tensor(1.5, dtype=torch.bfloat16), dist_reduce_fx="sum")
+        for _ in range(2):
+            gathered = gather_real({"returns": metric}, scans, Work(), Cache(tmp_path / "cache"))
+            assert gathered["returns"].states["real_half"] == 1.5
+
     def test_sampled_scans_are_never_kept(self, tmp_path):
         gather_real({"jsd": JSD()}, sampled_set(flow(), "flow", 2), Work(), Cache(tmp_path / "cache"))
         assert not (tmp_path / "cache").exists()
