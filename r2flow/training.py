@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal
 import lightning as L
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.callbacks import build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
@@ -150,7 +151,7 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
     if config.get("preview"):
         raise InputError("preview is of a chain of runs, such as experiment=demo: leave it out, or give preview=null.")
-    with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
+    with _said_once(), made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
         parent = find_parent(config["stage"].get("init"))
         config = _checked(config, asked, parent)
         config["plugins"] = config.get("plugins") or loaded_plugins()
@@ -263,6 +264,7 @@ def check_trainer(options: Mapping[str, Any]) -> None:
     for wrong, problem in (
         (precision in ("16-true", "bf16-true"), f"{precision} rounds the times of a flow to three digits; use {mixed}"),
         (accelerator in ("gpu", "cuda") and not gpu, "accelerator=gpu, but torch sees no GPU here; use trainer=cpu"),
+        ("spawn" in str(options["strategy"]), "a spawned run's step is lost to its launcher; use strategy=ddp"),
         (on_cpu and precision in ("16-mixed", "16"), f"{precision} becomes bfloat16 on a CPU; use {cpu_too}"),
     ):
         if wrong:
@@ -281,9 +283,10 @@ def fit(run: Run) -> Result:
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
     stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping(run.folder))
     with stopping.listening(), _quiet():
-        run.data.setup()
-        run.config["scans"] = run.data.fingerprint()
-        log.info("training on %s", run.config["scans"].partition(",")[0])
+        with _said_once():
+            run.data.setup()
+            run.config["scans"] = run.data.fingerprint()
+            log.info("training on %s", run.config["scans"].partition(",")[0])
         run.stage.config = dict(run.config)
         if run.config["trainer"]["fast_dev_run"]:
             run.trainer.fit(run.stage, run.data)
@@ -307,9 +310,9 @@ def _fit_in_folder(run: Run) -> int:
             init = as_override("stage.init", run.folder)
             print(f"finished before, at step {step_of(last)}; to learn more: {init} name=OTHER")
         return step_of(last)  # no training, no pairs
-    if last is not None:
-        log.info("resuming from %s", last)
     if run.trainer.is_global_zero:
+        if last is not None:
+            log.info("resuming from %s", last)
         log_config(run.trainer.loggers, run.config)
     try:
         if last is None and run.config["stage"].get("init"):  # what the end of the run is compared with
@@ -331,15 +334,28 @@ def _result(run: Run, step: int, finished: bool) -> Result:
 
 
 @contextmanager
+def _said_once() -> Iterator[None]:
+    """Context of what all devices find alike: only the first logs it."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING if getattr(rank_zero_only, "rank", 0) else before)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+@contextmanager
 def _quiet() -> Iterator[None]:
     """Suppress Lightning's messages and warnings about intended choices."""
-    logger = logging.getLogger("lightning.pytorch.utilities.rank_zero")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
+    loggers = [logging.getLogger(f"lightning.{name}") for name in ("pytorch.utilities.rank_zero", "fabric")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.WARNING)
     try:
         with warnings.catch_warnings():
             for message in EXPECTED_WARNINGS:
                 warnings.filterwarnings("ignore", message=message)
             yield
     finally:
-        logger.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

@@ -35,6 +35,7 @@ REFUSED = {
     "backbone.window=[2,9]": "odd sizes",
     "data.scans={name: simulated, split: train}": "data.scans",
     "trainer.precision=bf16-true": "rounds the times of a flow to three digits; use bf16-mixed",
+    "trainer.strategy=ddp_spawn": "use strategy=ddp",
     "data.scans={name: simulated}": "data.scans needs data=pairs, found data=simulated",
     "data.drives=[1]": "leave data.drives out",
     "data.reading.projection=unfolding": "leave data.reading out",

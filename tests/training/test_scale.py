@@ -60,7 +60,9 @@ def one(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def two(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same in two processes."""
     cwd = tmp_path_factory.mktemp("two")
-    recorded(cwd, scans, cwd / "record", "name=two", *EXACT, *TWO)
+    done = recorded(cwd, scans, cwd / "record", "name=two", *EXACT, *TWO)
+    said = [line for line in (done.stdout + done.stderr).splitlines() if line]
+    assert len(said) == len(set(said))  # once, not by each process
     return cwd
 
 
