@@ -29,7 +29,8 @@ INCIDENCES = np.cos(np.linspace(np.pi / 2, 0, 11))  # cosines, in steps of 9 deg
 DENSITIES = np.array([0.5, 1.5, 2.5, 4.5, 8.5, 16.5, 32.5, 64.5, 128.5, 256.5, np.inf])  # points
 NORMALS, COSINES = np.linspace(-1, 1, 21), np.linspace(0, 1, 21)
 APART = 128, 512  # pixels of a pair are 1/128 and 1/512 turn apart: range, reflectance
-DROPS, PAIRS = 12, 16  # bins of range
+# Ranges in metres, the same for every sensor: sets of sensors with other limits are compared with each other.
+DROPS, RANGES = np.geomspace(3, 80, 13), np.geomspace(1.45, 80, 17)
 MOST_ROWS = 1024
 REFLECTANCE = "reflectance pairs"  # the line that needs reflectance
 LACKING = "a set has no reflectance: the panel's mean leaves reflectance pairs out."
@@ -98,8 +99,7 @@ def drop_range(scan: Scan) -> np.ndarray:
 
     The range of a missing ray is the mean of its neighbours in the row; gaps over 16 columns are not counted.
     """
-    edges = np.geomspace(3.0, scan.sensor.max_range, DROPS + 1)
-    return drop_rate(bridged(scan.r, scan.r > 0), scan.r == 0, edges)
+    return drop_rate(bridged(scan.r, scan.r > 0), scan.r == 0, DROPS)
 
 
 def drop_incidence(scan: Scan) -> np.ndarray:
@@ -110,7 +110,7 @@ def drop_incidence(scan: Scan) -> np.ndarray:
 
 def range_pairs(scan: Scan) -> np.ndarray:
     """Joint histogram of ranges of pixels 2.8 degrees or one column apart, 16 x 16 logarithmic bins."""
-    return _pairs(scan.r, scan.r > 0, np.geomspace(scan.sensor.min_range, scan.sensor.max_range, PAIRS + 1), APART[0])
+    return _pairs(scan.r, scan.r > 0, RANGES, APART[0])
 
 
 def reflectance_pairs(scan: Scan) -> np.ndarray:
@@ -173,11 +173,11 @@ PANEL: dict[str, Member] = {
     "steps by sector": Member(steps_by_sector, SECTORS * (len(STEPS) - 1)),
     "run lengths": histogram_of(run_lengths, RUNS, weighted=True),
     "changes per row": Member(changes_row, 3 * MOST_ROWS, row_distance),
-    "drop rate by range": Member(drop_range, 3 * DROPS, rate_distance),
+    "drop rate by range": Member(drop_range, 3 * (len(DROPS) - 1), rate_distance),
     "drop rate by incidence": Member(drop_incidence, 3 * (len(INCIDENCES) - 1), rate_distance),
     "surface normals": histogram_of(lambda scan: scan.surfaces[0], NORMALS),
     "incidence": histogram_of(lambda scan: scan.surfaces[1], COSINES),
-    "range pairs": Member(range_pairs, PAIRS**2),
+    "range pairs": Member(range_pairs, (len(RANGES) - 1) ** 2),
     REFLECTANCE: Member(reflectance_pairs, (len(REFLECTANCES) - 1) ** 2, reflectance_distance),
     # over points, the number of points in the same 1.6 m bird's-eye cell
     "bird's-eye density": histogram_of(lambda scan: scan.birds_eye, DENSITIES, weighted=True),
@@ -218,7 +218,8 @@ class Panel(SumMetric):
     name = "panel"
     representation = "range image"
     settings: ClassVar[Mapping[str, Any]] = {
-        "members": list(PANEL), "distance": "Jensen-Shannon distance of histograms, |a - b| of rates or a over 100 b"
+        "members": list(PANEL), "ranges": [1.45, 80],
+        "distance": "Jensen-Shannon distance of histograms, |a - b| of rates or a over 100 b",
     }  # fmt: skip
     width = int(ENDS[-1])
     uses_reflectance = True

@@ -1,5 +1,7 @@
 """The panel's statistics of scans that are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -73,6 +75,8 @@ def test_the_metric_has_the_distances_of_the_sets_and_their_mean():
     figures = measured(METRICS["panel"](), *(Scans(torch.from_numpy(x), SENSOR) for x in (real, other))).compute()
     assert figures.pop("panel") == pytest.approx(np.mean(list(expected.values())))
     assert figures == pytest.approx(expected)
+    limits = replace(SENSOR, min_range=1.0, max_range=56.0)  # of LiDM: the same scans have the same counts
+    np.testing.assert_array_equal(panel(real, limits), panel(real, SENSOR))
 
 
 def test_scenes_of_the_same_sort_are_nearer_than_every_baseline():
