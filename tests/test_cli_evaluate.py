@@ -102,6 +102,23 @@ def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     )
 
 
+def test_the_order_of_models_changes_no_figure(r2flow, real, tmp_path):
+    for name, farthest, convention in (("a", 40.0, "lidm"), ("b", 50.0, "reference")):
+        config = {**CONFIG, "sensor": {**CONFIG["sensor"], "max_range": farthest}}
+        config["data"] = {"reading": {"convention": convention}}
+        save_checkpoint(Checkpoint(build_generator(config), config), tmp_path / f"{name}.safetensors")
+    for path in real.iterdir():  # points on the rays of bin centres, up to 60 m
+        write_points(tmp_path / "points" / f"{path.stem}.ply", *image_to_points(np.load(path), SENSOR))
+    figures = []
+    for scans, *names in (("real", "a"), ("points", "a", "b"), ("points", "b", "a")):
+        quick = ("--metrics", "jsd", "--num", 2, "--steps", 1, "--workers", 0, "--json", tmp_path / "e.json")
+        r2flow.said("evaluate", tmp_path / scans, *(tmp_path / f"{name}.safetensors" for name in names), *quick)
+        content = json.loads((tmp_path / "e.json").read_text())["comparisons"]
+        figures.append({one["comparison"]: one["metrics"][0]["figures"]["jsd"] for one in content})
+    assert figures[1] == figures[2]
+    assert figures[1]["a.safetensors"] == figures[0]["a.safetensors"]  # the images that the points were made of
+
+
 @pytest.fixture
 def points(r2flow, real, tmp_path):
     """The sampled sets of an evaluation, as `report paper` reads them, and its Markdown page."""

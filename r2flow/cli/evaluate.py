@@ -137,9 +137,8 @@ def evaluate(
         if flows and options.num is None and place()[0] == 0:
             print(f"{', '.join(flows)}: sampling {SAMPLED} scans per set (change the number by --num)")
         files = [name for name in named if name not in flows]
-        reading = how.reading([real, *files, options.train], next(iter(flows.values()), None))
-        if rules.convention is not None and how.convention is None:
-            reading = replace(reading, convention=rules.convention)
+        how = replace(how, convention=how.convention or rules.convention)
+        reading = _reading(how, [real, *files, *([options.train] if options.train else [])], list(flows.values()))
         if chosen and not any(m.needs_reflectance or m.uses_reflectance for m in chosen.values()):
             reading = replace(reading, reflectance=False)  # else a scale would be required
         truth = _open(real, reading, options.split, options.real_num)
@@ -195,6 +194,22 @@ def _compare(
         print(*write_page(page, options.out), sep="\n")
         sets = {"real": truth} | {"real, judged" if name == "real" else name: s for name, s in judged.items()}
         print(write_sets(options.out / "evaluation.html", sets, title="Generated and real scans"))
+
+
+def _reading(how: ReadingOptions, specs: Sequence[str], flows: "Sequence[Checkpoint]") -> "Reading":
+    """How points become images, whatever the order of models and samples: with all returns that any of them has."""
+    from r2flow.data.opening import PREPARED, own_reading, parse, reading_for
+    from r2flow.metrics.scans import MASK
+
+    reading = how.reading(specs, next(iter(flows), None))
+    sets = [reading_for([], flow) for flow in flows] + [stored for s in specs[1:] if (stored := own_reading(s))]
+    chosen = how.sensor and not flows
+    if chosen or not sets or PREPARED in [parse(spec)[0].name for spec in specs]:  # those are projected already
+        return reading
+    near = min(one.sensor.min_range for one in sets)
+    sensor = replace(reading.sensor, min_range=near, max_range=max(MASK[1], *(one.sensor.max_range for one in sets)))
+    agreed = how.convention or len({one.convention for one in sets}) == 1
+    return replace(reading, sensor=sensor, convention=reading.convention if agreed else "centre")
 
 
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
