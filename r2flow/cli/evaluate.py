@@ -203,11 +203,10 @@ def _reading(how: ReadingOptions, specs: Sequence[str], flows: "Sequence[Checkpo
 
     reading = how.reading(specs, next(iter(flows), None))
     sets = [reading_for([], flow) for flow in flows] + [stored for s in specs[1:] if (stored := own_reading(s))]
-    chosen = how.sensor and not flows
-    if chosen or not sets or PREPARED in [parse(spec)[0].name for spec in specs]:  # those are projected already
-        return reading
-    near = min(one.sensor.min_range for one in sets)
-    sensor = replace(reading.sensor, min_range=near, max_range=max(MASK[1], *(one.sensor.max_range for one in sets)))
+    if (how.sensor and not flows) or not sets or PREPARED in [parse(spec)[0].name for spec in specs]:
+        return reading  # as chosen, or as the prepared scans were projected
+    near, far = min(one.sensor.min_range for one in sets), max(one.sensor.max_range for one in sets)
+    sensor = replace(reading.sensor, min_range=near, max_range=max(far, MASK[1]))
     agreed = how.convention or len({one.convention for one in sets}) == 1
     return replace(reading, sensor=sensor, convention=reading.convention if agreed else "centre")
 

@@ -101,6 +101,8 @@ class Sampler(ABC):
         """Refuse a generator that the sampler cannot run."""
         if getattr(generator, self.needs, None) is None:
             kind = type(generator).__name__
+            drawn = getattr(generator, "draws", True) or generator.told
+            check(drawn, f"a {kind} draws no scans: give a model that draws its latents, such as a latent diffusion.")
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}; a {kind} has none.")
         if getattr(generator, "fixed", False) and self != generator.sampler:
             raise InputError(f"this model is distilled for {generator.sampler} alone: leave sampler and steps out.")
