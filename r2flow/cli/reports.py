@@ -206,9 +206,9 @@ def completion(
     with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
         shown = list(completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, progress=advance))
     figure = pictured(truths[0], shown, first.sensor)
-    about = f"{len(truths)} scans of {real}, {answers} completions per scan."
+    about = f"{len(truths)} scans of {real} (at most {num}, --num), {answers} completions per scan."
     page = completion_page([row for row, _ in shown], figure, about, seed, str(choose_device(device)))
-    finish(page, out, page.text[1:])
+    finish(page, out, [about, *page.text[1:]])
 
 
 @report.command(epilog="Example: r2flow report paper runs/1rf runs/2rf --results e.json --real kitti360/test -o paper")

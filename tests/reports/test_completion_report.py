@@ -88,11 +88,11 @@ def test_a_task_that_is_none_is_one_line(checkpoint, task):
 
 def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: Path):
     checkpoint.save(tmp_path / "model.safetensors")
-    out = tmp_path / "out"
-    r2flow.said(
+    said = r2flow.said(
         "report", "completion", "simulated:3", tmp_path / "model.safetensors", "--num", 2, "--answers", 2,
-        "--samplers", "euler,jump", "--steps", 1, "--tasks", "rows:4,rows:2", "--out", out,
+        "--samplers", "euler,jump", "--steps", 1, "--tasks", "rows:4,rows:2", "--out", (out := tmp_path / "out"),
     )  # fmt: skip
+    assert said.startswith("2 scans of simulated:3 (at most 2, --num), 2 completions per scan.\n")
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
     ways = "model, euler, 1 step", "model, jump, 1 step"
