@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 
 from r2flow.data.sets import ScanSet
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.files import read_json
 from r2flow.generators import Flow
 from r2flow.inversion import interpolate_scans
@@ -74,8 +74,9 @@ def paper_page(
     """
     roles = {weights_hash(run.checkpoint): run.role for run in runs}
     evaluated = [{**row, "role": roles[row["weights"]]} for row in rows if row["weights"] in roles]
-    architectures = architecture_rows(runs, evaluated, device)
     names = ", ".join(f"{run.label} ({run.role})" for run in runs)
+    check(evaluated or not rows, f"the results are of other models or checkpoints than {names}: evaluate these.")
+    architectures = architecture_rows(runs, evaluated, device)
     protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
     text = [f"{len(runs)} generators: {names}.", "## Table I: methods and metrics", table_i(evaluated)]
     if protocols:
@@ -98,8 +99,7 @@ def paper_page(
     if metrics := [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in evaluated)]:
         figures["figure_6"] = speed_figure([{**row, "flow": row["role"]} for row in evaluated], metrics)
     figures["figure_7"] = scans_figure(runs, samples, scans)
-    solvable = [run for run in flows if not run.checkpoint.generator.fixed]
-    if solvable:
+    if solvable := [run for run in flows if not run.checkpoint.generator.fixed]:
         tracked = track(solvable, "following paths")
         paths = [measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4) for run in tracked]
         figures |= {"figure_8a": curvature_figure(paths), "figure_8b": trajectories_figure(paths)}

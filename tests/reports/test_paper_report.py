@@ -74,11 +74,9 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     comparisons = [{"kind": "judged", "real": real, "generated": one, "metrics": metrics} for one in sets]
     results = tmp_path / "e.json"
     results.write_text(json.dumps({"comparisons": comparisons}))
-    options = ("--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0")
-    named = (f"9-RF={runs['2-RF']}", runs["1-RF"], runs["4-TD"])
-    said = r2flow.said("report", "paper", *named, "--results", results, *options, "-o", tmp_path / "out")
-    assert "3 generators" in said
-    assert "(9-RF)" in said
+    options = "--results", results, "--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0"
+    command = "report", "paper", f"9-RF={runs['2-RF']}", runs["1-RF"], runs["4-TD"], *options, "-o", tmp_path / "out"
+    assert "(9-RF)" in r2flow.said(*command)
     assert "r2flow, 5 scans of 8x64 against 7 of held" in (tmp_path / "out" / "paper.md").read_text()
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
@@ -86,3 +84,5 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     assert architecture["parameters"] == sum(p.numel() for p in network().generator.backbone.parameters())
     written = {path.stem for path in (tmp_path / "out").glob("*.png")}
     assert written == {"figure_3", "figure_5", "figure_6", "figure_7", "figure_8a", "figure_8b"}
+    results.write_text(json.dumps({"comparisons": comparisons[1:]}))
+    assert "the results are of other models" in r2flow.refusal(*command)
