@@ -100,16 +100,16 @@ def finish(
     checkpoint = load_checkpoint(path, device)
     if checkpoint.step < max_steps:
         print(f"stopped at step {checkpoint.step} of {max_steps}: the same command resumes from here")
-    out = run / "samples"
-    if samples["num"] == 0 or not checkpoint.generator.draws:
-        print(f"checkpoint    {path}")
-        return
-    write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"], replace=True)
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
         single = " (single batches: too few to compare)" if tenth == 1 and name.startswith("train/") else ""
         start = f"{values[:tenth].mean():.4f} at the start, " if len(values) > 1 else ""
         print(f"{name}: {start}{values[-tenth:].mean():.4f} at step {steps[-1]}{single}")
+    out = run / "samples"
+    if samples["num"] == 0 or not checkpoint.generator.draws:
+        print(f"checkpoint    {path}")
+        return
+    write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"], replace=True)
     during = f"; during training: {run / 'pictures'}" if (run / "pictures").is_dir() else ""
     logged = [str(run / "loss.png")] if curves else []
     if (run / "tensorboard").is_dir():
