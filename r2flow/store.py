@@ -10,7 +10,6 @@ An item depends only on the recipe and on its number: two processes that make th
 written under a temporary name and renamed when complete, so that a killed command can resume.
 """
 
-import errno
 import hashlib
 import json
 import logging
@@ -48,6 +47,10 @@ Advance = Callable[[int], None]  # called with the number of each finished item
 
 class Damaged(Exception):
     """A file does not have the content that was written."""
+
+
+class Foreign(InputError):
+    """A manifest.json that r2flow did not write."""
 
 
 class Store:
@@ -277,10 +280,10 @@ def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
     try:
         content: dict[str, Any] = read_json(path)
         if "checksum" not in content:  # a common name: of a data set, say
-            raise FileNotFoundError(errno.ENOENT, "r2flow did not write it; give another folder", str(path))
+            raise Foreign(f"{path} is damaged, or not of r2flow: give another folder.")
         format_name, _ = content["format"], content["recipe"]
-        damaged = content.pop("checksum", None) != checksum(content)
-    except (FileNotFoundError, NotADirectoryError):
+        damaged = content.pop("checksum") != checksum(content)
+    except (FileNotFoundError, NotADirectoryError, Foreign):
         raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         damaged = True
@@ -295,7 +298,7 @@ def manifest_of(folder: str | Path) -> dict[str, Any]:
     """The manifest that r2flow wrote in a folder; empty if there is none."""
     try:
         return read_manifest(Path(folder).expanduser())
-    except (FileNotFoundError, NotADirectoryError):
+    except (FileNotFoundError, NotADirectoryError, Foreign):
         return {}
 
 

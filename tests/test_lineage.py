@@ -10,6 +10,7 @@ from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit
+from r2flow.store import Store
 from tests.conftest import CONFIG as BOTH
 from tests.conftest import write_checkpoint
 
@@ -129,9 +130,10 @@ def reading_in(data, root: str | None = None, of_sensor: float | None = 0.012):
 def test_full_reflectance_is_what_was_given_else_the_sensors_and_one_in_what_r2flow_wrote(
     tmp_path: Path, name, root, given, expected
 ):
-    for folder, note in (("drawn", "manifest.json"), ("simulated", "manifest.json"), ("scans", "other.json")):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / note).touch()
+    for folder in ("drawn", "simulated"):
+        Store(tmp_path / folder, "samples", {}).begin()
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "manifest.json").write_text('{"version": 1}')  # of a data set
     data = {"name": name, "reading": {"reflectance_scale": given}}
     assert reading_in(data, str(tmp_path / root))["reading"]["reflectance_scale"] == expected
 
