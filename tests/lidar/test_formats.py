@@ -234,7 +234,7 @@ def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):
     assert points.dropped == 1
     (tmp_path / "b.csv").write_text("x,y,z,intensity\n" + "".join(f"{x},{y},{z},7,\n" for x, y, z in F4))
     same(read_points(tmp_path / "b.csv"), intensity=np.full(500, 7))
-    (tmp_path / "c.csv").write_text("x,y,z,class\n" + "".join(f"{x},{y},{z},a car\n" for x, y, z in F4))
+    (tmp_path / "c.csv").write_text("x,y,z,class\n" + "".join(f'"{x}","{y}","{z}","a car"\n' for x, y, z in F4))
     same(read_points(tmp_path / "c.csv"), intensity=None)
 
 

@@ -92,13 +92,14 @@ def _columns_of(array: np.ndarray) -> Table:
 
 def read_text(path: Path) -> Table:
     """A point per line, separated by commas, semicolons, tabs or spaces; names in the first line or a comment."""
-    lines = [line.strip(" \r") for line in path.read_text("utf-8-sig", "replace").split("\n") if line.strip()]
+    text = path.read_text("utf-8-sig", "replace").replace('"', "")
+    lines = [line.strip(" \r") for line in text.split("\n") if line.strip()]
     rows = [line for line in lines if line[0] not in "#/"]
     check(rows, "it holds no line of numbers.")
     apart = next((mark for mark in ";\t," if mark in rows[-1]), None)
 
     def words(line: str) -> list[str]:
-        return [re.sub(r"\s*[\[(].*", "", word.strip(' "')) for word in line.lstrip("#/ ").split(apart)]
+        return [re.sub(r"\s*[\[(].*", "", word.strip()) for word in line.lstrip("#/ ").split(apart)]
 
     names: list[str] | None
     if not any(map(_is_number, words(rows[0]))):
@@ -109,7 +110,7 @@ def read_text(path: Path) -> Table:
         named = (line for line in comments if len(line) == width and {"x", "y", "z"} <= {word.lower() for word in line})
         names = next(named, None)
     try:
-        table = np.loadtxt(rows, delimiter=apart, comments=None, quotechar='"', ndmin=2)
+        table = np.loadtxt(rows, delimiter=apart, comments=None, ndmin=2)
     except ValueError:
         if apart is None:
             raise
