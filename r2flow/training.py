@@ -264,7 +264,7 @@ def check_trainer(options: Mapping[str, Any]) -> None:
     for wrong, problem in (
         (precision in ("16-true", "bf16-true"), f"{precision} rounds the times of a flow to three digits; use {mixed}"),
         (accelerator in ("gpu", "cuda") and not gpu, "accelerator=gpu, but torch sees no GPU here; use trainer=cpu"),
-        ("spawn" in str(options["strategy"]), "a spawned run's step is lost to its launcher; use strategy=ddp"),
+        (re.search("spawn|fork|notebook", str(options["strategy"])), "its step is lost at its end; use strategy=ddp"),
         (on_cpu and precision in ("16-mixed", "16"), f"{precision} becomes bfloat16 on a CPU; use {cpu_too}"),
     ):
         if wrong:

@@ -36,6 +36,7 @@ REFUSED = {
     "data.scans={name: simulated, split: train}": "data.scans",
     "trainer.precision=bf16-true": "rounds the times of a flow to three digits; use bf16-mixed",
     "trainer.strategy=ddp_spawn": "use strategy=ddp",
+    "trainer.strategy=ddp_notebook_find_unused_parameters_false": "use strategy=ddp",
     "data.scans={name: simulated}": "data.scans needs data=pairs, found data=simulated",
     "data.drives=[1]": "leave data.drives out",
     "data.reading.projection=unfolding": "leave data.reading out",
