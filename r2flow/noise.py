@@ -29,9 +29,10 @@ def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.G
     index; all numbers are in [0, 2^64).
     """
     assert purpose in PURPOSES, purpose
-    assert index >= 0 <= step, (index, step)
-    if not (isinstance(seed, Integral) and 0 <= seed < 2**64):
-        raise InputError(f"a seed must be a whole number in [0, 2^64), found {seed!r}.")
+    assert step >= 0, step
+    for name, number in (("a seed", seed), ("an index", index)):
+        if not (isinstance(number, Integral) and 0 <= number < 2**64):
+            raise InputError(f"{name} must be a whole number in [0, 2^64), found {number!r}.")
     # Philox4x64 counts blocks of four numbers in the low words of a 256-bit counter: with index and step in the two
     # highest words, each pair has 2^128 blocks.
     key = np.array([seed, zlib.crc32(purpose.encode())], dtype=np.uint64)

@@ -27,10 +27,11 @@ def test_no_two_purposes_share_a_draw():
     assert len({expected(0, purpose, 0)[0, 0, 0].item() for purpose in PURPOSES}) == len(PURPOSES)
 
 
-@pytest.mark.parametrize("seed", [-1, 2**64])
-def test_a_seed_out_of_range_is_an_input_error(seed):
-    with pytest.raises(InputError, match=f"found {seed}"):
-        generator(seed, "evaluation", 0)
+@pytest.mark.parametrize("number", [-1, 2**64, 1.5])
+def test_a_seed_or_index_that_is_none_is_an_input_error(number):
+    for seed, index in ((number, 0), (0, number)):
+        with pytest.raises(InputError, match=f"found {number}"):
+            generator(seed, "evaluation", index)
 
 
 def test_scans_of_a_batch_are_drawn_by_their_numbers():
