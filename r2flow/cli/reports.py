@@ -173,10 +173,13 @@ def completion(
     from r2flow.model.completion import completing
     from r2flow.models import DENSIFY
     from r2flow.progress import Bar
+    from r2flow.reports.compare import labels
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, measured_by, pictured
     from r2flow.reports.pages import prepare_folder
 
-    loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or [DENSIFY]}
+    named = models or [DENSIFY]
+    labelled = zip(labels([Path(name) for name in named]), named, strict=True)
+    loaded = {label: load_checkpoint(name, choose_device(device)) for label, name in labelled}
     stored = own_reading(real)
     own = next((m.sensor for m in loaded.values() if not isinstance(m.generator, TransferFlow)), None)
     for name, model in loaded.items():

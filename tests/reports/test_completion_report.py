@@ -95,19 +95,24 @@ def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: P
     assert said.startswith("2 scans of simulated:3 (at most 2, --num), 2 completions per scan.\n")
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
-    ways = "model, euler, 1 step", "model, jump, 1 step"
+    ways = "model.safetensors, euler, 1 step", "model.safetensors, jump, 1 step"
     assert [row["method"] for row in rows] == [*INTERPOLATIONS, *ways, *INTERPOLATIONS, *ways]
     assert "coverage" in (out / "completion.md").read_text()
 
 
 def test_a_densifier_takes_a_flow_s_size_and_range_alone_has_no_reflectance(r2flow, checkpoint, tmp_path: Path):
     flow = Checkpoint(build_generator(FLOW).eval(), FLOW)
-    models = tmp_path / "dense.safetensors", tmp_path / "flow.safetensors"
+    models = tmp_path / "dense" / "model.safetensors", tmp_path / "flow" / "model.safetensors"
+    for path in models:
+        path.parent.mkdir()
     checkpoint.save(models[0])
     flow.save(models[1])
     np.save(tmp_path / "scan.npy", simulate(flow.sensor, 3, 0).image[:1])
     r2flow.said("report", "completion", tmp_path / "scan.npy", *models, "--tasks", "rows:2", "--out", tmp_path / "out")
     rows = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
+    assert [row["method"].split(",")[0] for row in rows[-2:]] == [
+        f"{name}/model.safetensors" for name in ("dense", "flow")
+    ]
     assert [row["evaluations"] for row in rows[-2:]] == [1, 30]
     assert all(math.isfinite(row["panel"]) and "reflectance_mae" not in row for row in rows)
     assert "reflectance MAE" not in (tmp_path / "out" / "completion.md").read_text()
