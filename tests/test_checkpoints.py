@@ -96,7 +96,7 @@ def test_a_config_that_contains_itself_is_refused(saved, tmp_path: Path):
 def test_notes_without_end_or_of_another_kind_are_refused(tmp_path: Path, notes: str):
     path = tmp_path / "model.safetensors"
     safetensors.torch.save_file({"x": torch.zeros(1)}, path, metadata={"r2flow": notes})
-    with pytest.raises(InputError, match=r"not of r2flow, or damaged|nested too deeply"):
+    with pytest.raises(InputError, match=r"not a model of r2flow, or damaged|nested too deeply"):
         load_checkpoint(path)
 
 

@@ -303,7 +303,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
     weights, metadata = read_tensors(path)
     notes = parse_json(metadata.get(NOTES, "{}"))
     if not isinstance(notes, dict) or notes.pop("digest", None) != _digest(notes, weights):
-        raise InputError(f"{path} is not of r2flow, or damaged: its checksum differs. Use another checkpoint.")
+        raise InputError(f"{path} is not a model of r2flow, or damaged: its checksum differs. Use another checkpoint.")
     config, step = notes["config"], int(notes["step"])
     check_tree(config)
     state = {PREFIX + name: value for name, value in weights.items()}
