@@ -177,9 +177,10 @@ def completion(
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, measured_by, pictured
     from r2flow.reports.pages import prepare_folder
 
-    named = models or [DENSIFY]
-    labelled = zip(labels([Path(name) for name in named]), named, strict=True)
-    loaded = {label: load_checkpoint(name, choose_device(device)) for label, name in labelled}
+    paths = [Path(name) for name in models or [DENSIFY]]
+    loaded = {
+        name: load_checkpoint(path, choose_device(device)) for name, path in zip(labels(paths), paths, strict=True)
+    }
     stored = own_reading(real)
     own = next((m.sensor for m in loaded.values() if not isinstance(m.generator, TransferFlow)), None)
     for name, model in loaded.items():

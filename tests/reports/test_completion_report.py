@@ -103,16 +103,12 @@ def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: P
 def test_a_densifier_takes_a_flow_s_size_and_range_alone_has_no_reflectance(r2flow, checkpoint, tmp_path: Path):
     flow = Checkpoint(build_generator(FLOW).eval(), FLOW)
     models = tmp_path / "dense" / "model.safetensors", tmp_path / "flow" / "model.safetensors"
-    for path in models:
-        path.parent.mkdir()
     checkpoint.save(models[0])
     flow.save(models[1])
     np.save(tmp_path / "scan.npy", simulate(flow.sensor, 3, 0).image[:1])
     r2flow.said("report", "completion", tmp_path / "scan.npy", *models, "--tasks", "rows:2", "--out", tmp_path / "out")
     rows = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
-    assert [row["method"].split(",")[0] for row in rows[-2:]] == [
-        f"{name}/model.safetensors" for name in ("dense", "flow")
-    ]
+    assert [row["method"][:5] for row in rows[-2:]] == ["dense", "flow/"]
     assert [row["evaluations"] for row in rows[-2:]] == [1, 30]
     assert all(math.isfinite(row["panel"]) and "reflectance_mae" not in row for row in rows)
     assert "reflectance MAE" not in (tmp_path / "out" / "completion.md").read_text()
