@@ -17,7 +17,7 @@ from r2flow.lidar.unfolding import elevations_of
 FEWEST_RETURNS = 200  # minimum for an estimate
 COLUMNS = 64  # image widths are multiples of it, so that every backbone can halve them
 FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full reflectance
-SURE = (1.0, 255.0, 256.0, 65535.0)  # bytes up to 100 may be of 255: above it are retroreflectors alone
+SURE = FULL_REFLECTANCE[:1] + FULL_REFLECTANCE[2:]  # bytes up to 100 may be of 255: above it are retroreflectors alone
 OUTLIERS = 1e-4  # share of values that may exceed one of them
 IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
 OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor

@@ -28,19 +28,18 @@ RANGES = (2.0, 80.0)  # metres over which range is coloured, on a logarithmic sc
 
 
 def scan_figure(image: np.ndarray, rays: Tensor, title: str = "") -> Figure:
-    """Draw one scan: its images above, bird's-eye view and perspective below."""
+    """Draw one scan, (2 or 1, H, W): its images above, bird's-eye view and perspective below."""
     figure = Figure((WIDTH, 4.6), facecolor="white")
-    strips = len(image)
     grid = figure.add_gridspec(
-        strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.28, wspace=0.04,
+        len(image) + 1, 2, height_ratios=[*[1] * len(image), 5.2], hspace=0.28, wspace=0.04,
         left=0.01, right=0.925, top=0.89, bottom=0.01, width_ratios=[1, 1.45],
     )  # fmt: skip
     draw_range(figure.add_subplot(grid[0, :]), image)
     if len(image) > 1:
         draw_reflectance(figure.add_subplot(grid[1, :]), image)
     xyz, _ = image_to_points(image, rays)
-    draw_birds_eye(figure.add_subplot(grid[strips, 0]), xyz)
-    draw_perspective(figure.add_subplot(grid[strips, 1]), xyz)
+    draw_birds_eye(figure.add_subplot(grid[-1, 0]), xyz)
+    draw_perspective(figure.add_subplot(grid[-1, 1]), xyz)
     returned = image[0] > 0
     size = " x ".join(map(str, returned.shape))
     about = f"{title}   {size}, {returned.sum():,} returns ({returned.mean():.0%})".strip()

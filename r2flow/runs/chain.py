@@ -118,10 +118,10 @@ def is_noted(folder: Path, *links: Link) -> bool:
 
 
 def _record(link: Link) -> dict[str, Any]:
-    """Record of a finished link: its command line without the chain's folder, which may move, and its last checkpoint's
-    name and size."""
+    """Record of a finished link: its command line without the chain's folder, which may move, and its checkpoint."""
     last = next(iter(checkpoints_of(link.run_dir)), None)
-    overrides = [text.replace(f"='{link.run_dir.parent}/", "='") for text in link.overrides]
+    folder = override("", f"{link.run_dir.parent}/")[:-1]  # quoted as in the overrides
+    overrides = [text.replace(folder, "='") for text in link.overrides]
     return {"overrides": overrides, "checkpoint": last and [last.name, last.stat().st_size]}
 
 
