@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from r2flow.model.checkpoint import Checkpoint
 
 __version__ = "0.2.0"
+__all__ = ["__version__", "load", "read"]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoint":

@@ -82,6 +82,7 @@ def refuse(*_, **__):
 socket.socket.connect = socket.getaddrinfo = refuse
 import r2flow
 assert "torch" not in sys.modules
+assert dir(r2flow) == ["__version__", "load", "read"]
 flow = r2flow.load("street")
 scans = flow.sample(2, steps=1)
 assert scans.shape == (2, *flow.generator.space.shape)
