@@ -55,8 +55,10 @@ def report(
     if rig is not None:
         seen &= ~hidden(rays.lasers, rays.columns, rig)
     reading[reading < DARK * rng.random(rays.shape, dtype=np.float32)] = 0
-    reading = in_levels(reading)
-    return _sorted_into_rows(sensor, rays, s, r, reading, hits.label, seen)
+    reading = _levels()[np.rint(np.clip(reading, 0, 1) * 2000).astype(np.int32)]
+    along = np.broadcast_to(np.arange(len(slope))[:, None], rays.shape)
+    row = along if rays.lasers.straight else rows_of(sensor, slope + rise / np.maximum(s, np.float32(0.1)))
+    return _nearest(sensor, row, seen, r, reading, hits.label)
 
 
 @cache
@@ -68,11 +70,6 @@ def _levels() -> np.ndarray:
     level = np.where(reading < (first - 0.5) / LEVELS, 0, first + np.searchsorted(edges, reading, side="right"))
     level = np.where(reading > (last + 0.5) / LEVELS, np.rint(reading * LEVELS), level)
     return (np.minimum(level, LEVELS - 1) / LEVELS).astype(np.float32)
-
-
-def in_levels(reading: np.ndarray) -> np.ndarray:
-    """Reported reflectance: clipped to [0, 0.99], in hundredths."""
-    return _levels()[np.rint(np.clip(reading, 0, 1) * 2000).astype(np.int32)]
 
 
 def _reading(hits: Hits, r: np.ndarray, normal: np.ndarray, rays: Rays) -> np.ndarray:
@@ -99,22 +96,11 @@ def _in_patches(rays: Rays, rng: np.random.Generator) -> np.ndarray:
     return np.take_along_axis(patches, (np.arange(w) + start) // PATCH, axis=1)
 
 
-def _sorted_into_rows(
-    sensor: Sensor,
-    rays: Rays,
-    s: np.ndarray,
-    r: np.ndarray,
-    reading: np.ndarray,
-    label: np.ndarray,
-    seen: np.ndarray,
+def _nearest(
+    sensor: Sensor, row: np.ndarray, seen: np.ndarray, r: np.ndarray, reading: np.ndarray, label: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The image of returns in the rows of their apparent elevations; a pixel keeps the nearest."""
+    """The image of the returns seen, in the rows of their apparent elevations; a pixel keeps the nearest."""
     h, w = sensor.shape
-    if rays.lasers.straight:
-        row = np.broadcast_to(np.arange(h)[:, None], rays.shape)
-    else:
-        rise = rays.height[:, None] - np.float32(rays.ground)
-        row = rows_of(sensor, rays.slope[:, None] + rise / np.maximum(s, np.float32(0.1)))
     kept = np.flatnonzero(seen & (row >= 0))
     pixel = (row * w + np.arange(w)).ravel()[kept]
     r, reading, label = (q.ravel()[kept] for q in (r, reading, label))

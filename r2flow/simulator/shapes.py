@@ -50,12 +50,10 @@ class Boxes(NamedTuple):
     top: Column
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
-        """The first intersection with side, top or bottom."""
         k, w, near, far = _box_spans(self, rays)
-        return _upright(rays, k, w, near, far, self.bottom[k], self.top[k])
+        return _upright(self, rays, k, w, near, far)
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        """Normals of the faces nearest to the points, (N,)."""
         u, v, c, s = _into(self, k, x, y)
         sides = np.abs(u) - self.length[k] / 2, np.abs(v) - self.width[k] / 2
         face = np.stack([*sides, z - self.top[k], self.bottom[k] - z]).argmax(0)
@@ -105,7 +103,6 @@ class Frusta(NamedTuple):
         return Fragments((b * rays.columns + w)[hit], near[hit], k[hit])
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        """Normals of the planes nearest to the points, (N,)."""
         u, v, c, s = _into(self, k, x, y)
         rise = z - self.bottom[k]
         planes = self._planes(k)
@@ -130,15 +127,12 @@ class Cylinders(NamedTuple):
     top: Column
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
-        """The first intersection with side, top or bottom."""
-        k, w, middle, half = _chords(self.x, self.y, self.radius, rays)
-        near, far = np.maximum(middle - half, NEAR), middle + half
-        ahead = far > NEAR
-        k, w, near, far = k[ahead], w[ahead], near[ahead], far[ahead]
-        return _upright(rays, k, w, near, far, self.bottom[k], self.top[k])
+        k, w, middle, half = _chords(self, rays)
+        ahead = middle + half > NEAR
+        k, w, middle, half = k[ahead], w[ahead], middle[ahead], half[ahead]
+        return _upright(self, rays, k, w, np.maximum(middle - half, NEAR), middle + half)
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        """Normals away from the axis, or up or down at the ends."""
         u, v = x - self.x[k], y - self.y[k]
         away = hypotenuse(u, v)
         on_top = z - self.top[k] > away - self.radius[k]
@@ -163,7 +157,7 @@ class Blobs(NamedTuple):
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
         """Roots of |p(s) - c|^2 = 1 in units of the semi-axes; the near root moves inwards by the free path."""
-        k, w, middle, half = _chords(self.x, self.y, self.radius, rays)
+        k, w, middle, half = _chords(self, rays)
         ahead = middle - half > NEAR
         k, w, middle, half = k[ahead], w[ahead], middle[ahead], half[ahead]
         n, b = row_windows(rays, middle - half, middle + half, self.z[k] - self.height[k], self.z[k] + self.height[k])
@@ -182,7 +176,6 @@ class Blobs(NamedTuple):
         return Fragments((b * rays.columns + w)[hit], distance[hit], k[hit])
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        """Gradients of the ellipsoids at the points."""
         u, v = (x - self.x[k]) / self.radius[k] ** 2, (y - self.y[k]) / self.radius[k] ** 2
         t = (z - self.z[k]) / self.height[k] ** 2
         norm = 1 / np.maximum(np.sqrt(u * u + v * v + t * t), 1e-6)
@@ -239,8 +232,9 @@ def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
 _CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
-def _chords(x: np.ndarray, y: np.ndarray, radius: np.ndarray, rays: Rays) -> tuple[np.ndarray, ...]:
+def _chords(solids: "Cylinders | Blobs", rays: Rays) -> tuple[np.ndarray, ...]:
     """Chords of columns in the circular footprints of solids: solid k, column w, midpoint and half length."""
+    x, y, radius = solids.x, solids.y, solids.radius
     distance = hypotenuse(x, y)
     inside = distance <= radius
     half = np.where(inside, np.pi, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1)))
@@ -253,18 +247,12 @@ def _chords(x: np.ndarray, y: np.ndarray, radius: np.ndarray, rays: Rays) -> tup
 
 
 def _upright(
-    rays: Rays,
-    k: np.ndarray,
-    w: np.ndarray,
-    near: np.ndarray,
-    far: np.ndarray,
-    bottom: np.ndarray,
-    top: np.ndarray,
+    solids: "Boxes | Cylinders", rays: Rays, k: np.ndarray, w: np.ndarray, near: np.ndarray, far: np.ndarray
 ) -> Fragments:
-    """First intersection with upright solids between near and far, from bottom to top, including both lids."""
-    n, b = row_windows(rays, near, far, bottom, top)
-    k, w, near, far, bottom, top = (q[n] for q in (k, w, near, far, bottom, top))
-    slope, height = rays.slope[b], rays.height[b]
+    """First intersection of columns w with upright solids k between near and far, including both lids."""
+    n, b = row_windows(rays, near, far, solids.bottom[k], solids.top[k])
+    k, w, near, far = (q[n] for q in (k, w, near, far))
+    bottom, top, slope, height = solids.bottom[k], solids.top[k], rays.slope[b], rays.height[b]
     z = height + near * slope
     lid = np.where(z > top, top, bottom)
     with np.errstate(divide="ignore", invalid="ignore"):
