@@ -101,7 +101,15 @@ def solve(
     solution = solver.solve(v, x, times, limits)
     if not (global_error and solver.adapts):
         return solution
-    return _with_global_error(solution, solver, velocity, x, times, limits._replace(tighter=TIGHTER), progress)
+    scenes = solution.converged.nonzero()[:, 0]
+    error = torch.full((len(x),), math.inf, dtype=torch.float64)
+    extra = torch.zeros_like(solution.evaluations)
+    if len(scenes):
+        index, v = scenes.to(x.device), Evaluations(selected(velocity, scenes), len(scenes), progress)
+        second = solver.solve(v, x[index], times, limits._replace(tighter=TIGHTER))
+        rms = flat((solution.x[index] - second.x).detach().double().square()).mean(1).sqrt().cpu()
+        error[scenes], extra[scenes] = torch.where(second.converged, rms, math.inf), second.evaluations
+    return replace(solution, evaluations=solution.evaluations + extra, global_error=error)
 
 
 def method_of(name: str) -> Method:
@@ -112,24 +120,3 @@ def method_of(name: str) -> Method:
 def usual_grid(name: str) -> str:
     """The default grid of a method: denser towards t = 1 for multistep methods, else uniform."""
     return "power:1.75" if getattr(SOLVERS[name], "multistep", False) else "uniform"
-
-
-def _with_global_error(
-    solution: Solution,
-    solver: Method,
-    velocity: Velocity,
-    x: Tensor,
-    times: Tensor,
-    limits: Limits,
-    progress: Callable[[], None] | None,
-) -> Solution:
-    """Add an error estimate to a solution: the difference to one at a lower tolerance, for converged scenes."""
-    scenes = solution.converged.nonzero()[:, 0]
-    error = torch.full((len(x),), math.inf, dtype=torch.float64)
-    extra = torch.zeros_like(solution.evaluations)
-    if len(scenes):
-        index, velocity_of_scenes = scenes.to(x.device), selected(velocity, scenes)
-        second = solver.solve(Evaluations(velocity_of_scenes, len(scenes), progress), x[index], times, limits)
-        rms = flat((solution.x[index] - second.x).detach().double().square()).mean(1).sqrt().cpu()
-        error[scenes], extra[scenes] = torch.where(second.converged, rms, math.inf), second.evaluations
-    return replace(solution, evaluations=solution.evaluations + extra, global_error=error)
