@@ -160,12 +160,12 @@ class TwoSample(FeatureMetric):
         names = [f"{self.name}{end}" for end in ("", "_low", "_high")]
         if any(self.count(side) < self.fewest for side in SIDES):
             return dict.fromkeys(names, float("nan")), [f"{self.name} needs {self.fewest} or more scans of each set."]
-        real, generated = (self.kept(side).double() for side in SIDES)
-        judged = []
+        sides = [self.kept(side).double() for side in SIDES]
+        halves, judged = [(x[: len(x) // 2], x[len(x) // 2 :]) for x in sides], []
         for turn in (1, -1):
-            (learn_real, judge_real), (learn_made, judge_made) = (_halves(len(x))[::turn] for x in (real, generated))
-            score = _classifier(real[learn_real], generated[learn_made])
-            judged.append(area(score(real[judge_real]), score(generated[judge_made])))
+            (learn_real, judge_real), (learn_made, judge_made) = (both[::turn] for both in halves)
+            score = _classifier(learn_real, learn_made)
+            judged.append(area(score(judge_real), score(judge_made)))
         value, error = sum(a for a, _ in judged) / 2, math.sqrt(sum(v for _, v in judged)) / 2
         ends = value, max(value - 1.96 * error, 0.0), min(value + 1.96 * error, 1.0)
         return dict(zip(names, ends, strict=True)), []
@@ -177,10 +177,6 @@ def area(negative: Tensor, positive: Tensor) -> tuple[float, float]:
     equal = difference.abs() < SAME * (1 + positive.abs())  # features of a scan differ by rounding between batches
     above = torch.where(equal, 0.5, (difference > 0).double())
     return float(above.mean()), sum(float(above.mean(k).var() / above.shape[1 - k]) for k in (0, 1))
-
-
-def _halves(count: int) -> tuple[slice, slice]:
-    return slice(0, count // 2), slice(count // 2, count)
 
 
 def _classifier(real: Tensor, generated: Tensor) -> Callable[[Tensor], Tensor]:

@@ -16,9 +16,8 @@ from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
 from r2flow.metrics.base import ScanMetric, Side, blocks
-from r2flow.metrics.birds_eye import js_distance
+from r2flow.metrics.jsd_mmd import JSD
 from r2flow.metrics.scans import Scans
-from r2flow.metrics.sums import SumMetric
 
 NEAR, FAR, EXTENT = 1.0, 56.0, 50  # metres
 FINE, COARSE = 0.05, 0.5  # cell size in metres: JSD, MMD
@@ -34,7 +33,7 @@ def occupied(points: Tensor, cell: float) -> Tensor:
     return torch.unique(x * side + y)
 
 
-class JSDLiDM(SumMetric):
+class JSDLiDM(JSD):
     """Jensen-Shannon distance (root, natural logarithm) between counts of scans that occupy each 5 cm cell.
 
     A row lists the occupied cells, since a scan has 4 million.
@@ -58,9 +57,6 @@ class JSDLiDM(SumMetric):
         total: Tensor = getattr(self, f"{side}_sum")
         cells = rows[rows < self.width].long().to(total.device)
         total.index_add_(0, cells, total.new_ones(len(cells)))
-
-    def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
-        return {self.name: js_distance(real, generated)}
 
 
 class MMDLiDM(ScanMetric):

@@ -7,10 +7,9 @@ torchsparse (1.4 and 2.0), so that its weights, (K, C_in, C_out), fit: see `offs
 """
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Self, cast
+from typing import NamedTuple, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -85,15 +84,11 @@ def kernel_map(inputs: VoxelGrid, outputs: VoxelGrid, size: int) -> KernelMap:
     return entries
 
 
-@dataclass(frozen=True)
-class Sparse:
+class Sparse(NamedTuple):
     """Features (N, C) of the voxels of a grid."""
 
     features: Tensor
     grid: VoxelGrid
-
-    def with_features(self, features: Tensor) -> "Sparse":
-        return Sparse(features, self.grid)
 
 
 class SparseConv3d(nn.Module):
@@ -113,9 +108,9 @@ class SparseConv3d(nn.Module):
 
     def forward(self, x: Sparse) -> Sparse:
         if self.size == 1:
-            return x.with_features(x.features @ self.kernel)
+            return x._replace(features=x.features @ self.kernel)
         if self.size == 3:
-            return x.with_features(convolve(x.features, self.kernel, x.grid.around, len(x.grid)))
+            return x._replace(features=convolve(x.features, self.kernel, x.grid.around, len(x.grid)))
         if self.transposed:
             reverse = [(outputs, inputs) for inputs, outputs in x.grid.inside]
             finer = cast(VoxelGrid, x.grid.finer)
@@ -137,9 +132,9 @@ def convolve(features: Tensor, kernel: Tensor, where: KernelMap, num: int) -> Te
 
 class SparseNorm(nn.BatchNorm1d):
     def forward(self, x: Sparse) -> Sparse:  # type: ignore[override]
-        return x.with_features(super().forward(x.features))
+        return x._replace(features=super().forward(x.features))
 
 
 class SparseReLU(nn.Module):
     def forward(self, x: Sparse) -> Sparse:
-        return x.with_features(torch.relu(x.features))
+        return x._replace(features=torch.relu(x.features))

@@ -88,7 +88,7 @@ class Residual(nn.Module):
         self.downsample = nn.Sequential(*change)
 
     def forward(self, x: Sparse) -> Sparse:
-        return x.with_features(torch.relu(self.net(x).features + self.downsample(x).features))
+        return x._replace(features=torch.relu(self.net(x).features + self.downsample(x).features))
 
 
 class MinkowskiNet(Extractor):
@@ -123,7 +123,7 @@ class MinkowskiNet(Extractor):
     def up(self, level: int, x: Sparse, skip: Sparse) -> Sparse:
         """One level up, concatenated with the skip map of that level."""
         x = self.get_submodule(f"up{level}.0")(x)
-        return self.get_submodule(f"up{level}.1")(x.with_features(torch.cat([x.features, skip.features], 1)))
+        return self.get_submodule(f"up{level}.1")(x._replace(features=torch.cat([x.features, skip.features], 1)))
 
     def forward(self, coords: Tensor, features: Tensor) -> Tensor:
         """Last map, (N, 48); `coords` (N, 3) int64 as in `VoxelGrid`, `features` (N, 4): x, y, z in metres and -1."""
@@ -184,12 +184,12 @@ class SPVCNN(MinkowskiNet):
         at_16 = Corners(coords, maps[4].grid, 16)
         points = at_16.to_points(maps[4].features) + self.point_transforms[0](points)
 
-        y = self.up(1, maps[4].with_features(at_16.to_voxels(points)), maps[3])
+        y = self.up(1, maps[4]._replace(features=at_16.to_voxels(points)), maps[3])
         y = self.up(2, y, maps[2])
         at_4 = Corners(coords, y.grid, 4)
         points = at_4.to_points(y.features) + self.point_transforms[1](points)
 
-        y = self.up(3, y.with_features(at_4.to_voxels(points)), maps[1])
+        y = self.up(3, y._replace(features=at_4.to_voxels(points)), maps[1])
         y = self.up(4, y, maps[0])
         return y.features + self.point_transforms[2](points)
 
