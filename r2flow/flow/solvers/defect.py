@@ -64,10 +64,6 @@ class Tried(NamedTuple):
         length = expand_time(self.h, self.x) / self.scale
         return unpowered(norms(*(powered(difference * length) for difference in differences)))
 
-    def roughness(self) -> np.ndarray:
-        """h times the third difference of v, in tolerances, (B,)."""
-        return self.changes(weighted(self.method.third_difference, self.k))[0]
-
 
 @dataclass
 class _Bracket:
@@ -137,7 +133,7 @@ def probes(method: EmbeddedMethod, share: float) -> list[float]:
 @torch.no_grad()
 def inspect(control: StepController, tried: Tried, good: np.ndarray) -> np.ndarray:
     """Which of the accepted steps remain accepted, (B,) bool; tells the controller where the others must end."""
-    control.roughness = tried.roughness()
+    control.roughness = tried.changes(weighted(tried.method.third_difference, tried.k))[0]
     compared, bisected = control.rougher(*COMPARED), control.rougher(*BISECTED) | control.rougher(*FROM_REST)
     bisected &= good | (control.troubled == REMEMBERED) | control.rougher(*REJECTED)
     planned: dict[int, list[float]] = {}

@@ -50,11 +50,6 @@ class EmbeddedMethod:
         return v.solution(advance(v, x, float(times[0]), float(times[-1]), self, limits))
 
     @property
-    def stages(self) -> int:
-        """Evaluations per step."""
-        return len(self.rows)
-
-    @property
     def distinct(self) -> dict[float, int]:
         """The stage at each time of the step, the last one of several, in increasing time."""
         return dict(sorted({c: i for i, c in enumerate((0.0, *self.nodes))}.items()))

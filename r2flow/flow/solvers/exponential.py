@@ -8,7 +8,6 @@ vectors are finite differences of v, one evaluation each. Scenes are solved one 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -26,13 +25,8 @@ KRYLOV = 0.05  # error of a function of J, in tolerances
 SAFETY, SHRINK, GROW = 0.8, 0.2, 8.0
 
 
-@dataclass(frozen=True)
 class ExponentialMethod:
-    """An exponential method."""
-
     adapts: ClassVar[bool] = True  # whether step sizes follow from a tolerance
-
-    order: int = 4
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Solve every scene of x, (B, ...), from t_0 to t_1, one after another."""

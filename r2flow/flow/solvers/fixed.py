@@ -73,10 +73,6 @@ class FixedStep:
     evaluations: int
     multistep: bool = False
 
-    def cost(self, steps: int) -> int:
-        """Evaluations of v for a number of steps."""
-        return steps * self.evaluations
-
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Take the steps of a time grid, (N + 1,) float64; keep inner states at equal numbers of steps.
 

@@ -163,7 +163,7 @@ class StepController:
         self.arrived[places], self.leaving[places] = False, True
 
     def _spent(self) -> np.ndarray:
-        return self.v.counts[self.v.scenes] + self.method.stages > self.limits.max_evaluations
+        return self.v.counts[self.v.scenes] + len(self.method.rows) > self.limits.max_evaluations
 
     def _factors(self, good: np.ndarray, finite: np.ndarray, error: np.ndarray) -> np.ndarray:
         """h_new / h = S err^-(1/q - 3/4 beta) err_before^beta, the PI controller of dopri5.f; 1/5 if not finite."""
