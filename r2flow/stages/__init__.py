@@ -41,7 +41,7 @@ def check_roll(augment: Augmentation, generator: Generator) -> None:
 def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     """Build the LightningModule of a config's `stage` around a generator; its checkpoints store the config.
 
-    The config's `sampler`, if given, becomes the generator's default.
+    The config's `sampler` and `few`, if given, become the generator's defaults.
     """
     run_options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"]}
     for name, where in (("batch_size", "data.batch_size"), ("seed", "seed")):
@@ -51,12 +51,6 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     stage: Stage = STAGES.build(options, generator)
     stage.config = dict(config)
     stage.check_data(options["name"], config["data"])
-    _choose(generator, config)
-    return stage
-
-
-def _choose(generator: Generator, config: Mapping[str, Any]) -> None:
-    """Set a generator's default samplers from a config's `sampler` and `few`."""
     sampler, few = generator.choose(**dict(config.get("sampler") or {})), config.get("few")
     if sampler.completes:
         raise InputError(f"sampler.name={sampler.name} completes scans: give it to r2flow complete by --sampler.")
@@ -64,3 +58,4 @@ def _choose(generator: Generator, config: Mapping[str, Any]) -> None:
         generator.few = build_sampler(few)
         generator.few.check(generator)
     generator.run_by(sampler, generator.few, generator.fixed)
+    return stage
