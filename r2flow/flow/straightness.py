@@ -22,16 +22,11 @@ Progress = Callable[[], None] | None
 
 
 class Curvature(NamedTuple):
-    """The integral of s over the paths of a batch.
+    """The integral of s over the paths of a batch."""
 
-    Attributes:
-        x_0, x_1: Start and end of each path, (B, ...).
-        per_pixel: int_0^1 (d - v_t)^2 dt per element, (B, ...), float64.
-    """
-
-    x_0: Tensor
-    x_1: Tensor
-    per_pixel: Tensor
+    x_0: Tensor  # start of each path, (B, ...)
+    x_1: Tensor  # end
+    per_pixel: Tensor  # int_0^1 (d - v_t)^2 dt per element, (B, ...), float64
 
     @property
     def total(self) -> Tensor:
@@ -50,21 +45,13 @@ class Curvature(NamedTuple):
 
 
 class Straightness(NamedTuple):
-    """s(t) per scene, and the paths of the most curved elements.
+    """s(t) per scene, and the paths of the most curved elements."""
 
-    Attributes:
-        t: The times 0, 1/n, ..., (n - 1)/n, (n,), float64.
-        s: s(t), (B, n), float64.
-        curvature: The integral of s.
-        pixels: Indices into the flattened batch by decreasing curvature, (k,); elements of non-finite paths come last.
-        trajectories: Values of these elements at 0, 1/n, ..., 1, (k, n + 1).
-    """
-
-    t: Tensor
-    s: Tensor
-    curvature: Curvature
-    pixels: Tensor
-    trajectories: Tensor
+    t: Tensor  # the times 0, 1/n, ..., (n - 1)/n, (n,), float64
+    s: Tensor  # s(t), (B, n), float64
+    curvature: Curvature  # the integral of s
+    pixels: Tensor  # indices into the flattened batch by decreasing curvature, (k,); those of non-finite paths last
+    trajectories: Tensor  # values of these elements at 0, 1/n, ..., 1, (k, n + 1)
 
 
 @torch.no_grad()

@@ -85,16 +85,12 @@ class Generator(nn.Module):
         sampler: Default sampler.
         few: Sampler for fewer steps than `sampler.steps`; None: `sampler`.
         fixed: True for a distilled model: only `sampler` is valid.
-        draws: Whether it generates scans from noise; False for an autoencoder, which is never sampled.
-        told: Whether it takes a condition of `r2flow.generators.condition_of`.
-        learns_directions: Whether it learns one vector per direction; scans must then not be rotated in training.
-        goes_on_as: Generator class used when fine-tuned with a velocity loss; None: same class.
     """
 
-    draws: ClassVar[bool] = True
-    told: ClassVar[bool] = False
-    learns_directions: ClassVar[bool] = False
-    goes_on_as: ClassVar[str | None] = None
+    draws: ClassVar[bool] = True  # whether it makes scans of noise; False for an autoencoder, never sampled
+    told: ClassVar[bool] = False  # whether it takes a condition of `r2flow.generators.condition_of`
+    learns_directions: ClassVar[bool] = False  # whether it learns a vector per direction: no rotation in training
+    goes_on_as: ClassVar[str | None] = None  # class used when fine-tuned with a velocity loss; None: the same
 
     def __init__(self, space: ModelSpace, noise_shape: tuple[int, ...] | None = None) -> None:
         super().__init__()

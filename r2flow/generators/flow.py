@@ -21,12 +21,9 @@ USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  
 
 
 class Flow(Generator):
-    """A generator by an ODE. A subclass defines `velocity`.
+    """A generator by an ODE. A subclass defines `velocity`."""
 
-    Attributes:
-        completers: Samplers that complete scans, with their default settings; the first one is the default.
-    """
-
+    # Samplers that complete scans, with their default settings; the first one is the default.
     completers: ClassVar[tuple[Sampler, ...]] = (MMPS(),)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
@@ -65,14 +62,10 @@ class NetworkFlow(Flow):
 
     Args:
         backbone: Name and options, as in conf/backbone.
-
-    Attributes:
-        answer: The quantity that the network predicts.
-        region: Region of the image that is generated; None: all of it.
     """
 
-    answer: str = "v(t, x)"
-    region: Region | None = None
+    answer: str = "v(t, x)"  # the quantity that the network predicts
+    region: Region | None = None  # region of the image that is generated; None: all of it
     condition_channels: int = 0  # additional input channels of the backbone, for a condition
     second_time: ClassVar[bool] = False  # whether the backbone takes a second time, for flow maps
 

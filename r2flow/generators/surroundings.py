@@ -16,27 +16,20 @@ SAME = 2e-4  # radians: tolerance for rows of the same elevation
 
 
 class Surroundings(NamedTuple):
-    """Candidates for every ray, and features of them.
+    """Six candidates for every ray, and features of them.
 
-    Attributes:
-        features: (B, `FEATURES`, H, W); all but one are invariant to scaling all ranges.
-        ranges: log r of the candidates, (B, 6, H, W): the nearest returns above, below, left and right, then the
-            vertical and the horizontal interpolation between them, linear in 1 / r.
-        strengths: Reflectance of the candidates, (B, 6, H, W); zeros for a model of range alone.
-        there: Which candidates exist, (B, 6, H, W) bool.
-        guess: log r of the best candidate, (B, 1, H, W): the vertical interpolation, else the horizontal one, else a
-            neighbour, else 10 m.
-        start: Measured rays, and the best candidate for the others, in model space, (B, C, H, W).
-        sure: 1 for a measured return, -1 for a ray measured as empty, 0 for a hidden ray, (B, 1, H, W).
+    These are the nearest returns above, below, left and right, then the vertical and the horizontal interpolation
+    between them, linear in 1 / r. The best is the vertical interpolation, else the horizontal one, else a neighbour,
+    else 10 m.
     """
 
-    features: Tensor
-    ranges: Tensor
-    strengths: Tensor
-    there: Tensor
-    guess: Tensor
-    start: Tensor
-    sure: Tensor
+    features: Tensor  # (B, `FEATURES`, H, W); all but one are invariant to scaling all ranges
+    ranges: Tensor  # log r of the candidates, (B, 6, H, W)
+    strengths: Tensor  # reflectance of the candidates, (B, 6, H, W); zeros for a model of range alone
+    there: Tensor  # which candidates exist, (B, 6, H, W) bool
+    guess: Tensor  # log r of the best candidate, (B, 1, H, W)
+    start: Tensor  # measured rays, and the best candidate for the others, in model space, (B, C, H, W)
+    sure: Tensor  # 1 for a measured return, -1 for a ray measured as empty, 0 for a hidden ray, (B, 1, H, W)
 
     @classmethod
     def of(cls, space: ModelSpace, condition: Condition, ring: bool, steps: Tensor) -> "Surroundings":

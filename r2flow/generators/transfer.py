@@ -37,21 +37,13 @@ WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0}  # loss weights
 
 @dataclass(frozen=True)
 class Answers:
-    """The network's prediction for every ray: p(x_1 | x_t, condition), a mixture over candidates.
+    """The network's prediction for every ray: p(x_1 | x_t, condition), a mixture over candidates."""
 
-    Attributes:
-        logits: Log probability of each candidate, given a return, (B, 7, H, W).
-        ranges: log r of each candidate, (B, 7, H, W); the last one is predicted freely by the network.
-        scales: Scale b of each candidate's Laplace density on log r, (B, 7, H, W).
-        returns: Logit of a return, (B, 1, H, W).
-        strengths: Reflectance of each candidate, (B, 7, H, W).
-    """
-
-    logits: Tensor
-    ranges: Tensor
-    scales: Tensor
-    returns: Tensor
-    strengths: Tensor
+    logits: Tensor  # log probability of each candidate, given a return, (B, 7, H, W)
+    ranges: Tensor  # log r of each candidate, (B, 7, H, W); the last one is predicted freely by the network
+    scales: Tensor  # scale b of each candidate's Laplace density on log r, (B, 7, H, W)
+    returns: Tensor  # logit of a return, (B, 1, H, W)
+    strengths: Tensor  # reflectance of each candidate, (B, 7, H, W)
 
     def log_density(self, log_r: Tensor) -> Tensor:
         """log p(log r | return), (B, 1, H, W)."""

@@ -11,13 +11,9 @@ from r2flow.metrics.base import SIDES, ScanMetric, Side
 
 
 class SumMetric(ScanMetric):
-    """A metric of the sum of rows of a set, in float64; sums of integers are exact in any order.
+    """A metric of the sum of rows of a set, in float64; sums of integers are exact in any order."""
 
-    Attributes:
-        width: Length of a row.
-    """
-
-    width: ClassVar[int]
+    width: ClassVar[int]  # length of a row
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -27,17 +27,11 @@ Grid = str | list[float] | tuple[float, ...]
 
 @dataclass(frozen=True)
 class Generated:
-    """Scans in model space.
+    """Scans in model space."""
 
-    Attributes:
-        x: x_1, (B, C, H, W), on the generator's device, float32 or float64.
-        evaluations: Network evaluations of each scan, (B,) int64.
-        converged: Whether each scan is finite and, for an adaptive method, solved, (B,) bool.
-    """
-
-    x: Tensor
-    evaluations: Tensor
-    converged: Tensor
+    x: Tensor  # x_1, (B, C, H, W), on the generator's device, float32 or float64
+    evaluations: Tensor  # network evaluations of each scan, (B,) int64
+    converged: Tensor  # whether each scan is finite and, for an adaptive method, solved, (B,) bool
 
     @classmethod
     def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:
@@ -62,18 +56,12 @@ def last_of(states: Iterable[Tensor], progress: Call) -> Tensor:
 class Sampler(ABC):
     """How a generator is run. A subclass is a frozen dataclass in `SAMPLERS`; configs, checkpoints and the command line
     store its name and fields.
-
-    Attributes:
-        draws: Whether the sampler is stochastic: it draws noise after x_0.
-        paired: Whether x_1 depends on x_0 closely enough for a reflow pair (x_0, x_1).
-        completes: Whether a condition is required.
-        needs: Attribute that a generator must have.
     """
 
-    draws: ClassVar[bool] = False
-    paired: ClassVar[bool] = True
-    completes: ClassVar[bool] = False
-    needs: ClassVar[str] = "velocity"
+    draws: ClassVar[bool] = False  # whether the sampler is stochastic: it draws noise after x_0
+    paired: ClassVar[bool] = True  # whether x_1 depends on x_0 closely enough for a reflow pair (x_0, x_1)
+    completes: ClassVar[bool] = False  # whether a condition is required
+    needs: ClassVar[str] = "velocity"  # attribute that a generator must have
 
     @abstractmethod
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
@@ -142,15 +130,10 @@ class Sampler(ABC):
 
 @dataclass(frozen=True)
 class OnGrid(Sampler):
-    """A sampler with fixed steps on a time grid.
+    """A sampler with fixed steps on a time grid."""
 
-    Attributes:
-        steps: Number of steps from t = 0 to t = 1.
-        grid: Time grid: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
-    """
-
-    steps: Steps = 32
-    grid: Grid = "uniform"
+    steps: Steps = 32  # from t = 0 to t = 1
+    grid: Grid = "uniform"  # a name (`r2flow.flow.solvers.named_grid`), or the times themselves
 
     def __post_init__(self) -> None:
         if isinstance(self.grid, list | tuple):

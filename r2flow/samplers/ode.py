@@ -26,15 +26,10 @@ class ODESampler(Sampler):
 
 @dataclass(frozen=True)
 class FixedSteps(OnGrid, ODESampler):
-    """Fixed steps of a solver.
+    """Fixed steps of a solver."""
 
-    Attributes:
-        method: Name of the solver, and of the sampler.
-        finish: Length of a last Euler step, 0 for none; it smooths surfaces if the flow is undertrained near t = 1.
-    """
-
-    method: str = "euler"
-    finish: Portion = 0.0
+    method: str = "euler"  # name of the solver, and of the sampler
+    finish: Portion = 0.0  # length of a last Euler step, which smooths surfaces of a flow undertrained near t = 1
 
     @property
     def name(self) -> str:
@@ -66,15 +61,10 @@ class FixedSteps(OnGrid, ODESampler):
 
 @dataclass(frozen=True)
 class Adaptive(ODESampler):
-    """Adaptive steps of a solver, chosen per scan.
+    """Adaptive steps of a solver, chosen per scan."""
 
-    Attributes:
-        method: Name of the solver, and of the sampler.
-        tolerance: Absolute and relative tolerance of the local error (`r2flow.flow.solvers.solve`).
-    """
-
-    method: str = "dopri5"
-    tolerance: Positive = 1e-5
+    method: str = "dopri5"  # name of the solver, and of the sampler
+    tolerance: Positive = 1e-5  # absolute and relative, of the local error (`r2flow.flow.solvers.solve`)
 
     @property
     def name(self) -> str:
@@ -86,17 +76,11 @@ class Adaptive(ODESampler):
 
 @dataclass(frozen=True)
 class TorchDiffEq(ODESampler):
-    """A solver of the package torchdiffeq.
+    """A solver of the package torchdiffeq."""
 
-    Attributes:
-        method: Name in torchdiffeq.
-        tolerance: Tolerance of an adaptive method.
-        steps: Steps of a fixed-step method.
-    """
-
-    method: str = "dopri5"
-    tolerance: Positive = 1e-5
-    steps: Count = 32
+    method: str = "dopri5"  # name in torchdiffeq
+    tolerance: Positive = 1e-5  # of an adaptive method
+    steps: Count = 32  # of a fixed-step method
 
     def __post_init__(self) -> None:
         method_of(TORCHDIFFEQ + self.method)

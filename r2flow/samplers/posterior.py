@@ -91,16 +91,12 @@ class Repaint(Posterior):
     Before repeating a step, it goes back from t' to t by fresh noise (`back`), which preserves the distribution of x_t.
     The first step is taken once, since x_0 does not depend on x_t'. If the generator has a method `repaint`, as a
     diffusion model has, that method is used instead.
-
-    Attributes:
-        repeats: How often each step is taken.
-        jump: Number of equal parts of a step.
     """
 
     draws: ClassVar[bool] = True
 
-    repeats: Count = 4
-    jump: Count = 1
+    repeats: Count = 4  # how often each step is taken
+    jump: Count = 1  # number of equal parts of a step
 
     def times(self, *args: Any, **options: Any) -> Tensor:
         times = super().times(*args, **options)
@@ -139,16 +135,12 @@ class MMPS(Posterior):
     E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T)^-1 (y - A x_1hat), which is exact if x_1 is Gaussian given x_t. Conjugate
     gradients (`_solved`) solve the linear system with one product with J per iteration; they stop at a direction in
     which C is not positive, which a network does not exclude. `sde` takes the steps with this mean.
-
-    Attributes:
-        products: Products with the Jacobian per step.
-        churn: Noise replacement, as in `SDE`.
     """
 
     draws = SDE.draws
 
-    products: Count = 2
-    churn: NonNegative = 1.0
+    products: Count = 2  # with the Jacobian per step
+    churn: NonNegative = 1.0  # noise replacement, as in `SDE`
 
     def evaluations(self, generator: Any = None) -> int:
         """Network evaluations per scan; a vector-Jacobian product counts as one."""

@@ -91,18 +91,13 @@ def back(x: Tensor, r: float, s: float, e: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SDE(OnGrid):
-    """SDE sampler of order 2 in distribution, one evaluation per step.
-
-    Attributes:
-        finish: Length of the last step, which ends at the mean of x_1; 0: as in the grid.
-        churn: Noise replacement: 1 is the reverse-time SDE, 0 the ODE.
-    """
+    """SDE sampler of order 2 in distribution, one evaluation per step."""
 
     paired: ClassVar[bool] = False
 
     grid: Grid = "power:2.5"
-    finish: Portion = 1 / 128
-    churn: NonNegative = 1.0
+    finish: Portion = 1 / 128  # length of the last step, which ends at the mean of x_1; 0: as in the grid
+    churn: NonNegative = 1.0  # noise replacement: 1 is the reverse-time SDE, 0 the ODE
 
     @property
     def draws(self) -> bool:  # type: ignore[override]

@@ -28,20 +28,13 @@ class Tasks:
 
     Masks: the rows of a sparser sensor (every 2nd to 8th, mostly every 4th or 2nd), a random share of the rows, or a
     random share of the rays (3 to 80 %).
-
-    Args:
-        rows: Rows of a crop, at most those of the run's sensor.
-        columns: Columns of a crop, at most those of the run's sensor.
-        halved: Share of crops at half the rows and a quarter of the columns, to train for coarser images.
-        silent: Share of crops with unknown reflectance.
-        unnumbered: Share of crops without the vectors learned per row, to train for other sensors.
     """
 
-    rows: Count = 32
-    columns: Count = 256
-    halved: Portion = 0.3
-    silent: Portion = 0.05
-    unnumbered: Portion = 0.1
+    rows: Count = 32  # of a crop, at most those of the run's sensor
+    columns: Count = 256  # likewise
+    halved: Portion = 0.3  # share of crops at half the rows and a quarter of the columns, for coarser images
+    silent: Portion = 0.05  # share of crops with unknown reflectance
+    unnumbered: Portion = 0.1  # share of crops without the vectors learned per row, for other sensors
 
     def size(self, space: ModelSpace) -> tuple[int, int]:
         """Rows and columns of a crop, for the space of the run's sensor."""

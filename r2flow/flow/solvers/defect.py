@@ -32,21 +32,14 @@ CROSSING = 0.2  # largest error of crossing a jump, in tolerances
 
 
 class Tried(NamedTuple):
-    """A step of every scene with its stages.
-
-    Attributes:
-        x, y: State before and after, (B, ...).
-        k: Stages.
-        h: Signed length, (B,).
-        scale: Tolerance of every element's error, (B, ...).
-    """
+    """A step of every scene with its stages."""
 
     method: EmbeddedMethod
-    x: Tensor
-    y: Tensor
-    k: list[Tensor]
-    h: Tensor
-    scale: Tensor
+    x: Tensor  # state before, (B, ...)
+    y: Tensor  # state after
+    k: list[Tensor]  # stages
+    h: Tensor  # signed length, (B,)
+    scale: Tensor  # tolerance of every element's error, (B, ...)
 
     def of(self, places: np.ndarray) -> "Tried":
         """The step of the scenes with these indices."""
@@ -67,24 +60,16 @@ class Tried(NamedTuple):
 
 @dataclass
 class _Bracket:
-    """An interval of a step, in shares of its length, in which v may jump.
-
-    Attributes:
-        before, after: v at both ends, minus its smooth trend.
-        change: Norm of h (after - before), in tolerances.
-        trend: Slope of v per step, the median over the gaps between stages, per element.
-        most: Largest change of any half so far.
-        whole: Change over the first bracket.
-    """
+    """An interval of a step, in shares of its length, in which v may jump."""
 
     left: float
     right: float
-    before: Tensor
-    after: Tensor
-    change: float
-    trend: Tensor
-    most: float = 0.0
-    whole: float = math.inf
+    before: Tensor  # v at the left end, minus its smooth trend
+    after: Tensor  # at the right end
+    change: float  # norm of h (after - before), in tolerances
+    trend: Tensor  # slope of v per step, the median over the gaps between stages, per element
+    most: float = 0.0  # largest change of any half so far
+    whole: float = math.inf  # change over the first bracket
 
     @classmethod
     def first(cls, step: Tried, also: dict[float, Tensor]) -> "_Bracket":

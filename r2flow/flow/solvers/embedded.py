@@ -15,33 +15,20 @@ class EmbeddedMethod:
     """The Butcher tableau of an explicit embedded method whose last stage is the next step's first (FSAL).
 
     Its last two stages are at the same t; stiffness detection compares them.
-
-    Attributes:
-        order: Order of the propagated solution.
-        nodes: c_i of stages 2 to s.
-        rows: a_ij of stages 2 to s; the last row is the new state.
-        error: b_i - b*_i, the weights of the error estimate.
-        safety: Safety factor of the step size controller.
-        grow: Largest factor between one step size and the next.
-        stability: |h lambda| above which a step counts as stiff; near the end of the stability region on the negative
-            real axis.
-        bump: d_i, the weights of the quartic term of the interpolant.
-        rough: Stages of the third divided difference that measures the roughness of v along a step.
-        defect: Largest defect of a step in tolerances: several times that of accurate steps of the exact problems.
     """
 
     adapts: ClassVar[bool] = True  # whether step sizes follow from a tolerance
 
-    order: int
-    nodes: tuple[float, ...]
-    rows: tuple[tuple[float, ...], ...]
-    error: tuple[float, ...]
-    safety: float
-    grow: float
-    stability: float
-    bump: tuple[float, ...]
-    rough: tuple[int, int, int, int]
-    defect: float
+    order: int  # of the propagated solution
+    nodes: tuple[float, ...]  # c_i of stages 2 to s
+    rows: tuple[tuple[float, ...], ...]  # a_ij of stages 2 to s; the last row is the new state
+    error: tuple[float, ...]  # b_i - b*_i, the weights of the error estimate
+    safety: float  # factor of the step size controller
+    grow: float  # largest factor between one step size and the next
+    stability: float  # |h lambda| of stiff steps: near the end of the stability region on the negative real axis
+    bump: tuple[float, ...]  # d_i, the weights of the quartic term of the interpolant
+    rough: tuple[int, int, int, int]  # stages of the third divided difference, the roughness of v along a step
+    defect: float  # largest of a step in tolerances: several times that of accurate steps of the exact problems
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Solve every scene of x, (B, ...), from the first time to the last with its own steps."""

@@ -56,22 +56,14 @@ Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class FixedStep:
-    """A fixed-step method x(t) -> x(t + h).
-
-    Attributes:
-        step: Step function of v, t, h and x; for a multistep method, a factory of step functions that takes the times
-            of a solution, (N + 1,) float64.
-        order: Order of the global error.
-        evaluations: Evaluations of v per step.
-        multistep: Whether `step` is a factory.
-    """
+    """A fixed-step method x(t) -> x(t + h)."""
 
     adapts: ClassVar[bool] = False  # whether step sizes follow from a tolerance
 
-    step: Callable[..., Any]
-    order: int
-    evaluations: int
-    multistep: bool = False
+    step: Callable[..., Any]  # function of v, t, h and x
+    order: int  # of the global error
+    evaluations: int  # of v per step
+    multistep: bool = False  # whether `step` makes such a function from the times of a solution, (N + 1,) float64
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Take the steps of a time grid, (N + 1,) float64; keep inner states at equal numbers of steps.

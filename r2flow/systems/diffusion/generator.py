@@ -83,17 +83,13 @@ class Diffusion(NetworkFlow):
 
 @dataclass(frozen=True)
 class DDIM(OnGrid):
-    """DDIM steps along the schedule (Song et al. 2021).
-
-    Attributes:
-        eta: Share of fresh noise: 0: deterministic, 1: ancestral steps.
-    """
+    """DDIM steps along the schedule (Song et al. 2021)."""
 
     paired: ClassVar[bool] = False
     needs: ClassVar[str] = "denoise"
 
     steps: Steps = 256
-    eta: Share = 0.0
+    eta: Share = 0.0  # share of fresh noise; 0: deterministic, 1: ancestral steps
 
     @property
     def draws(self) -> bool:  # type: ignore[override]

@@ -49,15 +49,11 @@ class Gan(Generator):
 
 @dataclass(frozen=True)
 class Direct(Sampler):
-    """One evaluation.
-
-    Attributes:
-        truncation: psi of w <- w_avg + psi (w - w_avg): smaller values reduce diversity (0.7 in DUSty's
-            published demo).
-    """
+    """One evaluation."""
 
     needs: ClassVar[str] = "made"
 
+    # psi of w <- w_avg + psi (w - w_avg): smaller values reduce diversity (0.7 in DUSty's published demo).
     truncation: Annotated[float, Bound("in (0, 1]", lambda psi: 0 < psi <= 1)] = 1.0
 
     def evaluations(self, generator: Any) -> int:

@@ -49,17 +49,11 @@ def lazy_adam(learning_rate: float, betas: tuple[float, float], every: int) -> t
 
 @dataclass(frozen=True)
 class Warmup:
-    """Decreasing degradation of the discriminator's inputs: dropped pixels and blur.
+    """Decreasing degradation of the discriminator's inputs: dropped pixels and blur."""
 
-    Attributes:
-        images: Images seen until nothing is changed any more; 0 for no warm-up.
-        dropout: Share of dropped pixels at the start.
-        blur: sigma of the blur at the start, in pixels.
-    """
-
-    images: Natural = 200_000
-    dropout: Portion = 0.5
-    blur: NonNegative = 0.0
+    images: Natural = 200_000  # seen until nothing is changed any more; 0 for no warm-up
+    dropout: Portion = 0.5  # share of dropped pixels at the start
+    blur: NonNegative = 0.0  # sigma of the blur at the start, in pixels
 
     def left(self, images: int) -> float:
         """1 at the start, 0 from `images` on, linear between."""

@@ -92,9 +92,6 @@ class LatentDDIM(Sampler):
     """DDIM on every (N // steps)-th of the diffusion's N steps, then the decoder.
 
     The last step goes to lambda_0 and not to the data, as in the published code, and adds noise too.
-
-    Attributes:
-        eta: Share of fresh noise.
     """
 
     paired: ClassVar[bool] = False
@@ -102,7 +99,7 @@ class LatentDDIM(Sampler):
     needs: ClassVar[str] = "unet"
 
     steps: Count = 50
-    eta: Share = 1.0
+    eta: Share = 1.0  # share of fresh noise
 
     def evaluations(self, generator: Any) -> int:
         return len(some_of(len(generator.log_snr), self.steps))

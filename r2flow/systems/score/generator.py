@@ -120,17 +120,13 @@ class ScoreModel(Generator):
 
 @dataclass(frozen=True)
 class Langevin(Sampler):
-    """Annealed Langevin dynamics; a condition pulls the scan to the known rays.
-
-    Attributes:
-        steps: Steps at each noise level.
-    """
+    """Annealed Langevin dynamics; a condition pulls the scan to the known rays."""
 
     draws: ClassVar[bool] = True
     paired: ClassVar[bool] = False
     needs: ClassVar[str] = "pull"
 
-    steps: Count = 5
+    steps: Count = 5  # at each noise level
 
     def evaluations(self, generator: Any) -> int:
         return len(generator.network.sigmas) * self.steps + 1
