@@ -1,7 +1,7 @@
 """The images of a run as resumable batches, also of mixtures of data sets."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,12 +71,6 @@ class FlowDataset(Dataset[Item]):
         return item | self.further(x_1, encoding.sensor, noise.generator(seed, "condition", k))
 
 
-class Order(Protocol):
-    """Maps image k of a run to a scan, as a function of k only."""
-
-    def __getitem__(self, k: int) -> int: ...
-
-
 class Permutations:
     """Scan permutation_{k // n}[k mod n] of n scans: every epoch has every scan once, in a new order.
 
@@ -102,7 +96,9 @@ class RunSampler(Sampler[list[tuple[int, int]]]):
     the whole run, even if it starts at a later batch: Lightning adds a resumed run's finished batches to its count.
     """
 
-    def __init__(self, order: Order, batch_size: int, images: int, rank: int = 0, ranks: int = 1) -> None:
+    def __init__(
+        self, order: "Permutations | MixedOrder | range", batch_size: int, images: int, rank: int = 0, ranks: int = 1
+    ) -> None:
         self.order, self.batch_size, self.images = order, batch_size, images
         self.rank, self.ranks = rank, ranks
         self.first_batch = 0
