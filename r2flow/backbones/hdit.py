@@ -289,16 +289,12 @@ class Attention(nn.Module):
         return 2 * batch * height * padded * rows * columns * channels
 
     def _project(self, x: Tensor, condition: Tensor, table: Tensor) -> tuple[Tensor, ...]:
-        """q, k and v, each (B, H, W, N, D), q and k scaled and rotated."""
+        """q, k and v, each (B, H, W, N, D), q and k of length sqrt(s) and rotated."""
         qkv = self.qkv_proj(self.norm(x, condition)).unflatten(-1, (3, self.heads, -1))
-        qk, v = qkv[..., :2, :, :], qkv[..., 2, :, :]
-        return *rotate(self._normalised(qk), table).to(v.dtype).unbind(-3), v
-
-    def _normalised(self, qk: Tensor) -> Tensor:
-        """q and k, (..., N, D), normalised to length sqrt(s); in float32, since s amplifies their rounding."""
-        qk = at_least_float32(qk)
+        qk, v = at_least_float32(qkv[..., :2, :, :]), qkv[..., 2, :, :]  # s would amplify q's and k's rounding
         scale = at_least_float32(self.scale).clamp(max=LARGEST_LOG_SCALE).exp().sqrt()
-        return qk * (scale * torch.rsqrt(qk.square().sum(-1, keepdim=True) + 1e-6))
+        qk = qk * (scale * torch.rsqrt(qk.square().sum(-1, keepdim=True) + 1e-6))
+        return *rotate(qk, table).to(v.dtype).unbind(-3), v
 
 
 def _global_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
