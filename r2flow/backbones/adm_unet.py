@@ -28,7 +28,6 @@ class ADMUNet(UNet):
     """
 
     def build_levels(self, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions) -> None:
-        """Build `down_blocks`, `mid_blocks`, `up_blocks` and the last norm and convolution."""
         deepest = self.levels - 1
         width, *widths = widths
         skips = [width]

@@ -30,7 +30,6 @@ class RingConv2d(nn.Conv2d):
         return super().forward(wrapped(x, 1, 1) if self.ring else x)
 
     def open_ring(self) -> None:
-        """Switch to zero padding at the left and right edges."""
         self.ring, self.padding = False, (1, 1)
 
 
@@ -65,7 +64,6 @@ class Resample(ExactBuffers):
         return F.conv2d(x, kernel, stride=2, padding=zeros, groups=channels)
 
     def open_ring(self) -> None:
-        """Switch to zero padding at the left and right edges."""
         self.ring = False
 
     def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:

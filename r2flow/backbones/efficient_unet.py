@@ -26,7 +26,6 @@ class EfficientUNet(UNet):
     """
 
     def build_levels(self, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions) -> None:
-        """Build `d_block1`, `u_block1`, `d_block2`, ... and the last convolution."""
         for level, ((above, width), count) in enumerate(zip(pairwise(widths), counts, strict=True), start=1):
             deepest = level == self.levels
             attention = heads if deepest else None

@@ -53,7 +53,6 @@ class Local(Backbone):
         return uncast(self.answer, F.silu(h))[..., margin : margin + columns].contiguous()
 
     def open_ring(self) -> None:
-        """Switch to zero padding at the left and right edges."""
         self.ring = False
 
 

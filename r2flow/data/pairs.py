@@ -77,7 +77,6 @@ class PairStore(Store):
         return len(usable) >= len(self.batches_of(item)) * self.options.batch_size
 
     def missing_pairs(self) -> int:
-        """Number of pairs in missing shards."""
         return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.options.batch_size
 
     def noise(self, index: int) -> Tensor:

@@ -26,7 +26,6 @@ class Codes:
         self.values = np.interp(np.arange(np.iinfo(dtype).max + 1), codes, values).astype(np.float32)
 
     def encode(self, x: np.ndarray) -> np.ndarray:
-        """The nearest codes of values."""
         return np.rint(np.interp(x, *self._knots)).astype(self.dtype)
 
 

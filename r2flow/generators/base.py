@@ -99,7 +99,6 @@ class Generator(nn.Module):
         self.run_by(FixedSteps())
 
     def run_by(self, sampler: Sampler, few: Sampler | None = None, fixed: bool = False) -> None:
-        """Set the default samplers."""
         self.sampler, self.few, self.fixed = sampler, few, fixed
 
     def drawing(self) -> dict[str, Any]:

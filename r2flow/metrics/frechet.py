@@ -64,7 +64,6 @@ class Moments(NamedTuple):
 
 
 def moments(matrix: Tensor) -> Moments:
-    """Split a matrix of moments into its parts."""
     return Moments(int(matrix[0, 0]), matrix[0, 1:], matrix[1:, 1:])
 
 

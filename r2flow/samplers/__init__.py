@@ -48,7 +48,6 @@ class _Samplers(Registry[Any]):
         return iter([*SOLVERS, *self._entries])
 
     def name_of(self, kind: type[Sampler]) -> str:
-        """Name of a registered class."""
         reference = lazy(f"{kind.__module__}:{kind.__qualname__}")
         return next(name for name, entry in self._entries.items() if entry is kind or entry == reference)
 

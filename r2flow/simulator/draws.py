@@ -30,12 +30,10 @@ def sine(x: np.ndarray) -> np.ndarray:
 
 
 def cosine(x: np.ndarray) -> np.ndarray:
-    """cos x = sin(x + pi / 2)."""
     return sine(x + math.pi / 2)
 
 
 def hypotenuse(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """sqrt(x^2 + y^2)."""
     return np.sqrt(x * x + y * y)
 
 
@@ -86,11 +84,9 @@ class ScalarDraws:
         return self._pool.pop()
 
     def uniform(self, low: float, high: float) -> float:
-        """Uniform on [low, high)."""
         return low + (high - low) * self.unit()
 
     def chance(self, probability: float) -> bool:
-        """True with this probability."""
         return self.unit() < probability
 
     def normal(self, mean: float, deviation: float) -> float:

@@ -125,7 +125,6 @@ def _clumps(
 
 
 def tree(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
-    """A trunk and a crown."""
     draws, ground = b.draws, b.level(x, y)
     trunk, clear = draws.uniform(0.07, 0.20) * size, draws.uniform(1.5, 2.8)
     crown, tall = draws.uniform(1.2, 2.6) * size, draws.uniform(1.2, 2.2) * size
@@ -220,13 +219,11 @@ def bollard(b: SceneBuilder, x: float, y: float) -> None:
 
 
 def bin_(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
-    """A refuse bin."""
     ground, size = b.level(x, y), b.draws.uniform(0.45, 0.7)
     b.add(Boxes(x, y, yaw, size, size, ground, ground + 1.05), "other-object", "plastic")
 
 
 def cabinet(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
-    """A utility cabinet."""
     ground = b.level(x, y)
     box = Boxes(x, y, yaw, b.draws.uniform(0.6, 1.4), 0.4, ground, ground + b.draws.uniform(0.9, 1.4))
     b.add(box, "other-structure", "concrete")

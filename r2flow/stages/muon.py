@@ -33,7 +33,6 @@ class Muon(torch.optim.AdamW):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """One step of all weights."""
         loss = None
         if closure is not None:  # it clears, computes and clips the gradients of all groups
             with torch.enable_grad():

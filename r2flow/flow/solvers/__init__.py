@@ -113,7 +113,6 @@ def solve(
 
 
 def method_of(name: str) -> Method:
-    """The solver of a name."""
     return TorchDiffEqMethod(name.removeprefix(TORCHDIFFEQ)) if name.startswith(TORCHDIFFEQ) else SOLVERS[name]
 
 

@@ -49,5 +49,4 @@ def weighted(weights: Sequence[float | Tensor], k: Sequence[Tensor]) -> Tensor:
 
 
 def rows(x: Tensor, places: np.ndarray) -> Tensor:
-    """Select scenes by index."""
     return x[torch.from_numpy(places).to(x.device)]

@@ -29,8 +29,6 @@ def torchdiffeq_methods() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class TorchDiffEqMethod:
-    """A solver of torchdiffeq by name."""
-
     name: str
 
     def __post_init__(self) -> None:

@@ -202,7 +202,6 @@ def _split_header(data: bytes, last: str) -> tuple[list[list[str]], int]:
 
 
 def _whole(word: str) -> int:
-    """Parse a count in a header."""
     check(word.isascii() and word.isdigit() and len(word) <= 18, f"it declares {word[:24]!r}, not a whole number.")
     return int(word)
 

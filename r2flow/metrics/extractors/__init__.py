@@ -14,7 +14,6 @@ class Extractors(Registry["type[Extractor]"]):
     """Registry of networks that also registers their metrics."""
 
     def add(self, name: str, entry: type[Extractor]) -> None:
-        """Register a network and the metrics of its features."""
         from r2flow.metrics import add_network
 
         super().add(name, entry)

@@ -114,7 +114,6 @@ def weights_folder() -> Path:
 
 
 def kept_file(name: str) -> Path:
-    """File of the installed weights of a network."""
     return weights_folder() / f"{name}.safetensors"
 
 
@@ -187,7 +186,6 @@ def _joined(path: Path, members: Mapping[str, bytes]) -> tuple[dict[str, Tensor]
 
 
 def _read_torch(file: IO[bytes], name: str) -> dict[str, Tensor]:
-    """Read the tensors of a torch file, by name."""
     content = read_torch(file, name)
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]

@@ -193,12 +193,10 @@ class Handcrafted(Extractor):
 
     @classmethod
     def trained(cls) -> Self:
-        """Build the network, which has no weights."""
         return cls()
 
     @torch.no_grad()
     def features(self, scans: Scans) -> Tensor:
-        """Features (B, D), float32, D = `dim`; NaN for a scan without returns."""
         h, w = scans.sensor.shape
         parts = scans.images.split(max(PIXELS // (h * w), 1))
         return nan_where_empty(torch.cat([self._features(part) for part in parts]), scans)
