@@ -157,7 +157,10 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
         )
     if manifest_of(path).get("format") == "r2flow scans":
         return SourceOptions(PREPARED, str(path)), None
-    return SourceOptions(FOLDER, str(samples_of(path) or path)), None
+    if (path / "config.yaml").is_file() or (path / "checkpoints").is_dir():
+        run, path = path, path / "samples"
+        check(path.is_dir(), f"{run} is a run without samples; draw some: r2flow sample {run} --out {path}.")
+    return SourceOptions(FOLDER, str(path)), None
 
 
 def find_drives(
@@ -168,15 +171,6 @@ def find_drives(
 
 
 # How scans are read
-
-
-def samples_of(run: Path) -> Path | None:
-    """The folder `samples` of a run folder; None if the folder is not a run folder."""
-    if not (run / "config.yaml").is_file() and not (run / "checkpoints").is_dir():
-        return None
-    if not (run / "samples").is_dir():
-        raise InputError(f"{run} is a run without samples; draw some: r2flow sample {run} --out {run / 'samples'}.")
-    return run / "samples"
 
 
 def reading_for(
