@@ -39,7 +39,7 @@ def advance(v: Evaluations, x: Tensor, t_0: float, t_1: float, method: EmbeddedM
     """The last state of every scene of x, (B, ...), from t_0 to t_1 by its own steps."""
     control = StepController(v, t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
     results = x.clone()
-    k_1 = v(control.now(x), x)
+    k_1 = v(x.new_full((len(x),), t_0), x)
     tolerance = attainable(limits, v.precision)
     with torch.no_grad():
         scale = x.abs().mul(tolerance).add_(tolerance)

@@ -71,7 +71,9 @@ class _Scene:
         # Differences of a noisy velocity (dropout, sampling inside the network) do not approximate J.
         if _rms(self.velocity(self.t, self.u) - f) > math.sqrt(self.roundoff) * _rms(f):
             return False
-        h = self._first_step(f)
+        # The first step as in explicit methods, but not limited by the rate of change of x, which J covers.
+        slope = _rms(f / (self.tolerance * (1 + self.u.abs())))
+        h = min((0.01 / slope) ** 0.25, self.length) if slope > 0 else self.length
         while self.t != self.t_end and f.isfinite().all():
             krylov = _Krylov(partial(self.product, f), torch.cat([f, f.new_ones(1)]))
             left = abs(self.t_end - self.t)
@@ -112,11 +114,6 @@ class _Scene:
 
     def _shortest(self) -> float:
         return 4 * torch.finfo(self.u.dtype).eps * max(abs(self.t), 1e-3 * self.length)
-
-    def _first_step(self, f: Tensor) -> float:
-        """First step size as in explicit methods, but not limited by the rate of change of x, which J covers."""
-        slope = _rms(f / (self.tolerance * (1 + self.u.abs())))
-        return min((0.01 / slope) ** 0.25, self.length) if slope > 0 else self.length
 
     def _try(self, f: Tensor, krylov: "_Krylov", h: float) -> tuple[float, float, Tensor, Tensor]:
         """Try a step: its error in tolerances, its length (at most h), its end and the velocity there.

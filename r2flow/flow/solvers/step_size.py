@@ -3,8 +3,6 @@
 import math
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations, Limits
@@ -54,10 +52,6 @@ class StepController:
     def shortest(self) -> np.ndarray:
         """Smallest step sizes, (B,): below them the stages' times are equal in the state's type."""
         return 4 * self.eps * np.maximum(np.abs(self.time(self.reached)), 1e-3 * self.length)
-
-    def now(self, x: Tensor) -> Tensor:
-        """Current t per scene, (B,), with the device and type of x."""
-        return torch.from_numpy(self.time(self.reached)).to(x.device, x.dtype)
 
     def start(self, state: np.ndarray, slope: np.ndarray) -> None:
         """Set the first step size from the norms of x and v in tolerances; scenes with a non-finite v leave.
