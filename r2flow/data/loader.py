@@ -143,7 +143,6 @@ class Mixture(ScanSource):
         return int(self.starts[-1])
 
     def locate(self, index: int) -> tuple[int, int]:
-        """The part of a scan, and its number in that part."""
         if not 0 <= index < len(self):
             raise IndexError(index)
         part = int(np.searchsorted(self.starts, index, side="right")) - 1

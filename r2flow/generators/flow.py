@@ -31,7 +31,7 @@ class Flow(Generator):
         raise NotImplementedError
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
-        """u(t, x, s), the mean velocity from t to s; v(t, x) unless the flow is a flow map."""
+        """u(t, x, s), (B, C, H, W), the mean velocity from t to s, () or (B,); v(t, x) unless it is a flow map."""
         return self.velocity(t, x, condition)
 
     def field(self, condition: Condition | None = None) -> Velocity:
@@ -169,7 +169,6 @@ class FlowMap(RectifiedFlow):
         self.run_by(Jump())
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
-        """u(x, t, s), (B, C, H, W), the mean velocity from time t to time s, of shape () or (B,)."""
         assert condition is None
         return self.backbone(t, x, s)
 

@@ -158,7 +158,6 @@ class TransferFlow(Flow):
         return self._toward(t, x, condition, last=bool((torch.as_tensor(s) >= 1).all()))
 
     def map(self, condition: Condition | None = None) -> MeanVelocity:
-        """u(t, x, s) under a condition."""
         return Conditioned(self, condition or {})
 
     def _toward(self, t: Tensor, x: Tensor, condition: Condition | None, last: bool) -> Tensor:

@@ -193,7 +193,6 @@ class LearnLatentDiffusion(SingleLoss):
         return self.optimizers_for(self.generator.unet.parameters())
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        """Mean loss over images at the steps selected by u in [0, 1), (B,)."""
         diffusion, eps = self.generator, batch["x_0"]
         with torch.no_grad():
             z = diffusion.first_stage_model.eval().encode(batch["x_1"]).float()  # full precision for small noise levels

@@ -29,7 +29,6 @@ class MatchScore(SingleLoss):
         self.power = power
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        """Mean loss over images at the noise levels selected by u in [0, 1), (B,)."""
         network = self.generator.network
         labels = (u * len(network.sigmas)).to(torch.int64)
         return score_loss(network, (batch["x_1"] + 1) / 2, batch["x_0"], labels, network.sigmas, self.power).mean()
