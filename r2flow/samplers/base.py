@@ -35,11 +35,7 @@ class Generated:
 
     @classmethod
     def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:
-        """Scans that took the same number of evaluations.
-
-        Args:
-            converged: Whether each scan was finite at every step, (B,) bool; None: whether x is finite.
-        """
+        """Scans after as many evaluations each; `converged`, (B,) bool, is whether x is finite by default."""
         counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
         x = wide(x)
         return cls(x, counted, finite(x) if converged is None else converged)

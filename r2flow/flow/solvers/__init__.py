@@ -21,8 +21,6 @@ __all__ = [
     "named_grid", "solve", "usual_grid",
 ]  # fmt: skip
 
-Method = FixedStep | EmbeddedMethod | ExponentialMethod | TorchDiffEqMethod
-
 SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
     "solver",
     euler=FixedStep(euler, order=1, evaluations=1),
@@ -112,7 +110,7 @@ def solve(
     return replace(solution, evaluations=solution.evaluations + extra, global_error=error)
 
 
-def method_of(name: str) -> Method:
+def method_of(name: str) -> FixedStep | EmbeddedMethod | ExponentialMethod | TorchDiffEqMethod:
     return TorchDiffEqMethod(name.removeprefix(TORCHDIFFEQ)) if name.startswith(TORCHDIFFEQ) else SOLVERS[name]
 
 
