@@ -61,6 +61,3 @@ def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> Simulated
     """Scan a scene with a sensor at its default height above the scene's origin."""
     rays = Rays(lasers_of(sensor), sensor.columns, sensor.height)
     return SimulatedScan(*report(sensor, rays, cast(scene, rays, rng), scene.rig, rng))
-
-
-__all__ = ["REVISION", "Scene", "SimulatedScan", "draw_scene", "observe", "simulate"]

@@ -12,7 +12,8 @@ import numpy as np
 from r2flow.errors import InputError, check, warn_odd
 from r2flow.files import atomic_write, reading
 from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
-from r2flow.lidar.scan_files.points import FARTHEST, NoPointsError, Points, check_columns, check_xyz, column_points
+from r2flow.lidar.scan_files.points import FARTHEST, Points, check_columns, check_xyz, column_points
+from r2flow.lidar.scan_files.points import NoPointsError as NoPointsError
 from r2flow.lidar.scan_files.tables import (
     read_array,
     read_arrow,
@@ -23,17 +24,6 @@ from r2flow.lidar.scan_files.tables import (
     read_text,
     usual_names,
 )
-
-__all__ = [
-    "NoPointsError",
-    "Points",
-    "check_columns",
-    "points_beside",
-    "read_numbers",
-    "read_points",
-    "read_range_image",
-    "write_points",
-]
 
 _ROWS = (".pcd.bin", ".bin")  # rows of float32; the one that ends with the other first
 _READERS = {
