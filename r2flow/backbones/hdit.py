@@ -129,18 +129,18 @@ class HDiT(Backbone):
             h = h + self.spatial_pe.embedding.to(h.dtype)
         elif self.spatial_pe is not None:
             h = h + self.spatial_pe(self.features).to(h.dtype)
-        skips = []
+        skips, tables = [], [self.get_buffer(f"table_{level}") for level in range(self.levels)]
         for level in range(self.levels - 1):
             for block in _level(self.down_levels, level):
-                h = block(h, condition, self._table(level))
+                h = block(h, condition, tables[level])
             skips.append(h)
             h = self.down_levels[f"merge_{level}"](h)
         for block in self._blocks(self.levels - 1):
-            h = block(h, condition, self._table(self.levels - 1))
+            h = block(h, condition, tables[-1])
         for level in reversed(range(self.levels - 1)):
             h = self.up_levels[f"expand_{level}"](h, skips.pop())
             for block in _level(self.up_levels, level):
-                h = block(h, condition, self._table(level))
+                h = block(h, condition, tables[level])
         v = unshuffle(uncast(self.detokenizer, h), self.patch).permute(0, 3, 1, 2)
         return v if self.detail is None else v + self.detail(x, h, condition)
 
@@ -166,9 +166,6 @@ class HDiT(Backbone):
                 learned = learned.index_select(dim, numbers[::step].to(learned.device) // step)
             part.spatial_pe.embedding = nn.Parameter(learned, requires_grad=False)
         return part
-
-    def _table(self, level: int) -> Tensor:
-        return self.get_buffer(f"table_{level}")
 
     def _blocks(self, level: int) -> list["Block"]:
         if level == self.levels - 1:

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.layers import ExactBuffers, at_least_float32, wrapped
+from r2flow.backbones.layers import ExactBuffers, at_least_float32, uncast, wrapped
 from r2flow.processes import averaged
 
 DROPPED = -1.0  # value of a dropped ray in model space
@@ -33,11 +33,9 @@ class Equalised(nn.Module):
             nn.init.zeros_(bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        if not self.exact:
-            return self.module(x * self.scale) * self.gain
-        kind = x.device.type if x.device.type != "meta" else "cpu"
-        with torch.autocast(kind, enabled=False):
-            return self.module(at_least_float32(x) * self.scale) * self.gain
+        if self.exact:
+            return uncast(self.module, at_least_float32(x) * self.scale) * self.gain
+        return self.module(x * self.scale) * self.gain
 
 
 class BiasedLeakyReLU(nn.Module):
