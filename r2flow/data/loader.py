@@ -45,9 +45,7 @@ class FlowDataset(Dataset[Item]):
         sensors: Sequence[Sensor] | None = None,
     ) -> None:
         self.source, self.seed, self.purpose = source, seed, purpose
-        self.encodings = [
-            encoding if s == encoding.sensor else encoding.through(s) for s in sensors or [encoding.sensor]
-        ]
+        self.encodings = [encoding.through(sensor) for sensor in sensors or [encoding.sensor]]
         self.augment, self.noise_shape = augment, tuple(noise_shape or encoding.shape)
         self.further = further
 
