@@ -42,13 +42,12 @@ class Stage(L.LightningModule):
         batch_size: Images per step, to convert images into steps.
 
     Attributes:
-        learns: Class of the generators that it can train.
         config: The run's config, which its checkpoints store.
         gradient_clip_val: Gradient clipping of the run, for a stage with manual optimisation.
         further: Makes additional batch entries of x_1, (C, H, W), its sensor and draws of each image, in the loader.
     """
 
-    learns: ClassVar[type[Generator]] = Generator
+    learns: ClassVar[type[Generator]] = Generator  # class of the generators that it can train
     generator_name: ClassVar[str | None] = None  # generator to train; None: the parent's, or a rectified flow
     needs_pairs: ClassVar[bool] = False  # whether it trains on pairs of x_0 and x_1
     needs_parent: ClassVar[bool] = False  # whether it must start from another run, even if it trains on scans
