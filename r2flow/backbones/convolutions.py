@@ -119,8 +119,6 @@ def time_embedding(channels: int, out_channels: int, bias: bool = True) -> nn.Se
 
 @dataclass(frozen=True)
 class BlockOptions:
-    """Common options of the residual blocks of a `UNet`."""
-
     condition_channels: int
     ring: bool
     dropout: float

@@ -220,8 +220,6 @@ class Neighbourhood(NamedTuple):
 
 
 class BlockOptions(NamedTuple):
-    """Common options of the blocks of a level."""
-
     channels: int
     heads: int
     condition_channels: int

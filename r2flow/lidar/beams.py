@@ -33,8 +33,6 @@ class NoBeamsError(InputError):
 
 @dataclass(frozen=True)
 class Beams:
-    """The beams of a sensor."""
-
     elevations: np.ndarray  # median elevation of each beam in degrees, from the top, (H,)
     of_point: list[np.ndarray]  # row of each point of each scan; -1 for a ray without return
     order: str = UNORDERED  # storage order of the scans: `RINGS`, `FIRINGS`, ...

@@ -25,8 +25,6 @@ WHOLE = 0.9  # minimum share of the rays of a turn that a file with all lost ray
 
 @dataclass(frozen=True)
 class Partial:
-    """A partially measured image."""
-
     image: np.ndarray  # range in metres and, if measured, reflectance, (2 or 1, H, W) float32; 0 without a return
     state: np.ndarray  # `Ray` of each ray, (H, W) uint8
     xyz: np.ndarray | None = None  # the measured points of the returns in metres, (3, H, W) float32, or None

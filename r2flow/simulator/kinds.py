@@ -14,8 +14,6 @@ Span = tuple[float, float]
 
 
 class Kind(NamedTuple):
-    """A kind of place."""
-
     share: float  # share of scenes
     half_width: Span  # half of the carriageway in metres, from and to
     pavement: Span  # width of the pavement in metres, from and to

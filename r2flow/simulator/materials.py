@@ -9,8 +9,6 @@ import numpy as np
 
 
 class Material(NamedTuple):
-    """Properties of a material."""
-
     name: str
     albedo: float  # mean reflectance at perpendicular incidence
     spread: float  # standard deviation of albedo between objects

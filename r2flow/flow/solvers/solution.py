@@ -106,7 +106,6 @@ class Evaluations:
         self._velocity = selected(self._whole, torch.from_numpy(scenes))
 
     def solution(self, x: Tensor, knots: Tensor | None = None) -> Solution:
-        """The solution with these final states."""
         counts = self.counts, self.accepted, self.rejected, self.stiff, self.converged
         evaluations, accepted, rejected, stiff, converged = (torch.from_numpy(count) for count in counts)
         return Solution(x, evaluations, accepted, rejected, stiff, converged, knots=knots)
