@@ -40,17 +40,13 @@ class Estimate(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """What was `seen` in scans that do not fit a sensor; hopeless: they have no beams.
+    """Why scans do not fit a sensor."""
 
-    `name` is the nearest built-in sensor within `OFF`; sure: it is within `BEATEN`; finer: it is the sensor with rows
-    between its beams (`Sensor.resized`), a sensor of one's own.
-    """
-
-    seen: str
-    name: str | None
-    hopeless: bool = False
-    sure: bool = False
-    finer: bool = False
+    seen: str  # what was seen in them
+    name: str | None  # the nearest built-in sensor within `OFF`
+    hopeless: bool = False  # whether they have no beams
+    sure: bool = False  # whether the nearest sensor is within `BEATEN`
+    finer: bool = False  # whether it is the sensor with rows between its beams (`Sensor.resized`), one of one's own
 
 
 def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:

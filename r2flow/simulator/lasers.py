@@ -151,15 +151,13 @@ class Silhouette(NamedTuple):
 
     It is about a metre away, nearer than any valid return, so that scans show only its shadow. Lasers next to the axis
     see it displaced: neighbouring rings are occluded alternately to the left and right.
-
-    `away` is the distance in metres from the axis to the object, which determines the shift of neighbouring rings.
     """
 
     azimuth: float
     elevation: float
     half_width: float
     half_height: float
-    away: float
+    away: float  # distance in metres from the axis, which determines the shift of neighbouring rings
     grounded: bool = False
     power: int = 2
 
