@@ -75,6 +75,7 @@ interpolate scans scans -c run -o out # scan
 show file.txt -o out
 show scans -o out.png
 show scans -o out --projection unfolding
+show street -o out # sample it first: r2flow sample street --out scans
 show run -o out # a run without samples
 show nope:scans -o out
 show simulated:a -o out

@@ -151,6 +151,7 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
         return SourceOptions(FOLDER, str(path.parent)), path
     if not path.exists():
         hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
+        check(text not in MODELS, f"{text} is a model; sample it first: r2flow sample {text} --out scans.")
         problem = "is a broken link" if path.is_symlink() else "does not exist"
         raise InputError(
             f"{path} {problem}. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run.{hint}"
