@@ -11,6 +11,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -150,8 +151,8 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
     if path.is_file():
         return SourceOptions(FOLDER, str(path.parent)), path
     if not path.exists():
-        hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
         check(text not in MODELS, f"{text} is a model; sample it first: r2flow sample {text} --out scans.")
+        hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
         problem = "is a broken link" if path.is_symlink() else "does not exist"
         raise InputError(
             f"{path} {problem}. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run.{hint}"
@@ -241,8 +242,8 @@ def _reading_of(model: Any) -> Reading:
 def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale: float | None = None) -> Tensor:
     """`r2flow.read`."""
     check(isinstance(path, str | Path), f"give the path of a scan; found {type(path)}.")
-    right = reflectance_scale is None or 0 < reflectance_scale < math.inf
-    check(right, f"reflectance_scale must be a positive number, found {reflectance_scale}.")
+    right = reflectance_scale is None or (isinstance(reflectance_scale, Real) and 0 < reflectance_scale < math.inf)
+    check(right, f"reflectance_scale must be a positive number, found {reflectance_scale!r}.")
     options, file = parse(str(path))
     check(options.name != FOLDER or file, f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
     reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale, estimate_scale=True)

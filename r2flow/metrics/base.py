@@ -10,7 +10,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from r2flow.errors import InputError
-from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.metrics.scans import MASK, Scans
 from r2flow.processes import place
 
@@ -66,11 +66,11 @@ class ScanMetric(Metric):
     keeping: ClassVar[bool] = False  # whether rows are stored in memory, float32
     fewest: ClassVar[int] = 2  # minimum number of scans per set for `distance`
 
-    def __init__(self, *, sensor: Sensor | None = None, name: str | None = None, **options: Any) -> None:
+    def __init__(self, *, sensor: Sensor | str | None = None, name: str | None = None, **options: Any) -> None:
         # Not cached: torchmetrics would return the value from before `merge_state`.
         super().__init__(**{"compute_with_cache": False, **options})
         self.name = name or type(self).name
-        self.sensor = sensor
+        self.sensor = None if sensor is None else named_sensor(sensor)
         for side in SIDES:
             self.add_state(f"{side}_scans", torch.tensor(0), dist_reduce_fx="sum")
             self.add_state(f"{side}_left_out", torch.tensor(0), dist_reduce_fx="sum")
@@ -117,7 +117,7 @@ class ScanMetric(Metric):
         if not isinstance(scans, Scans):
             raise InputError(
                 f"'{self.name}' takes metrics.scans.Scans(images, sensor), or a tensor of images once it has their "
-                f"sensor: METRICS['{self.name}'](sensor=SENSORS['hdl64e']); found {type(scans).__name__}"
+                f"sensor: METRICS['{self.name}'](sensor='hdl64e'); found {type(scans).__name__}"
                 f"{'' if self.sensor else ' without a sensor'}."
             )
         if self.needs_reflectance and not scans.has_reflectance:

@@ -1,13 +1,13 @@
 """Simulated LiDAR scans with labels: procedural street scenes, ray-cast.
 
-`simulate(SENSORS["hdl64e"], seed=1, index=0).image` is range in metres and reflectance, (2, 64, 1024).
+`simulate("hdl64e", seed=1, index=0).image` is range in metres and reflectance, (2, 64, 1024).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.noise import generator
 from r2flow.simulator import roadside
 from r2flow.simulator.draws import ScalarDraws
@@ -28,13 +28,13 @@ class SimulatedScan:
     labels: np.ndarray  # SemanticKITTI ids, (H, W), uint16; 0 where missing
 
 
-def simulate(sensor: Sensor, seed: int, index: int) -> SimulatedScan:
+def simulate(sensor: Sensor | str, seed: int, index: int) -> SimulatedScan:
     """Scan `index` of `seed`, a function of sensor, seed and index only, bit-identical on every machine.
 
     The scene is drawn before anything that depends on the sensor, so that all sensors scan the same scenes.
     """
     rng = generator(seed, "simulator", index)
-    return observe(draw_scene(rng), sensor, rng)
+    return observe(draw_scene(rng), named_sensor(sensor), rng)
 
 
 def draw_scene(rng: np.random.Generator) -> Scene:

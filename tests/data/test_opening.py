@@ -156,7 +156,7 @@ class TestWhatR2FlowWrote:
             assert told in caplog.text
             assert bool(caplog.text) == bool(told)
             caplog.clear()
-        for wrong in (0, -1.0, float("inf"), float("nan")):
+        for wrong in (0, -1.0, float("inf"), float("nan"), "255"):
             with pytest.raises(InputError, match="reflectance_scale must be"):
                 r2flow.read(tmp_path / "a.ply", "vlp16", wrong)
         with pytest.raises(InputError, match="give the path of a scan"):

@@ -186,6 +186,7 @@ def test_what_is_no_batch_of_scans_is_refused_in_one_line(build, sets):
     assert metric.given("real") == 0
     with pytest.raises(InputError, match=r"a tensor of images once it has their sensor: .*; found ndarray\.$"):
         METRICS["jsd"](sensor=SMALL).update(images().numpy(), real=True)
+    assert METRICS["jsd"](sensor="hdl64e").sensor.shape == (64, 1024)
 
 
 # What torchmetrics promises of every metric

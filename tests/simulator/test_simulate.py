@@ -70,7 +70,7 @@ def test_other_instructions_and_threads_draw_the_same_scans():
 
 def test_the_scene_is_drawn_before_anything_of_the_sensor():
     # An image of a quarter of the columns shows the same large things at the same places.
-    fine, coarse = simulate(HDL64E, 5, 2), simulate(HDL64E.resized(64, 256), 5, 2)
+    fine, coarse = simulate("hdl64e", 5, 2), simulate(HDL64E.resized(64, 256), 5, 2)
     for row in range(20, 44, 4):
         block = fine.image[0, row].reshape(256, 4)
         both = (block > 0).all(1) & (coarse.image[0, row] > 0)
