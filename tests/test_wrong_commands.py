@@ -56,6 +56,7 @@ export run --to safetensors --what network # --what network is for
 export run --what network --steps 4 # takes no sampler: leave sampler, steps
 export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx
 export run --sampler dopri5 # give --sampler adams3 --steps 16
+report backbones --only hdit,adm_unet --size 31x64 --repeats 0 # height 31 cannot be used
 report backbones --only nope
 report backbones --size ²x²
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels

@@ -135,6 +135,7 @@ def backbones(
     names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, repeats, where)
     load = os.getloadavg()[0]
+    check(any("error" not in row for row in measured), measured[0].get("error", ""))
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
     print_costs(measured, chosen, where)
     if repeats and load > cores():
