@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from r2flow.config import flatten, key_of, override
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
 
 T = TypeVar("T")
@@ -47,6 +47,7 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
     Raises:
         InputError: an unknown key or choice.
     """
+    check(not isinstance(overrides, str), f"overrides are a list, as {[overrides]}; found a text.")
     search = ",".join(f"file://{Path(folder).resolve()}" for folder in folders)
     overrides = [*as_hydra_takes(overrides), f"hydra.searchpath=[{search}]"]
     try:
