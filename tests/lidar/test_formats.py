@@ -41,8 +41,9 @@ NAMES = ("time", "z", "x", "y", "ring", "intensity")
         {"delimiter": ",", "header": '"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","intensity"', "comments": ""},
         {"delimiter": " ", "header": "a scan of mine\nof today", "comments": "# "},
         {"delimiter": " ", "header": "here are x y z in metres", "comments": "# "},
+        {"delimiter": " ", "header": "500", "comments": ""},
     ],
-    ids=["spaces", "commas", "tabs", "semicolons", "units", "CloudCompare", "VeloView", "comments", "a sentence"],
+    ids=["spaces", "commas", "tabs", "semicolons", "units", "CloudCompare", "VeloView", "comments", "words", "count"],
 )
 def test_columns_of_text(tmp_path: Path, ending: str, options: dict):
     path = tmp_path / f"a.{ending}"

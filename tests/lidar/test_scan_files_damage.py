@@ -276,6 +276,7 @@ WRONG = {
     "a word": ("pcd", ROW.replace(b"1 2 3", b"1 2 six")),
     "an accent": ("pcd", ROW.replace(b"1 2 3", b"\xe9 2 3")),
     "NaN alone": ("pcd", ROW.replace(b"1 2 3", b"nan 2 3")),
+    "another count of points": ("xyz", b"3\n1 2 3\n4 5 6\n"),
     "no vertex": ("ply", ply_ascii().replace(b"vertex", b"vertices")),
     "no format": ("ply", ply_ascii().replace(b"format ascii 1.0\n", b"")),
     "a list": ("ply", ply_ascii().replace(b"property float x", b"property list uchar float x")),

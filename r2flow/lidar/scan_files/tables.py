@@ -95,6 +95,8 @@ def read_text(path: Path) -> Table:
     text = path.read_text("utf-8-sig", "replace").replace('"', "")
     lines = [line.strip(" \r") for line in text.split("\n") if line.strip()]
     rows = [line for line in lines if line[0] not in "#/"]
+    if rows[:1] == [str(len(rows) - 1)]:  # the number of points
+        del rows[0]
     check(rows, "it holds no line of numbers.")
     apart = next((mark for mark in ";\t," if mark in rows[-1]), None)
 
