@@ -29,7 +29,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "sensor": loaded.sensor.name,
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],
         "encoding": loaded.config["encoding"],
-        **loaded.generator.drawing(),
+        **(loaded.generator.drawing() if loaded.generator.draws or loaded.generator.told else {}),
         "config": loaded.config,
     }
 

@@ -391,6 +391,7 @@ def test_an_autoencoder_where_scans_are_wanted_is_one_line(r2flow, shared: Path,
     path = shared / "oracle_baselines" / "lidm_ae_published.ckpt"
     assert "a VQAutoencoder draws no scans" in r2flow.refusal("sample", path, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    assert "\nsampler " not in r2flow.said("info", path)
 
 
 def test_a_latent_diffusion_starts_from_its_autoencoder_alone():
