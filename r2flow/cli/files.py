@@ -38,6 +38,7 @@ def export(
     The file has a fixed number of steps; r2flow runs it and compares it with the flow. --to safetensors writes the
     averaged weights, config and sampler of any generator, reproducibly.
     """
+    from r2flow.generators import RectifiedFlow
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 
@@ -55,8 +56,8 @@ def export(
         save_checkpoint(loaded, out, half)
         print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {sha256(out.read_bytes()).hexdigest()}")
         return
-    writing.FORMATS[to]
-    sampler = loaded.generator.choose(**how.given)
+    flow = isinstance(loaded.generator, RectifiedFlow)  # others are refused whatever their sampler
+    sampler = loaded.generator.choose(**how.given) if flow else None
     written = writing.export(loaded, out, sampler, what == "network")
     batch = "any batch" if written.any_batch else "batch of one scan (torch could not export a variable batch)"
     print(

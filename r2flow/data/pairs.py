@@ -20,7 +20,7 @@ from r2flow.data.loader import FlowDataset, Item, Permutations
 from r2flow.data.options import PairOptions
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
-from r2flow.generators import Generated, Generator, as_flow
+from r2flow.generators import Flow, Generated, Generator, as_flow
 from r2flow.generators.base import autocast
 from r2flow.models import name_of
 from r2flow.processes import place
@@ -103,17 +103,16 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> Mad
     """
     if generator.noise_shape != store.noise_shape:
         raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")
-    sampler = store.sampler
-    sampler.check(generator)
-    if not sampler.paired:
-        raise InputError(f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
+    flow, sampler = as_flow(generator, "a reflow pair"), store.sampler
+    sampler.check(flow)
+    check(sampler.paired, f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
     made, start = Made(), time.monotonic()
 
     def make_shard(shard: int) -> None:
         store.mend([shard])
         batches = []
         for batch in store.batches_of(shard):
-            batches.append(solve_batch(store, generator, batch))
+            batches.append(solve_batch(store, flow, batch))
             made.pairs += store.options.batch_size
             made.evaluations += int(batches[-1]["evaluations"].sum())
             made.unusable += int((~batches[-1]["usable"]).sum())
@@ -143,7 +142,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> Mad
     return made
 
 
-def solve_batch(store: PairStore, generator: Generator, batch: int) -> dict[str, np.ndarray]:
+def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.ndarray]:
     """The pairs first + [b B, (b + 1) B) of batch b: x_1, evaluations, usable and, with knots, the inner states.
 
     States are float16, (B, C, H, W) and (B, K, C, H, W); pairs whose states overflow float16 are not usable.
@@ -154,7 +153,7 @@ def solve_batch(store: PairStore, generator: Generator, batch: int) -> dict[str,
     end: Generated | Solution
     if store.knots:
         with autocast(generator.device, options.precision):
-            end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=sampler, knots=store.knots)
+            end = generator.solve(x_0, sampler=sampler, knots=store.knots)
         assert end.knots is not None
         states["knots"] = end.knots
     else:

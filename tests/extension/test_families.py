@@ -118,8 +118,8 @@ CANNOT = {
     ),
     "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow from noise; a ToyGenerator"),
     "report solvers": (["RUN", "-o", "OUT"], "report solvers needs the velocity of a flow"),
-    "export": (["RUN", "-o", "OUT.onnx"], "only rectified flows and flow maps can be exported"),
-    "pairs": (["RUN"], "needs a generator with a velocity"),
+    "export": (["RUN", "-o", "OUT.onnx", "--steps", "4"], "only rectified flows and flow maps can be exported"),
+    "pairs": (["RUN"], "a reflow pair needs the velocity of a flow from noise; a ToyGenerator"),
     "sample": (["RUN", "--steps", "4", "-o", "OUT"], "has no option 'steps'"),
 }  # fmt: skip
 
