@@ -64,7 +64,7 @@ class Tasks:
             known[-1] = 0
         return {
             "x_1": part, IMAGE: part * known, KNOWN: known, "elevations": elevations,
-            "steps": steps, "numbered": torch.tensor(unnumbered >= self.unnumbered),
+            "steps": steps, "numbered": torch.tensor(bool(unnumbered >= self.unnumbered)),
         }  # fmt: skip
 
 
