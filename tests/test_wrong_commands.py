@@ -38,7 +38,6 @@ sample run -o out --sampler torchdiffeq:nope
 sample run -o out --sampler euler --tolerance 0.1 # tolerance
 sample run -o out --sampler dopri5 --steps 50 # steps
 sample run -o out --device cuda:99
-sample run -o out --format las
 sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column
 sample run -o out --rows 5-3
@@ -56,9 +55,8 @@ export run --to safetensors --what network # --what network is for
 export run --what network --steps 4 # takes no sampler: leave sampler, steps
 export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx
 export run --sampler dopri5 # give --sampler adams3 --steps 16
-report backbones --only hdit,adm_unet --size 31x64 --repeats 0 # height 31 cannot be used
-report backbones --only nope
 report backbones --size ²x²
+report backbones --only hdit,adm_unet --size 31x64 --repeats 0 # height 31 cannot be used
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels
 complete scans/000000.bin -c run -o out --mask nope # no mask
 complete scans/000000.bin -c run -o out --to os1_64
@@ -76,10 +74,9 @@ interpolate scans scans -c run -o out # scan
 show file.txt -o out
 show scans -o out.png
 show scans -o out --projection unfolding
-show street -o out # sample it first: r2flow sample street --out scans
 show run -o out # a run without samples
+show street -o out # sample it first: r2flow sample street --out scans
 show nope:scans -o out
-show simulated:a -o out
 show kitti_360:nowhere -o out
 sensor bad.bin
 sensor image.npy

@@ -28,7 +28,7 @@ from r2flow.cli.options import (
     rows_and_columns,
     separate,
 )
-from r2flow.errors import InputError, check
+from r2flow.errors import check
 
 if TYPE_CHECKING:
     from r2flow.reports.pages import Page
@@ -98,8 +98,7 @@ def solvers(
     names = [] if problems == "none" else problems.split(",") if problems else list(PROBLEMS)
     most = numbers("budgets", budgets)
     chosen, subjects, flow = measuring.configurations(methods, most), measuring.problem_subjects(names), None
-    if not chosen or not (names or model):
-        raise InputError("nothing to measure: give a model, more --budgets, or leave --problems none out.")
+    check(chosen and (names or model), "nothing to measure: give a model or more --budgets, or no --problems none.")
     loaded = None if model is None else load_checkpoint(model, where)
     if loaded is not None:
         as_flow(loaded.generator, "report solvers")
@@ -135,8 +134,8 @@ def backbones(
     names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, repeats, where)
     load = os.getloadavg()[0]
-    check(any("error" not in row for row in measured), measured[0].get("error", ""))
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
+    check(any("error" not in row for row in measured), measured[0].get("error", ""))
     print_costs(measured, chosen, where)
     if repeats and load > cores():
         print(f"The machine was busy (load {load:.1f} on {cores()} cores): latencies may be too high.")
@@ -268,8 +267,7 @@ def compare(
     for title, (cells, headings) in tables(groups).items():
         print_table(cells, headings, title)
         print()
-    compared_keys = ("images", "stage", "loss", "data")
-    differ = {key for key in compared_keys if len({run.values[key] for run in compared} - {None}) > 1}
+    differ = {k for k in ("images", "stage", "loss", "data") if len({run.values[k] for run in compared} - {None}) > 1}
     if "images" in differ:
         print("the runs have seen different numbers of images: compare their curves at equal steps")
     if differ - {"images"}:

@@ -35,8 +35,7 @@ def show(
     from r2flow.reports.pictures import save_figure, scan_figure
     from r2flow.reports.view.panels import scan_panels
 
-    if out.suffix.lower() in (".png", ".pdf", ".npy"):
-        raise InputError(f"--out must be a folder, for a file per scan, found {out}.")
+    check(out.suffix.lower() not in (".png", ".pdf", ".npy"), f"--out is a folder, for a file per scan; found {out}.")
     names: list[str] = []
     readings = ((spec, how.reading([spec], estimate_scale=True)) for spec in scans)
     panels = (panel for spec, reading in readings for panel in scan_panels(spec, reading, most, labelled=False))

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
@@ -59,8 +59,7 @@ class SourceOptions:
     @property
     def folder(self) -> str:
         """`root` as a string: YAML reads a folder name of digits as a number."""
-        if self.root is None:
-            raise InputError(f"data={self.name} needs the folder of its scans: data.root=FOLDER.")
+        check(self.root is not None, f"data={self.name} needs the folder of its scans: data.root=FOLDER.")
         return str(self.root)
 
 

@@ -18,7 +18,7 @@ from torch.utils.data import Dataset
 from r2flow import noise
 from r2flow.data.loader import FlowDataset, Item, Permutations
 from r2flow.data.options import PairOptions
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.solvers import Solution
 from r2flow.generators import Flow, Generated, Generator, as_flow
 from r2flow.generators.base import autocast

@@ -76,9 +76,8 @@ def _check_set(
 ) -> None:
     """Refuse options that do not name a single set of scans or, with `split`, lack the split of a standard data set."""
     check_options(what, kind, options)
-    name = options.get("name")
-    if name is None or name in (MIXED, PAIRS):
-        raise InputError(f"{what} needs the name of a data set, found {name!r}.")
+    name: Any = options.get("name")
+    check(name not in (None, MIXED, PAIRS), f"{what} needs the name of a data set, found {name!r}.")
     splits = ", ".join(SOURCES[name].splits)
     if split and splits and "split" not in options:
         raise InputError(f"{what}: {name} has a standard split: give split, one of {splits}, or null for all.")

@@ -106,13 +106,6 @@ def test_one_and_one_point_nought_are_one_tolerance(tmp_path: Path):
     assert one.described == other.described
 
 
-def test_how_pairs_are_drawn_is_for_their_generator_to_say(tmp_path: Path):
-    store = store_in(tmp_path / "pairs", sampler={"name": "direct"}, num=8)
-    with pytest.raises(InputError, match="direct"):  # which is of GANs
-        make_pairs(store, grow)
-    assert not store.folder.exists()
-
-
 def test_a_distilled_flow_draws_pairs_by_its_own_steps_alone(tmp_path: Path):
     flow = Field(lambda t, x: x, SHAPE)
     flow.run_by(build_sampler("euler", steps=2, grid="power:3"), fixed=True)
