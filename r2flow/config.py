@@ -157,11 +157,12 @@ def override(key: str, value: Any) -> str:
         return f"{key}=[{','.join(override('', item)[1:] for item in value)}]"
     if value is None or isinstance(value, bool):
         return f"{key}={json.dumps(value)}"
-    if isinstance(value, str) and not value.replace("_", "").replace("-", "").isalnum():
+    if isinstance(value, str) and not re.fullmatch(r"(?!(?i:null|true|false|inf|nan)$)[a-zA-Z][\w-]*", value, re.A):
         value = "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value) + "'"
     return f"{key}={value}"
 
 
 def as_override(key: str, path: str | Path) -> str:
-    """KEY=PATH quoted for a shell and for Hydra's grammar, in which a space or = needs quotes."""
-    return shlex.quote(f"{key}={path}" if re.fullmatch(r"[\w./~-]+", str(path)) else override(key, str(path)))
+    """KEY=PATH quoted for a shell and for Hydra's grammar."""
+    plain = re.fullmatch(r"[a-zA-Z/][\w./-]*/[\w./-]*", str(path), re.A)
+    return shlex.quote(f"{key}={path}" if plain else override(key, str(path)))

@@ -106,13 +106,19 @@ def test_the_groups_of_conf_are_groups_of_the_default_config(config):
 
 @pytest.mark.parametrize(
     "path",
-    ["runs/sweep/seed=1-5b990e", "~/it's", 'a "b" c', "a\\b=c", "über,1", "a{b}[c]", "${x}", "a b\\"],
+    ["runs/sweep/seed=1-5b990e", "~/it's", 'a "b" c', "a\\b=c", "ü,1", "a{b}[c]", "${x}", "a b\\", "ü", "1_2", "null"],
 )
 def test_an_override_that_is_printed_is_read_back(path: str):
     (text,) = shlex.split(as_override("stage.init", path))
     parsed = OverridesParser.create().parse_override(text)
     value = parsed.value()
     assert (parsed.key_or_group, getattr(value, "text", value)) == ("stage.init", path)
+
+
+def test_a_path_needs_no_quotes_unless_it_has_brackets_or_quotes():
+    for path in ("~/scans", "/home/josé/März", "2011_09_26", "a&b #1"):
+        assert compose(["data=folder", f"data.root={path}"])["data"]["root"] == path
+    assert compose(["trainer.max_steps=320_000"])["trainer"]["max_steps"] == 320_000
 
 
 @pytest.mark.parametrize("experiment", ["lidm_autoencoder", "lidargen", "dusty2"])

@@ -157,6 +157,8 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str
 def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
     """Suggested commands after sampling a run to `out`: training on real scans, the next link, or evaluation."""
     plugins = "".join(f" --plugin {shlex.quote(str(name))}" for name in config.get("plugins") or ())
+    paths = run, out.parent / "more", out / "000000.ply", out.parent / "views"
+    quoted, more, first, views = (shlex.quote(str(path)) for path in paths)
     stage = config["stage"]
     experiment = {"rectify": None if stage.get("init") else "reflow", "reflow": "distill"}.get(stage["name"])
     if config["data"]["name"] == "simulated":
@@ -164,9 +166,9 @@ def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
     elif experiment:
         then = f"train experiment={experiment} {as_override('stage.init', run)}"
     else:
-        then = f"evaluate REAL {shlex.quote(str(run))}{plugins}"
+        then = f"evaluate REAL {quoted}{plugins}"
     return f"""
 next
-  r2flow sample {run} --num 16{plugins} --seed 1 --out {out.parent / "more"}
-  r2flow show {out / "000000.ply"} --out {out.parent / "views"}
+  r2flow sample {quoted} --num 16{plugins} --seed 1 --out {more}
+  r2flow show {first} --out {views}
   r2flow {then}"""

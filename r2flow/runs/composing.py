@@ -160,6 +160,8 @@ def choices(group: str) -> list[str]:
 
 
 CHOICE = str | dict | Sweep  # valid values of a config group
+_TEXT = r"[^][{}(),='\"]*"
+ODD = re.compile(rf"([\w.@/+]+)=(?!\d{{1,3}}(?:_\d{{3}})+$)({_TEXT}(?:[^ -}}]|[&#]|\d_\d){_TEXT})")  # ~/a, ü, 1_2
 MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~KEY may delete from
 
 
@@ -173,12 +175,14 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     converted: list[str] = []
     parser = OverridesParser.create()
     for text in overrides:
+        if odd := ODD.fullmatch(text):  # text that Hydra refuses or takes for a number
+            text = override(*odd.groups())
         try:
             parsed = parser.parse_override(text)
         except HydraException:
             raise InputError(
-                f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around spaces and "
-                "=, as 'KEY=\"a value\"'."
+                f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around = and "
+                "brackets, as 'KEY=\"a value\"'."
             ) from None
         key, value = parsed.key_or_group, parsed.value()
         names = value if isinstance(value, list) else [value]
