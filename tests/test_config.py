@@ -26,18 +26,10 @@ def config() -> dict[str, Any]:
     return compose()
 
 
-@pytest.mark.parametrize(
-    ("override", "key"),
-    [
-        ("data.root=x", "data.root"),
-        ("+data.augment.flip=true", "data.augment.flip"),
-        ("~callbacks.ema", "callbacks.ema"),
-        ("sensor@_global_.sensor=vlp16", "sensor"),
-        ("hydra/launcher=slurm", "hydra.launcher"),
-    ],
-)
-def test_the_key_of_an_override(override: str, key: str):
-    assert key_of(override) == key
+def test_the_key_of_an_override():
+    overrides = "data.root=x +data.augment.flip=true ~callbacks.ema sensor@_global_.sensor=vlp16 hydra/launcher=slurm"
+    keys = ["data.root", "data.augment.flip", "callbacks.ema", "sensor", "hydra.launcher"]
+    assert list(map(key_of, overrides.split())) == keys
 
 
 def test_every_rule_is_of_a_key_that_exists(config):

@@ -62,8 +62,7 @@ def write_samples(
     endings = _chosen(checkpoint, formats)
     sampler.check(generator)
     how: dict[str, Any] = {"region": region, "precision": precision}
-    plain = how | {"region": region and asdict(region)}
-    part = {key: value for key, value in plain.items() if value not in (None, "32-true")}
+    part = {k: v for k, v in (how | {"region": region and asdict(region)}).items() if v not in (None, "32-true")}
     store = FileStore(out, "samples", recipe_of(checkpoint, seed, sampler, **part), endings)
     stale = _stale(store, replace)
     shown: list[np.ndarray] = []
@@ -149,8 +148,7 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str
     for index, image in track(list(enumerate(images)), "drawing", "pages", least=3):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     save_figure(contact_sheet(images[:8], rays), out / "samples.png")
-    fitting = images[: most_images(rays.shape)]
-    panels = [Panel(f"sample {number}", image[None], rays) for number, image in enumerate(fitting)]
+    panels = [Panel(f"sample {i}", image[None], rays) for i, image in enumerate(images[: most_images(rays.shape)])]
     write_page(out / "samples.html", panels, title)
 
 

@@ -126,9 +126,7 @@ def add_choices(group: str) -> None:
             node = {**options_of(import_module(module).build_sensor), "name": name}
         else:
             node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
-            if group == "stage":
-                node = {"init": None, **node}
-            node = {"name": name, **node}
+            node = {"name": name, **({"init": None} if group == "stage" else {}), **node}
         ConfigStore.instance().store(name, node, group=group)
 
 
@@ -159,9 +157,7 @@ def choices(group: str) -> list[str]:
     return sorted(files | {name.removesuffix(".yaml") for name in stored})
 
 
-CHOICE = str | dict | Sweep  # valid values of a config group
-_TEXT = r"[^][{}(),='\"]*"
-ODD = re.compile(rf"([\w.@/+]+)=(?!\d{{1,3}}(?:_\d{{3}})+$)({_TEXT}(?:[^ -}}]|[&#]|\d_\d){_TEXT})")  # ~/a, ü, 1_2
+ODD = re.compile(r"([\w.@/+]+)=(?!\d{1,3}(?:_\d{3})+$)(?=.*(?:[^ -}]|[&#]|\d_\d))([^][{}(),='\"]*)")  # ~/a, ü, 1_2
 MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~KEY may delete from
 
 
@@ -186,7 +182,7 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
             ) from None
         key, value = parsed.key_or_group, parsed.value()
         names = value if isinstance(value, list) else [value]
-        empty = parsed.is_delete() or "" in names or not all(isinstance(name, CHOICE) for name in names)
+        empty = parsed.is_delete() or "" in names or not all(isinstance(name, str | dict | Sweep) for name in names)
         if not key:
             problem = " names no key: give KEY=VALUE"
         elif key == "hydra":
