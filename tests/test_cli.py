@@ -18,7 +18,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.export import Difference
 from r2flow.samplers import build_sampler
-from tests.conftest import write_run, write_scan
+from tests.conftest import CONFIG, tiny_options, write_checkpoint, write_run, write_scan
 from tests.test_sampling import network, scans
 
 
@@ -74,12 +74,13 @@ def test_export_writes_the_averaged_weights(r2flow, saved, tmp_path):
     assert r2flow("export", out, "--to", "safetensors", "--out", out)[0] == 2
 
 
-def test_the_network_and_the_sampler_are_not_written_to_one_file(r2flow, saved, tmp_path, monkeypatch):
+def test_the_network_and_the_sampler_are_not_written_to_one_file(r2flow, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    write_checkpoint(tmp_path / "it.ckpt", {**CONFIG, "backbone": tiny_options("local")})
     for options in (["--what", "network"], ["--steps", 1]):
-        code, _, error = r2flow("export", saved[0], "--to", "pt2", *options)
+        code, _, error = r2flow("export", "it.ckpt", "--to", "pt2", *options)
         assert (code, "does not draw" in error) == (0, False)
-    assert {path.name for path in tmp_path.glob("*.pt2")} == {f"{saved[0].stem}{end}.pt2" for end in ("", "-network")}
+    assert {path.name for path in tmp_path.glob("*.pt2")} == {"it.pt2", "it-network.pt2"}
 
 
 def test_an_export_that_draws_other_scans_is_warned_of(r2flow, saved, tmp_path, monkeypatch):

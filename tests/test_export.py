@@ -99,7 +99,7 @@ def test_a_velocity_of_ones_own_is_not_exported_as_the_network(network, words, t
 
 
 def test_an_export_leaves_the_model_as_it_was_and_takes_a_samplers_name(tmp_path):
-    checkpoint = flow("efficient_unet")
+    checkpoint = flow("hdit")
     checkpoint.generator.train()
     assert export(checkpoint, tmp_path / "flow.pt2", "euler:steps=1").notes["evaluations"] == 1
     assert checkpoint.generator.backbone.training
