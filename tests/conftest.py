@@ -13,6 +13,7 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from r2flow import cli, errors
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
@@ -24,6 +25,7 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.model.checkpoint import Checkpoint
+from r2flow.reports.pictures import save_figure
 from r2flow.stages import build_stage
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -178,6 +180,19 @@ def refusal(answer: tuple[int, str, str]) -> str:
 @pytest.fixture
 def r2flow(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
     return Command(monkeypatch, capsys)
+
+
+@pytest.fixture
+def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page's pictures in fewer pixels and without their PDFs, which test_pages.py has whole."""
+
+    def save(figure: Figure, path: Path, **about: Any) -> Path:
+        if path.suffix == ".pdf":
+            path.touch()
+            return path
+        return save_figure(figure, path, dpi=100, **about)
+
+    monkeypatch.setattr("r2flow.reports.pages.save_figure", save)
 
 
 def ground(sensor: Sensor, above: float = 0.0) -> np.ndarray:

@@ -183,6 +183,7 @@ def files(tmp_path: Path) -> list[Path]:
     return paths
 
 
+@pytest.mark.usefixtures("quick_pictures")
 def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):
     out = tmp_path / "between"
     said = r2flow.said("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8)

@@ -30,6 +30,7 @@ from tests.conftest import CONFIG, folder, images
 from tests.metrics.conftest import Summary
 from tests.test_evaluation import SENSOR
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
 QUICK = ("--metrics", "jsd,mmd", "--size", "8x64", "--workers", 0)
 
 

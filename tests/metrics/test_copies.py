@@ -89,6 +89,7 @@ def test_scans_without_a_return_have_no_neighbour(sets, tmp_path):
     assert (find_nearest({"g": sets["generated"]}, with_empty, Work())["g"].neighbours != 1).all()
 
 
+@pytest.mark.usefixtures("quick_pictures")
 def test_evaluate_has_the_copies_as_lines_and_a_picture(r2flow, sets, tmp_path):
     out = r2flow.said(
         "evaluate", tmp_path / "held", tmp_path / "generated", "--train", tmp_path / "training", "--size", "8x64",
