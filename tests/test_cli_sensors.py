@@ -68,7 +68,7 @@ def test_points_of_another_frame_are_warned_of(r2flow, tmp_path: Path):
 
 
 def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, tmp_path: Path):
-    given, out = write_scans(tmp_path / "scans", SENSORS["pandar64"], 2, 1), tmp_path / "out"
+    given, out = write_scans(tmp_path / "scans", SENSORS["pandar64"].resized(columns=384), 2, 1), tmp_path / "out"
     for verb in (
         ("show", given, "--format", "npy"),
         ("prepare", given, "--workers", 1),
@@ -84,7 +84,7 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
     assert read_manifest(out / "prepare")["recipe"]["reading"]["sensor"]["name"] == "pandar64"
     images = [np.load(out / f"show{forced}" / "000000.npy") for forced in ("", "--sensorhdl64e")]
     assert (images[0][0] > 0).sum() > 1.1 * (images[1][0] > 0).sum()  # hdl64e sees 92 % of the returns
-    assert r2flow("show", given, "--sensor", "pandar64", "--out", out)[::2] == (0, "")
+    assert r2flow("show", given, "--sensor", "pandar64", "--format", "npy", "--out", out)[::2] == (0, "")
     (given / "answers").mkdir()  # of `complete`, next to the scans: no scans, and the scans stay the sensor's own
     shutil.copy(out / "prepare" / "manifest.json", given / "answers")
     shutil.copy(given / "000000.bin", given / "answers")
