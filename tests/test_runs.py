@@ -26,14 +26,6 @@ def checkpoint(run: Path, step: int) -> Path:
     return path
 
 
-def test_the_same_config_goes_on_from_the_newest_whole_checkpoint(tmp_path: Path):
-    open_run(tmp_path, CONFIG)
-    older, newer = checkpoint(tmp_path, 5), checkpoint(tmp_path, 10)
-    assert open_run(tmp_path, CONFIG) == newer
-    newer.write_bytes(b"half")
-    assert open_run(tmp_path, CONFIG) == older
-
-
 def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert contradictions(CONFIG, changed(trainer={"devices": 4}, data={"root": "moved"})) == []
     assert contradictions(CONFIG, changed(seed=1)) == ["seed=0 there, 1 here"]
