@@ -182,9 +182,8 @@ def r2flow(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
     return Command(monkeypatch, capsys)
 
 
-@pytest.fixture
-def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page's pictures in fewer pixels and without their PDFs, which test_pages.py has whole."""
+def draw_quickly(patch: pytest.MonkeyPatch) -> None:
+    """Pictures in fewer pixels, and no PDFs; test_pages.py and test_pictures.py have them whole."""
 
     def save(figure: Figure, path: Path, **about: Any) -> Path:
         if path.suffix == ".pdf":
@@ -192,7 +191,13 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
             return path
         return save_figure(figure, path, dpi=100, **about)
 
-    monkeypatch.setattr("r2flow.reports.pages.save_figure", save)
+    for module in ("pages", "pictures"):
+        patch.setattr(f"r2flow.reports.{module}.save_figure", save)
+
+
+@pytest.fixture
+def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw_quickly(monkeypatch)
 
 
 def ground(sensor: Sensor, above: float = 0.0) -> np.ndarray:

@@ -2,14 +2,12 @@
 
 import contextlib
 import copy
-import io
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import torch
 from hydra.core.config_store import ConfigStore
 
 from r2flow import cli, plugins
@@ -19,7 +17,7 @@ from r2flow.generators import GENERATORS
 from r2flow.runs.composing import REGISTRIES
 from r2flow.samplers import SAMPLERS
 from r2flow.stages import STAGES
-from tests.training.conftest import Done
+from tests.training.conftest import Done, captured
 
 FAMILIES = Path(__file__).parent / "families"
 
@@ -75,21 +73,9 @@ def loaded(*families: Family) -> Iterator[None]:
 
 def r2flow(*arguments: object) -> Done:
     """`r2flow ARGUMENTS` in this process; no plug-in that it loads is there afterwards."""
-    threads, code = torch.get_num_threads(), 0
-    said, complained = io.StringIO(), io.StringIO()
-    torch.set_num_threads(1)
-    try:
-        with (
-            loaded(), pytest.MonkeyPatch.context() as patch,
-            contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained),
-        ):  # fmt: skip
-            patch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
-            cli.main()
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else 1
-    finally:
-        torch.set_num_threads(threads)
-    return Done(code, said.getvalue(), complained.getvalue())
+    with loaded(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
+        return captured(cli.main)
 
 
 def train(run: Path, family: Family, *more: str) -> Done:

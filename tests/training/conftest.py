@@ -24,7 +24,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.runs.launch import main
 from r2flow.signals import LATER
 from r2flow.training import build, compose, fit
-from tests.conftest import ROOT, refusal, success
+from tests.conftest import ROOT, draw_quickly, refusal, success
 
 HOLDING = Path(__file__).with_name("holding.py")
 COMMAND = [sys.executable, str(ROOT / "train.py")]
@@ -100,19 +100,30 @@ def tiny(scans: Path, *overrides: str) -> list[str]:
     return [*TINY, f"data.root={scans}", *overrides]
 
 
-def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
-    """`train.py ARGUMENTS` from a folder, in this process: it costs no import of torch."""
-    threads = torch.get_num_threads()
-    said, complained = io.StringIO(), io.StringIO()
+def captured(run: Callable[[], int | None]) -> Done:
+    """A command in this process, which costs no import of torch; its pictures are drawn quickly."""
+    threads, said, complained = torch.get_num_threads(), io.StringIO(), io.StringIO()
     torch.set_num_threads(1)  # as the processes of `start`, which are to end with the same bits
     try:
-        with contextlib.chdir(cwd), contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
-            code = main(arguments, COMMAND)
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained),
+        ):  # fmt: skip
+            draw_quickly(patch)
+            code = run() or 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
     finally:
         torch.set_num_threads(threads)
-    done = Done(code, said.getvalue(), complained.getvalue())
-    if check and code:
-        raise AssertionError(f"{' '.join(arguments)} ended with {code}:\n{done.stdout}\n{done.stderr}")
+    return Done(code, said.getvalue(), complained.getvalue())
+
+
+def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
+    """`train.py ARGUMENTS` from a folder, in this process."""
+    with contextlib.chdir(cwd):
+        done = captured(lambda: main(arguments, COMMAND))
+    if check and done.returncode:
+        raise AssertionError(f"{' '.join(arguments)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
     return done
 
 
