@@ -130,7 +130,7 @@ def test_mmps_takes_a_flow_map_s_velocity():
 def test_mmps_samples_the_posterior_of_a_gaussian():
     prior, case = gaussian(), Case(ROWS)
     y = case.measure(prior.sample(3, draws(4)))
-    means, covariance = moments(velocity_of(prior), "mmps:products=12", case, y, times(64, "power:1.5"))
+    means, covariance = moments(velocity_of(prior), "mmps:products=12", case, y, times(40, "power:1.5"))
     total = 0.0
     for one, mean in zip(y, means, strict=True):
         posterior = prior.posterior(case.matrix, one, 0.0)
