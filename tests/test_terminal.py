@@ -32,11 +32,11 @@ def one_line_of(arguments: list[str], cwd: Path) -> tuple[str, int, str]:
 
 
 def test_a_training_outlives_the_reader_of_its_output(tmp_path: Path, scans: Path):  # noqa: F811
-    more = ["trainer.max_steps=20", "callbacks.progress.seconds=0", "samples.num=0", "run_dir=run"]
+    more = ["trainer.max_steps=6", "callbacks.progress.seconds=0", "samples.num=0", "run_dir=run"]
     line, code, error = one_line_of(["train", *tiny(scans, *more)], tmp_path)
     assert line
     assert (code, "Error" in error) == (0, False)
-    assert (tmp_path / "run" / "checkpoints" / "step-00000020.ckpt").is_file()
+    assert (tmp_path / "run" / "checkpoints" / "step-00000006.ckpt").is_file()
 
 
 def test_info_ends_quietly_with_its_reader(tmp_path: Path, saved):
