@@ -4,7 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import groupby, product
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -189,7 +190,7 @@ def solvers_page(
     """Build the report on the rows of `measure`; `subject` is the trained flow, if any."""
     text: list[str] = []
     figures: dict[str, Figure] = {}
-    groups = _by(rows, "problem")
+    groups = {name: list(group) for name, group in groupby(rows, itemgetter("problem"))}
     if subject is not None:
         flow = groups.pop(subject.name)
         text += flow_text(flow, subject, budgets)
@@ -250,7 +251,7 @@ def _figure(panels: Sequence[tuple[str, Sequence[Row], str, str]], columns: int)
     methods: dict[str, dict[str, Any]] = {}
     for place, (title, rows, x, y) in enumerate(panels, 1):
         axes = figure.add_subplot(lines, columns, place)
-        for method, group in _by(rows, "method").items():
+        for method, group in groupby(rows, itemgetter("method")):
             methods[method] = STYLES[METHODS.index(method) % len(STYLES)] if method in METHODS else STYLES[-1]
             solved = [row for row in group if math.isfinite(reached(row)) and math.isfinite(row[y])]
             points = sorted((row[x], max(row[y], ROUNDING / 10)) for row in solved)
@@ -263,10 +264,3 @@ def _figure(panels: Sequence[tuple[str, Sequence[Row], str, str]], columns: int)
     handles = [Line2D([], [], **style, ms=5, lw=1.1, label=method) for method, style in methods.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return figure
-
-
-def _by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(row[key], []).append(row)
-    return groups
