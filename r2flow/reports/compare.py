@@ -55,12 +55,10 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     Other paths, as in `runs/sweep/*`, are skipped with a warning if there is any run.
     """
     runs: list[Path] = []
-    others: list[Path] = []
     for path in paths:
         inside = [run.parent for level in ("", "*/", "*/*/") for run in sorted(path.glob(f"{level}{CONFIG}"))]
-        inside = [run for run in inside if not run.name.startswith(".")]
-        runs += inside[:1] if path in inside else inside
-        others += [] if inside else [path]
+        runs += [path] if path in inside else [run for run in inside if not run.name.startswith(".")]
+    others = [path for path in paths if not any(run.is_relative_to(path) for run in runs)]
     if wrong := [path for path in others if not runs or not path.exists()]:
         raise InputError(f"{wrong[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
     for path in others:
