@@ -15,7 +15,7 @@ from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.sets import AS_MANY, HALVES
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.pictures import draw_range
-from r2flow.reports.tables import print_table, shown, table
+from r2flow.reports.tables import print_table, shown, table, words
 
 DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
 UNBIASED = ("kid_", "speed")  # do not depend on the number of scans
@@ -126,14 +126,14 @@ def evaluation_page(
     columns, lines = _table(comparisons)
     remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
     sets = [
-        (c.name, side, s.label, len(s), _words(s.about))
+        (c.name, side, s.label, len(s), words(s.about))
         for c in comparisons
         for side, s in (("real", c.real), ("generated", c.generated))
     ]
     protocols = [result.protocol for result in comparisons[0].measured]
     used = [
         (p["metric"], p["representation"], "{:g} < r < {:g}".format(*p["mask"]), p["extractor"], p["weights"],
-         p["layer"], _words(p["settings"]), p["sizes"]["real_chosen"], p["sizes"]["generated"])
+         p["layer"], words(p["settings"]), p["sizes"]["real_chosen"], p["sizes"]["generated"])
         for p in protocols
     ]  # fmt: skip
     text = [
@@ -206,10 +206,6 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
             about.append(", ".join(metrics))
         lines.append(f"{'; '.join(about)}: {remark}" if about else remark)
     return lines
-
-
-def _words(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key} {shown(value)}" for key, value in values.items())
 
 
 def _plain_comparison(comparison: Comparison) -> dict[str, Any]:

@@ -22,7 +22,7 @@ import r2flow
 from r2flow.errors import check
 from r2flow.files import write_file
 from r2flow.reports.pictures import save_figure
-from r2flow.reports.tables import Row
+from r2flow.reports.tables import Row, words
 
 # Markers and dashes distinguish lines without colour.
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (7, 2)), (0, (1, 1)), "-", "--", "-.", ":", "-")
@@ -142,15 +142,10 @@ def _plain(value: Any) -> Any:
 
 def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
     pictures = [f"![{name.replace('_', ' ')}]({name}.png)" for name in page.figures]
-    notes = [f"- {key}: {_one_line(value)}" for key, value in origin.items() if key not in ("report", "command")]
+    lines = {key: (words(value) or "none") if isinstance(value, Mapping) else value for key, value in origin.items()}
+    notes = [f"- {key}: {text}" for key, text in lines.items() if key not in ("report", "command")]
     again = ["## Where this comes from", "Made with", f"```\n{origin['command']}\n```", "\n".join(notes)]
     return "\n\n".join([f"# {page.title}", *pictures, *page.text, *again]) + "\n"
-
-
-def _one_line(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {item}" for key, item in value.items()) or "none"
-    return str(value)
 
 
 def _cpu_name() -> str:

@@ -53,6 +53,11 @@ def shown(value: Any) -> str:
     return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.1e}"
 
 
+def words(values: Mapping[str, Any]) -> str:
+    """Format named values: 'cores 2, threads 1'."""
+    return ", ".join(f"{key} {shown(value)}" for key, value in values.items())
+
+
 def _text(rows: Rows, columns: Columns) -> tuple[list[str], list[list[str]]]:
     if isinstance(columns, Mapping):
         return list(columns.values()), [[shown(row.get(key)) for key in columns] for row in rows]  # type: ignore[union-attr]
