@@ -28,20 +28,13 @@ MOST_CURVED = 200  # paths drawn, as in the paper's figure 8 (b)
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths of one checkpoint; an element is a pixel of range or reflectance.
-
-    Attributes:
-        t: Times of the Euler steps, (n,).
-        s: s(t) of every scan, (N, n).
-        squared_length: |x_1 - x_0|^2 of every scan, (N,).
-        trajectories: The most curved elements, the most curved first, in model space at 0, 1/n, ..., 1, (k, n + 1).
-    """
+    """Paths of one checkpoint."""
 
     label: str
-    t: np.ndarray
-    s: np.ndarray
-    squared_length: np.ndarray
-    trajectories: np.ndarray
+    t: np.ndarray  # times of the Euler steps, (n,)
+    s: np.ndarray  # s(t) of every scan, (N, n)
+    squared_length: np.ndarray  # |x_1 - x_0|^2 of every scan, (N,)
+    trajectories: np.ndarray  # the most curved pixels first, in model space at 0, 1/n, ..., 1, (k, n + 1)
 
     @property
     def s_normalised(self) -> np.ndarray:

@@ -45,19 +45,9 @@ def command() -> str:
 
 @dataclass(frozen=True)
 class Page:
-    """Contents of a report.
+    """Contents of a report."""
 
-    Attributes:
-        name: Stem of the files, such as `solvers`.
-        text: Paragraphs and tables of Markdown.
-        rows: One row per measurement, for the `rows` of the JSON.
-        figures: Figures by name, written as `NAME.png` and `NAME.pdf`.
-        seeds: All seeds, by purpose.
-        device: Device of the networks.
-        more: Further lists for the JSON, by name.
-    """
-
-    name: str
+    name: str  # stem of the files, such as `solvers`
     title: str
     text: Sequence[str]
     rows: Sequence[Row]
