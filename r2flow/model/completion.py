@@ -112,29 +112,22 @@ def complete(
         condition = {name: value[i : i + 1] for name, value in conditions.items()}
         known = condition["known"] > 0
         any_known = bool(known.any())
-        parts = []
+        answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
+        evaluations, converged, seconds = torch.zeros(num, dtype=torch.int64), torch.ones(num, dtype=torch.bool), 0.0
         for start in range(0, 0 if bool(known.all()) else num, batch_size):
-            numbers = [first + i + answer * ANSWER for answer in range(start, min(start + batch_size, num))]
+            at = slice(start, min(start + batch_size, num))
+            numbers = [first + i + answer * ANSWER for answer in range(at.start, at.stop)]
             given = {name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()}
-            parts.append(
-                draw(generator, numbers, seed, how if any_known else plain, given if any_known else None,
-                    precision=precision, progress=progress)
+            drawn = draw(
+                generator, numbers, seed, how if any_known else plain, given if any_known else None,
+                precision=precision, progress=progress,
             )  # fmt: skip
-        if not parts:
-            answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
-            parts = [Samples(answers, first + i, torch.zeros(num, dtype=torch.int64), torch.ones(num) > 0, 0.0)]
-        answers = torch.cat([part.images for part in parts])
+            answers[at], evaluations[at], converged[at] = drawn.images, drawn.evaluations, drawn.converged
+            seconds += drawn.seconds
         shared = min(answers.shape[1], image.shape[0])
         answers[:, :shared] = torch.where(measured, image[:shared], answers[:, :shared])
-        converged = torch.cat([part.converged for part in parts])
         warn_unsolved(converged, of=f" of the answers to scan {first + i}")
-        yield Completed(
-            answers * (answers[:, :1] > 0),
-            first + i,
-            torch.cat([part.evaluations for part in parts]),
-            converged,
-            sum(part.seconds for part in parts),
-        )
+        yield Completed(answers * (answers[:, :1] > 0), first + i, evaluations, converged, seconds)
 
 
 def _check_values(sensor: Sensor, images: Tensor) -> None:
