@@ -4,6 +4,7 @@ import json
 import math
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -86,8 +87,10 @@ class Comparer:
     def __call__(self, kind: Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
         """Compare two sets, or read the stored results."""
         start = time.monotonic()
-        path = self._path(real, other)
-        results = None if path is None else _read(path)
+        path, results = self._path(real, other), None
+        if path is not None:
+            with suppress(OSError, ValueError, TypeError):  # missing or damaged
+                results = [MetricResult(**entry) for entry in read_json(path)]
         if results is None:
             if id(real) not in self._statistics:
                 self._statistics[id(real)] = gather_real(self.metrics, real, self.work, self.cache, self.rules)
@@ -108,11 +111,3 @@ class Comparer:
             "protocol": self.rules.name, "plugins": plugin_digests(), "device": self.device,
         }  # fmt: skip
         return self.folder / f"{checksum(recipe)[:16]}.json"
-
-
-def _read(path: Path) -> list[MetricResult] | None:
-    """Stored results; None if missing or damaged."""
-    try:
-        return [MetricResult(**entry) for entry in read_json(path)]
-    except (OSError, ValueError, TypeError):
-        return None
