@@ -82,25 +82,22 @@ class Guard(L.Callback):
         self.in_a_row += first
         self.total += first and not overflow
         if self.in_a_row >= self.skips or (scale is not None and scale < self.lowest_scale):
-            self._stop(trainer, pl_module, loss, scale)
+            what = f"{self.in_a_row} steps in a row were" if self.in_a_row > 1 else "the step was"
+            scaled = f"loss scale {scale:g}" if scale is not None else f"no loss scale in {trainer.precision}"
+            hint = "" if trainer.precision == "32-true" else "try trainer.precision=32-true; "
+            self._end(
+                trainer,
+                f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss or gradient, "
+                f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; {scaled}; "
+                f"{describe_batch(trainer)}. {self._last_good()} Look at these scans; {hint}try, in a run of another "
+                "name, a lower stage.learning_rate.",
+            )
         if trainer.is_global_zero and not overflow:
             what = "gradients" if loss - loss == 0 else f"loss {loss}"
             log.warning(
                 "step %d skipped: non-finite %s (%d in a row; the run ends at %d)",
                 trainer.global_step + 1, what, self.in_a_row, self.skips,
             )  # fmt: skip
-
-    def _stop(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: float, scale: float | None) -> None:
-        what = f"{self.in_a_row} steps in a row were" if self.in_a_row > 1 else "the step was"
-        scaled = f"loss scale {scale:g}" if scale is not None else f"no loss scale in {trainer.precision}"
-        hint = "" if trainer.precision == "32-true" else "try trainer.precision=32-true; "
-        self._end(
-            trainer,
-            f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss or gradient, "
-            f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; {scaled}; "
-            f"{describe_batch(trainer)}. {self._last_good()} Look at these scans; {hint}try, in a run of another name, "
-            "a lower stage.learning_rate.",
-        )
 
     def on_save_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
         learned = [name for name, _ in pl_module.named_parameters()]
