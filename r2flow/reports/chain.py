@@ -1,7 +1,7 @@
 """Compare the generators of a chain at few and many steps, from the same noise."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +41,9 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     truth = panel(real, first.sensor)
     rows, drawn = [], {}
     bends = {name: bend(flow, num) for name, flow in flows.items()}
-    cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
+    fixed: dict[str, int] = {n: flow.generator.sampler.steps for n, flow in flows.items() if flow.generator.fixed}  # type: ignore[attr-defined]
+    every = sorted({1, *fixed.values(), MANY})  # numbers of steps of flows that are not distilled
+    cells = [(name, steps) for name in flows for steps in ([fixed[name]] if name in fixed else every)]
     for name, steps in track(cells, "sampling"):
         batches = list(sample(flows[name], num, steps=steps))
         images = np.concatenate([batch.images.numpy() for batch in batches])
@@ -82,12 +84,6 @@ Shown: in how many steps a flow draws a scan, and how far its scans are from hel
 Open {out / "chain.png"} first.""",
         flush=True,
     )
-
-
-def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
-    """Numbers of steps to sample: fixed for a distilled generator, else 1, those of distilled ones and `MANY`."""
-    fixed = {other.generator.sampler.steps for other in flows if other.generator.fixed}  # type: ignore[attr-defined]
-    return [flow.generator.sampler.steps] if flow.generator.fixed else sorted({1, *fixed, MANY})  # type: ignore[attr-defined]
 
 
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
