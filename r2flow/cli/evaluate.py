@@ -39,8 +39,6 @@ SAMPLING = ("steps", "sampler", "tolerance", "precision", "seed")  # options of 
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """Metrics, sets of scans, and output files."""
-
     metrics: Annotated[
         str | None,
         typer.Option(

@@ -134,7 +134,6 @@ class ReadingOptions:
     def reading(
         self, specs: Sequence[str | None], model: "Checkpoint | None" = None, estimate_scale: bool = False
     ) -> "Reading":
-        """The reading for scans and a model under these options."""
         from r2flow.data.opening import reading_for
 
         given = asdict(self) | {"size": rows_and_columns(self.size), "columns": named_columns(self.columns)}
@@ -169,8 +168,6 @@ class SamplerOptions:
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """Number of samples, seed, batch size and device."""
-
     num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 4
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends only on the seed and i.")] = 0
     batch_size: Annotated[int, typer.Option(min=1, help="Scans per batch.")] = 1

@@ -208,7 +208,6 @@ NOTES = (
 
 
 def compare_page(groups: Groups) -> Page:
-    """Build the page `compare.md .json .png`."""
     members = [(label, run) for label, runs in groups.items() for run in runs]
     seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
     written = [text for title, parts in tables(groups).items() for text in (f"## {title}", table(*parts))]

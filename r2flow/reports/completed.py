@@ -37,8 +37,6 @@ SHOWN = 4  # answers on a page
 
 @dataclass(frozen=True)
 class Job:
-    """Settings of completion."""
-
     num: int = 1  # answers per scan
     seed: int = 0
     mask: Mask | None = None  # measured rays to use; None: all

@@ -82,7 +82,6 @@ def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
 
 
 def summary(flow: Paths) -> dict[str, Any]:
-    """One row per checkpoint."""
     mean = flow.s.mean(0)
     total = mean.sum() or math.nan
     return {

@@ -24,8 +24,6 @@ RECORD = "link.json"
 
 @dataclass(frozen=True)
 class Link:
-    """One run of a chain."""
-
     name: str  # in the chain, and of the folder
     run_dir: Path
     overrides: tuple[str, ...]  # command line of the run
