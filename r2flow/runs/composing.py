@@ -215,25 +215,21 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
 def explain(error: Exception) -> str:
     """Shorten an error of Hydra to one line, with the nearest existing key."""
     text = str(error)
-    unknown = re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text)
-    if unknown:
+    if unknown := re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text):
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)
         others = [other for other in known_keys() if not key.startswith(f"{other}.")]  # without the key's group
         return f"the config has no key '{key}'.{did_you_mean(key, others)} See --cfg job for all of them."
-    missing = re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL)
-    if missing:
+    if missing := re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL):
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."
     if "'hydra/launcher/submitit" in text:
         return "this launcher needs an extra of the project: python -m pip install -e '.[slurm]'"
-    choice = re.search(r"Could not find '([^/']+)/([^']+)'", text)
-    if choice:
+    if choice := re.search(r"Could not find '([^/']+)/([^']+)'", text):
         group, name = choice.groups()
         names = choices(group)
         hint = f" For your own configs, also files in a sweep, give --config-dir FOLDER, with FOLDER/{group}/NAME.yaml."
         return f"no {group} config named '{name}'; known: {', '.join(names)}.{did_you_mean(name, names) or hint}"
-    several = re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
-    if several:
+    if several := re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text):
         key, values = several.groups()
         return f"{key}={values} is several values: for a sweep add -m, for a list give {key}=[{values}]."
     return " ".join([line.strip() for line in text.splitlines() if line.strip()][:2])
