@@ -13,6 +13,7 @@ import lightning as L
 import numpy as np
 from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from matplotlib.image import imread
 
 from r2flow.errors import require
 from r2flow.registry import Registry
@@ -96,8 +97,6 @@ def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
 
 def log_figures(loggers: Iterable[Logger], run_dir: Path, step: int) -> None:
     """Log the loss curve and the samples of a finished run to the loggers outside its folder."""
-    from matplotlib.image import imread
-
     external = [logger for logger in loggers if isinstance(logger, ELSEWHERE)]
     for path in (run_dir / "loss.png", run_dir / "samples" / "samples.png"):
         if external and path.is_file():

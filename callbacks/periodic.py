@@ -9,6 +9,7 @@ import torch
 from r2flow.generators import Generator
 from r2flow.model.sampling import draw
 from r2flow.registry import Count, Natural
+from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure
 
 from .ema import averaged_weights
 from .loggers import log_picture
@@ -62,8 +63,6 @@ class SamplePictures(Periodic):
         self.folder, self.seed, self.num, self.steps = Path(folder), seed, num, steps
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure
-
         step, path = trainer.global_step, self.folder / f"step-{trainer.global_step:08d}.png"
         generator: Generator = pl_module.generator  # type: ignore[assignment]
         if path.exists() or not generator.draws:

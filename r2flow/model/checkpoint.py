@@ -14,6 +14,8 @@ from typing import IO, Any
 
 import numpy as np
 import torch
+from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from r2flow.config import check_tree, learned
@@ -292,8 +294,6 @@ def weights_hash(checkpoint: Checkpoint) -> str:
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the tensors and the metadata of a `.safetensors`."""
-    from safetensors import safe_open
-
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
 
@@ -321,8 +321,6 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     The bytes depend on the generator alone: of its config, the file stores the keys of `r2flow.config.learned` and the
     names of plug-ins, without paths of this machine.
     """
-    from safetensors.torch import save
-
     path = Path(path)
     check(path.suffix == ".safetensors", f"{path}: a checkpoint is written as .safetensors.")
     moved = checkpoint.sensor != build_space(checkpoint.config).sensor

@@ -23,6 +23,7 @@ from r2flow.lidar.region import Region
 from r2flow.model.checkpoint import FOLDER, Checkpoint, weights_hash
 from r2flow.model.sampling import draw, warn_unsolved
 from r2flow.progress import Bar, track
+from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 from r2flow.reports.view import Panel, most_images, write_page
 from r2flow.store import MANIFEST, FileStore, read_manifest
 
@@ -143,8 +144,6 @@ class ScanBar(Bar):
 
 def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str) -> None:
     """Write a picture per image, `samples.png` of the first 8, and `samples.html` of all that fit."""
-    from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
-
     for index, image in track(list(enumerate(images)), "drawing", "pages", least=3):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     save_figure(contact_sheet(images[:8], rays), out / "samples.png")

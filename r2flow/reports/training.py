@@ -4,15 +4,15 @@ import csv
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from r2flow.model.checkpoint import checkpoints_of, find_checkpoint, load_checkpoint
 from r2flow.reports.outputs import what_next, write_samples
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from r2flow.reports.pages import STYLES, blank_figure
+from r2flow.reports.pictures import save_figure
 
 log = logging.getLogger(__name__)
 
@@ -51,10 +51,8 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
     }
 
 
-def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> "Figure":
+def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> Figure:
     """Plot one panel per logged curve of `CURVES`, one line per run; runs of one label share a style."""
-    from r2flow.reports.pages import STYLES, blank_figure
-
     names = [name for name in CURVES if any(name in curves for _, curves in runs)]
     styles = {label: STYLES[i % len(STYLES)] for i, label in enumerate(dict.fromkeys(label for label, _ in runs))}
     figure = blank_figure(5.5 * len(names), 3.8)
@@ -87,8 +85,6 @@ def finish(
 
     `kept`: the run keeps checkpoints.
     """
-    from r2flow.reports.pictures import save_figure
-
     curves = read_curves(run := Path(run))
     if curves:
         save_figure(curves_figure([(run.name, curves)]), run / "loss.png")

@@ -122,7 +122,7 @@ def test_a_resumed_run_does_not_look_again_at_the_step_that_it_goes_on_from():
 def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_path, monkeypatch):
     sheets = []
     real = pictures.contact_sheet
-    monkeypatch.setattr(pictures, "contact_sheet", lambda *given: sheets.append(given) or real(*given))
+    monkeypatch.setattr("r2flow.callbacks.periodic.contact_sheet", lambda *given: sheets.append(given) or real(*given))
     callbacks = [EMA(decay=0.5, every=1, warmup_steps=0), SamplePictures(tmp_path / "p", 7, every=2, num=2, steps=4)]
     logger = TensorBoardLogger(tmp_path, name="tensorboard", version="")
     fit(tmp_path, callbacks, steps=3, logger=logger)

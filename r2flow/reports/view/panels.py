@@ -25,6 +25,7 @@ from r2flow.noise import Draws
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.view import Panel, write_page
 from r2flow.samplers import OnGrid
+from r2flow.simulator import simulate
 
 
 def scans_of(path: Path) -> list[Path]:
@@ -73,8 +74,6 @@ def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -
 def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray | None]:
     """An image, and its semantic ids, (H, W), if there are any."""
     if isinstance(source, SimulatedScans):
-        from r2flow.simulator import simulate
-
         made = simulate(source.sensor, source.seed, source.numbers[number])
         return made.image[: 1 + source.reflectance], made.labels
     path = points_beside(Path(source.paths[number])) if isinstance(source, ScanFiles) else None
