@@ -78,16 +78,16 @@ def sample(
     """
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.models import DEFAULT, MODELS, find_model
-    from r2flow.reports.outputs import formats_of, write_samples
+    from r2flow.reports.outputs import write_samples
 
     if model is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     loaded = load_checkpoint(model or find_model(DEFAULT), device=choose_device(draw.device))
     sampler = loaded.generator.choose(**how.given)
-    formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded)
+    chosen = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else None
     region = part.region(loaded)
-    write_samples(
-        loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, precision=precision
+    formats = write_samples(
+        loaded, out, draw.num, draw.seed, sampler, chosen, pictures, draw.batch_size, region, precision=precision
     )
     pages = f", pictures in {out / 'samples.png'}, in 3-D in {out / 'samples.html'}" if pictures else ""
     print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{pages}")

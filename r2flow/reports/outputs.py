@@ -33,11 +33,6 @@ FORMATS = ("ply", "bin", "npy")
 OWN = re.compile(r"\d{6}\.(ply|bin|npy|png)|samples\.(png|html)")  # file names of samples
 
 
-def formats_of(checkpoint: Checkpoint) -> list[str]:
-    """Output formats that suit the model: .bin needs reflectance."""
-    return [name for name in FORMATS if name != "bin" or checkpoint.encoding.reflectance]
-
-
 def write_samples(
     checkpoint: Checkpoint,
     out: str | Path,
@@ -50,13 +45,13 @@ def write_samples(
     region: Region | None = None,
     replace: bool = False,
     precision: Precision = "32-true",
-) -> None:
+) -> Sequence[str]:
     """Sample scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
 
     Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes; `replace` deletes samples of
     other settings in the folder. The contact sheet shows at most 8 of `pictures`. Files have the sensor's shape, 0
-    outside the region (`r2flow.model.sampling.sample`). Of `formats_of`, the default, `ply` and `bin` are points in
-    metres with reflectance, `npy` is the range image, float32 (2 or 1, H, W).
+    outside the region (`r2flow.model.sampling.sample`). Of the formats, by default all that suit the model and in the
+    result, `ply` and `bin` are points in metres with reflectance, `npy` is the range image, float32 (2 or 1, H, W).
     """
     generator, out, rays = checkpoint.generator, Path(out), checkpoint.sensor.rays()
     sampler = sampler or generator.sampler
@@ -86,11 +81,12 @@ def write_samples(
         path = checkpoint.path.resolve()
         model = path.parents[1].name if path.parent.name == FOLDER else path.stem
         draw_pages(shown, rays, out, f"{model}, seed {seed}")
+    return endings
 
 
 def _chosen(checkpoint: Checkpoint, formats: Sequence[str] | None) -> Sequence[str]:
-    """The formats, by default all of `formats_of`; refuses others."""
-    fitting = formats_of(checkpoint)
+    """The formats, by default all that suit the model: .bin needs reflectance; refuses others."""
+    fitting = [name for name in FORMATS if name != "bin" or checkpoint.encoding.reflectance]
     formats = fitting if formats is None else formats
     if other := [name for name in formats if name not in fitting]:
         raise InputError(f"--format {','.join(other)} cannot hold these scans; give some of {','.join(fitting)}.")
