@@ -35,11 +35,6 @@ def scans_of(path: Path) -> list[Path]:
     return [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
 
 
-def _print_choice(what: str | Path, count: int, most: int) -> None:
-    if count > most:
-        print(f"{what}: {most} of its {count:,} scans, evenly spread (--num)")
-
-
 def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -> Iterator[Panel]:
     """A panel for each of up to `most` scans of a set (`open_scans`), evenly spread; `labelled`: with semantic ids.
 
@@ -51,8 +46,7 @@ def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -
     views: list[tuple[Path, ScanSet, int]]
     if own_reading(spec) is None and options.name == FOLDER:
         paths = scans_of(file or Path(options.folder))
-        _print_choice(spec, len(paths), most)
-        chosen = [paths[index] for index in spread(len(paths), most)]
+        count, chosen = len(paths), [paths[index] for index in spread(len(paths), most)]
         warn_of_other_sensor(chosen, reading, spec)
         if reading.reflectance_scale is None:
             scale = estimated_scale(chosen[0], readable(chosen, reading.columns))
@@ -60,10 +54,11 @@ def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -
         views = [(path, open_scans(path, reading, own_size=True), 0) for path in chosen]
     else:
         opened = open_scans(spec, reading)
-        if options.name != SIMULATED:  # simulated sets have any size
-            _print_choice(spec, len(opened), most)
+        count = 0 if options.name == SIMULATED else len(opened)  # simulated sets have any size
         scans = opened.spread(most)
         views = [(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
+    if count > most:
+        print(f"{spec}: {most} of its {count:,} scans, evenly spread (--num)")
     counts = Counter(path.name for path, *_ in views)
     for path, scans, number in views:
         image, labels = _labelled(scans.source, number) if labelled else (scans.source[number], None)
