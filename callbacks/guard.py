@@ -1,6 +1,5 @@
 """Guard against NaN: skips steps with a non-finite loss or gradient, and stops the run after too many."""
 
-import copy
 import logging
 from collections.abc import Iterable
 from pathlib import Path
@@ -145,13 +144,11 @@ def describe_batch(trainer: L.Trainer) -> str:
     loader = trainer.train_dataloader
     if not isinstance(loader, RunLoader):
         return "images unknown to the loader"
-    sampler: Any = copy.copy(loader.batch_sampler)
-    sampler.rank, sampler.ranks = 0, 1
-    sampler.first_batch = trainer.global_step * trainer.accumulate_grad_batches
-    batches = iter(sampler)
-    keys = [key for _ in range(trainer.accumulate_grad_batches) for key in next(batches, [])]
-    scans = ", ".join(str(scan) for _, scan in keys[:16]) + (", ..." if len(keys) > 16 else "")
-    return f"images k = {keys[0][0]} to {keys[-1][0]}, scans {scans}" if keys else "no images"
+    sampler: Any = loader.batch_sampler
+    size = trainer.accumulate_grad_batches * sampler.batch_size
+    images = range(sampler.images)[trainer.global_step * size :][:size]
+    scans = ", ".join(str(sampler.order[k]) for k in images[:16]) + (", ..." if len(images) > 16 else "")
+    return f"images k = {images[0]} to {images[-1]}, scans {scans}" if images else "no images"
 
 
 def _not_finite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
