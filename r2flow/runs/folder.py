@@ -137,12 +137,9 @@ def _readable(run: str | Path, needed: Sequence[str] = ()) -> Iterator[tuple[Pat
 
 def _fitting(run: str | Path, saved: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None) -> Path:
     """The first checkpoint whose weights have the names and shapes of `state`."""
+    shapes = None if state is None else {name: value.shape for name, value in state.items()}
     for path, content in saved:
-        if state is None or _shapes(content["state_dict"]) == _shapes(state):
+        if shapes is None or shapes == {n: getattr(v, "shape", None) for n, v in content["state_dict"].items()}:
             return path
         log.warning("%s does not have the weights of this run's config. Passing it over.", path)
     raise InputError(f"no checkpoint in {run} has the weights of its config; give name=OTHER for a new run.")
-
-
-def _shapes(state: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: getattr(value, "shape", None) for name, value in state.items()}
