@@ -4,6 +4,7 @@ import logging
 import re
 from collections import Counter
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -164,9 +165,8 @@ def unpack(
     from r2flow.progress import track
 
     written, stamps = 0, Counter[int]()
-    for number, (stamp, points) in enumerate(track(read_bag(recording, topic), "unpacking", "scans", most or 0)):
-        if number % every:
-            continue
+    read = track(read_bag(recording, topic), "unpacking", "scans", most or 0)
+    for stamp, points in islice(read, 0, None, every):
         if isinstance(points, InputError):
             log.warning("left out: %s", points)
             continue
