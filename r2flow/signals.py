@@ -49,15 +49,13 @@ def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[N
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.getsignal(number) for number in signals}
-    handled = [number for number in signals if not (number == signal.SIGINT and before[number] is signal.SIG_IGN)]
-    for number in handled:
-        signal.signal(number, handler)
+    heard = [n for n in signals if n != signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handler) for number in heard}
     try:
         yield
     finally:
-        for number in handled:
-            signal.signal(number, before[number])
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 def stop_at_once(number: int, frame: FrameType | None = None) -> None:
@@ -119,15 +117,16 @@ def end_with_parent(worker: int = 0) -> None:
 
 @contextmanager
 def out_of_reach() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C also during imports; this process receives it after the block."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the processes
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    """Start processes that ignore Ctrl-C also during imports; this process hears signals after the block."""
+    heard: list[int] = []
+    with listening(lambda number, frame: heard.append(number), [signal.SIGTERM]):
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the processes
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    if heard:
+        signal.raise_signal(heard[0])
 
 
 def outlive_the_signal(worker: int = 0) -> None:
@@ -141,6 +140,5 @@ def outlive_the_signal(worker: int = 0) -> None:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(30)
 
-    if os.name == "posix":
-        for number in STOPPING:
-            signal.signal(number, hear)
+    for number in STOPPING:
+        signal.signal(number, hear)

@@ -54,3 +54,11 @@ def wait_until(there: Callable[[], bool], seconds: float = 60.0) -> None:
     while not there():
         assert time.monotonic() - begin < seconds, f"not there after {seconds} s"
         time.sleep(0.005)
+
+
+def is_gone(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False

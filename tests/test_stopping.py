@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from r2flow.signals import listening, out_of_reach
 from tests.conftest import ROOT
-from tests.killing import wait_until
+from tests.killing import is_gone, wait_until
 
 # Sends this process a signal when it begins to import a module, then does what a command does.
 AT_IMPORT = """
@@ -70,21 +71,20 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path):
-    parent = subprocess.Popen([sys.executable, "-c", PARENT], cwd=tmp_path)
+    parent = subprocess.Popen([sys.executable, "-c", PARENT], cwd=tmp_path, start_new_session=True)
     try:
         wait_until(lambda: len(list(tmp_path.glob("pid-*"))) == 2)
         time.sleep(0.2)  # until both wait
     finally:
         parent.kill()
         parent.wait()
-    workers = [Path("/proc", path.name.removeprefix("pid-")) for path in tmp_path.glob("pid-*")]
-    wait_until(lambda: not any(is_running(worker) for worker in workers), seconds=20)
+    wait_until(lambda: is_gone(parent.pid), seconds=20)
 
 
-def is_running(process: Path) -> bool:
-    try:
-        return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+def test_a_signal_waits_until_workers_are_started():
+    started = []
+    with listening(lambda *_: started.append("told")), out_of_reach():
+        signal.raise_signal(signal.SIGTERM)
+        started.append("started")
+    assert started == ["started", "told"]

@@ -12,7 +12,7 @@ import pytest
 
 from r2flow.model.checkpoint import checkpoints_of
 from tests.conftest import write_scan
-from tests.killing import wait_until
+from tests.killing import is_gone, wait_until
 from tests.training.conftest import COMMAND, TINY, let_go, start, tiny
 from tests.training.test_chain import CHAIN, HELD, assert_alike
 from tests.training.test_train import assert_bit_equal
@@ -30,14 +30,6 @@ def finish(cwd: Path, command: Sequence[object]) -> float:
     said, _ = process.communicate(timeout=600)
     assert process.returncode == 0, said
     return time.monotonic() - begin
-
-
-def is_gone(group: int) -> bool:
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return True
-    return False
 
 
 def end_ten_times(cwd: Path, command: Sequence[object], seconds: float, seed: int) -> None:
