@@ -99,6 +99,7 @@ class Stopping(L.Callback):
                 ours = (callback for callback in kept if isinstance(callback, Checkpoints))
                 next(ours, Checkpoints(self.run_dir, keep=sys.maxsize)).save(trainer)
             self._training = False
+            trainer._logger_connector.update_train_step_metrics()  # as Lightning does after the callbacks
             environment = getattr(trainer.strategy, "cluster_environment", None)
             if not trainer.is_global_zero and isinstance(environment, LightningEnvironment):
                 outlive_parent()

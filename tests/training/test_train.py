@@ -124,6 +124,7 @@ def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(
     train(*options)
     assert [step_of(path) for path in checkpoints_of(run)] == [12, 8, 6]
     assert_bit_equal(alone[0], run)
+    np.testing.assert_array_equal(*(read_curves(one)["train/loss"] for one in (alone[0], run)))
 
 
 @pytest.mark.slow
