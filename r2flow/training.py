@@ -42,6 +42,7 @@ from r2flow.reports.training import finish, read_curves
 from r2flow.runs.composing import check_keys, compose
 from r2flow.runs.folder import check_run, open_run, read_config, run_lock
 from r2flow.runs.lineage import Parent, find_parent, inherit
+from r2flow.signals import LATER, Stopped
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 
@@ -62,9 +63,8 @@ EXPECTED_WARNINGS = (
     "Be aware that when using .ckpt_path.*",  # a callback's options may change
 )
 
-
 # Errors of gloo and NCCL after a peer process has ended.
-PEER_LOST = r"(?i)connection (closed|reset)|remote process exited|gloo.*(timed out|read error|write error)|NCCL"
+PEER_LOST = r"(?i)connection .*(close|reset)|broken pipe|process exited|gloo.*(timed out|(read|write) error)|NCCL"
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,7 @@ def fit(run: Run) -> Result:
 
     Raises:
         InputError: unreadable scans, another run in its folder, non-finite weights, a full disk.
-        r2flow.signals.Stopped: a stop signal was received.
+        r2flow.signals.Stopped: a stop signal was received, or another device's process was killed.
     """
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
     stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping(run.folder))
@@ -292,17 +292,16 @@ def fit(run: Run) -> Result:
             run.trainer.fit(run.stage, run.data)
             return _result(run, run.trainer.global_step, finished=True)
         with run_lock(run.folder) if run.trainer.is_global_zero else nullcontext():
-            step = _fit_in_folder(run)
+            step = _fit_in_folder(run, stopping)
             if run.trainer.is_global_zero:
-                device = run.trainer.strategy.root_device
-                sampling_device = str(device) if device.type == "cuda" else "cpu"
-                finish(run.folder, run.config["samples"], run.config["seed"], sampling_device, run.trainer.max_steps,
-                       kept=bool(run.trainer.checkpoint_callbacks))  # fmt: skip
+                where, kept = run.trainer.strategy.root_device, bool(run.trainer.checkpoint_callbacks)
+                device = str(where) if where.type == "cuda" else "cpu"
+                finish(run.folder, run.config["samples"], run.config["seed"], device, run.trainer.max_steps, kept=kept)
                 log_figures(run.trainer.loggers, run.folder, step)
     return _result(run, step, finished=step >= run.trainer.max_steps)
 
 
-def _fit_in_folder(run: Run) -> int:
+def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     """Fit a run in its folder; returns the step reached."""
     last = open_run(run.folder, run.config, run.stage.state_dict())
     if last is not None and step_of(last) >= run.trainer.max_steps:
@@ -321,8 +320,10 @@ def _fit_in_folder(run: Run) -> int:
     except MisconfigurationException as error:  # as of limit_val_batches, with few scans
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     except RuntimeError as error:
-        if run.trainer.world_size > 1 and re.search(PEER_LOST, str(error)):
-            raise InputError("a process of this run on another device ended; the same command resumes.") from error
+        if run.trainer.world_size > 1 and stopping.told is None and re.search(PEER_LOST, str(error)):
+            if any(process.wait() in (1, 2) for process in getattr(run.trainer.strategy.launcher, "procs", ())):
+                raise InputError("a process of this run on another device ended with an error.") from error
+            raise Stopped(LATER, "a process of this run on another device ended; the same command resumes.") from error
         raise
     return run.trainer.global_step
 

@@ -12,8 +12,10 @@ import pytest
 import torch
 
 import r2flow.training
+from r2flow.callbacks import Stopping
 from r2flow.errors import InputError
 from r2flow.progress import Bar, track
+from r2flow.signals import LATER, Stopped
 from tests.training.conftest import scans, tiny  # noqa: F401  a fixture
 
 R2FLOW = [sys.executable, "-m", "r2flow"]
@@ -69,24 +71,26 @@ def test_a_config_file_that_contains_itself_is_one_line(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "message",
+    ("message", "peer", "kind", "words"),
     [
-        "[../third_party/gloo/gloo/transport/tcp/pair.cc:534] Connection closed by peer [127.0.0.1]:42619",
-        "NCCL error: remote process exited or there was a network error",
+        ("[../third_party/gloo/pair.cc:534] Connection closed by peer [127.0.0.1]:42619", -9, Stopped, "resumes"),
+        ("NCCL error: remote process exited or there was a network error", LATER, Stopped, "resumes"),
+        ("Failed to recv, got 0 bytes. Connection was likely closed.", 2, InputError, "error"),
     ],
-)
-def test_a_lost_device_is_one_line(monkeypatch, tmp_path: Path, message: str):
-    """As torch.distributed says it in the processes that are left."""
-
-    fit = Mock(side_effect=RuntimeError(message))
-    trainer = SimpleNamespace(world_size=2, max_steps=4, is_global_zero=False, fit=fit)
+)  # fmt: skip
+def test_a_lost_device_is_one_line(monkeypatch, tmp_path: Path, message: str, peer: int, kind: type, words: str):
+    """As torch.distributed says it in the processes that are left, of which one has launched the others."""
+    fit, strategy = Mock(side_effect=RuntimeError(message)), Mock()
+    strategy.launcher.procs = [Mock(wait=lambda: peer)]
+    trainer = SimpleNamespace(world_size=2, max_steps=4, is_global_zero=False, fit=fit, strategy=strategy)
     run = SimpleNamespace(trainer=trainer, folder=tmp_path, config={"stage": {}}, data=None, stage=torch.nn.ReLU())
     monkeypatch.setattr(r2flow.training, "open_run", lambda *_: None)
-    with pytest.raises(InputError, match="device"):
-        r2flow.training._fit_in_folder(run)
+    with pytest.raises(kind, match=f"device ended.* {words}") as raised:
+        r2flow.training._fit_in_folder(run, Stopping(tmp_path))
+    assert getattr(raised.value, "code", 2) == (LATER if kind is Stopped else 2)
     trainer.world_size = 1
-    with pytest.raises(RuntimeError, match="peer|NCCL"):
-        r2flow.training._fit_in_folder(run)
+    with pytest.raises(RuntimeError, match="peer|NCCL|closed"):
+        r2flow.training._fit_in_folder(run, Stopping(tmp_path))
 
 
 def test_a_bar_goes_to_standard_error_with_count_unit_and_note(capsys, monkeypatch):

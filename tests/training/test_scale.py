@@ -124,14 +124,8 @@ def test_accumulated_batches_have_the_losses_of_the_whole(one: Path, scans: Path
 def srun(
     cwd: Path, scans: Path, *overrides: str, tasks: int = 1, leave_after: Path | None = None
 ) -> list[tuple[int, str]]:
-    """The tiny run as srun starts it on one node, with a `scontrol` that writes down what it was asked.
-
-    Args:
-        leave_after: The last task is sent SIGUSR1 when this file is there.
-
-    Returns:
-        (exit code, output) of every task.
-    """
+    """(exit code, output) of every task of the tiny run as srun starts it, with a `scontrol` that notes what it gets;
+    the last task is sent SIGUSR1 when the file `leave_after` is there."""
     scontrol = cwd / "bin" / "scontrol"
     scontrol.parent.mkdir(exist_ok=True)
     scontrol.write_text(f'#!/bin/sh\necho "$@" >> {cwd}/scontrol.log\n')
