@@ -12,9 +12,10 @@ import logging
 import re
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from subprocess import Popen, TimeoutExpired
 from typing import Annotated, Any, Literal
 
 import lightning as L
@@ -321,11 +322,18 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     except RuntimeError as error:
         if run.trainer.world_size > 1 and stopping.told is None and re.search(PEER_LOST, str(error)):
-            if any(process.wait() in (1, 2) for process in getattr(run.trainer.strategy.launcher, "procs", ())):
+            if any(map(_failed, getattr(run.trainer.strategy.launcher, "procs", ()))):
                 raise InputError("a process of this run on another device ended with an error.") from error
             raise Stopped(LATER, "a process of this run on another device ended; the same command resumes.") from error
         raise
     return run.trainer.global_step
+
+
+def _failed(process: Popen[bytes]) -> bool:
+    """Whether a process has ended with an error of its own; a process that hangs has not."""
+    with suppress(TimeoutExpired):
+        return process.wait(10) in (1, 2)
+    return False
 
 
 def _result(run: Run, step: int, finished: bool) -> Result:
