@@ -157,7 +157,7 @@ def choices(group: str) -> list[str]:
     return sorted(files | {name.removesuffix(".yaml") for name in stored})
 
 
-ODD = re.compile(r"([\w.@/+]+)=(?!\d{1,3}(?:_\d{3})+$)(?=.*(?:[^ -}]|[&#]|\d_\d))([^][{}(),='\"]*)")  # ~/a, ü, 1_2
+ODD = re.compile(r"([\w.@/+]+)=(?!\s*-?\d{1,3}(?:_\d{3})*(?:\.[\d_]*)?$)(?=.*(?:[^\t -}]|[&#]|\d_\d))([^][{}(),='\"]*)")
 MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~KEY may delete from
 
 
@@ -170,15 +170,15 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
     converted: list[str] = []
     parser = OverridesParser.create()
-    for text in overrides:
-        if odd := ODD.fullmatch(text):  # text that Hydra refuses or takes for a number
-            text = override(*odd.groups())
+    for text in map(str.strip, overrides):
+        if odd := ODD.fullmatch(text):  # Hydra refuses ~/a and ü, takes 1_2 for a number and expands no ~
+            text = override(odd[1], re.sub("^~(?=/|$)", str(Path.home()), odd[2].lstrip()))
         try:
             parsed = parser.parse_override(text)
         except HydraException:
             raise InputError(
-                f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around = and "
-                "brackets, as 'KEY=\"a value\"'."
+                f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around =, "
+                "brackets and, in a list, ~ and accents, as 'KEY=\"a value\"'."
             ) from None
         key, value = parsed.key_or_group, parsed.value()
         names = value if isinstance(value, list) else [value]
