@@ -119,14 +119,14 @@ def end_with_parent(worker: int = 0) -> None:
 def out_of_reach() -> Iterator[None]:
     """Start processes that ignore Ctrl-C also during imports; this process hears signals after the block."""
     heard: list[int] = []
-    with listening(lambda number, frame: heard.append(number), [signal.SIGTERM]):
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the processes
-        try:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the processes
+    try:
+        with listening(lambda number, frame: heard.append(number), [signal.SIGTERM]):
             yield
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    if heard:
-        signal.raise_signal(heard[0])
+    finally:  # also after the loss of a process, of which a signal to all of them is the cause
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if heard:
+            signal.raise_signal(heard[0])
 
 
 def outlive_the_signal(worker: int = 0) -> None:
