@@ -157,7 +157,6 @@ def choices(group: str) -> list[str]:
     return sorted(files | {name.removesuffix(".yaml") for name in stored})
 
 
-ODD = re.compile(r"([\w.@/+]+)=(?!\s*-?\d{1,3}(?:_\d{3})*(?:\.[\d_]*)?$)(?=.*(?:[^\t -}]|[&#]|\d_\d))([^][{}(),='\"]*)")
 MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~KEY may delete from
 
 
@@ -170,9 +169,7 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
     converted: list[str] = []
     parser = OverridesParser.create()
-    for text in map(str.strip, overrides):
-        if odd := ODD.fullmatch(text):  # Hydra refuses ~/a and ü, takes 1_2 for a number and expands no ~
-            text = override(odd[1], re.sub("^~(?=/|$)", str(Path.home()), odd[2].lstrip()))
+    for text in map(_plain, overrides):
         try:
             parsed = parser.parse_override(text)
         except HydraException:
@@ -210,6 +207,16 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     if "size=small" in converted and not any(re.match(r"\+?experiment=[^\[]", text) for text in converted):
         raise InputError("size=small is a form of one experiment: give experiment=NAME, such as r2dm.")
     return converted
+
+
+def _plain(text: str) -> str:
+    """Quote a plain value that Hydra refuses, as ü and &, or takes for a number, as the date 2011_09_26; expand ~."""
+    key, _, value = text.strip().partition("=")
+    value = re.sub("^~(?=/|$)", str(Path.home()), value.strip())
+    number = re.fullmatch(r"-?\d{1,3}(_\d{3})*(\.[\d_]*)?", value)
+    odd = re.search(r"[^\t -}]|[&#]|\d_\d", text) and not number
+    plain = re.fullmatch(r"[\w.@/+]+", key) and not re.search(r"""[][{}(),='"]""", value)
+    return override(key, value) if odd and plain else text.strip()
 
 
 def explain(error: Exception) -> str:
