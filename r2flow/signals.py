@@ -123,7 +123,7 @@ def out_of_reach() -> Iterator[None]:
     try:
         with listening(lambda number, frame: heard.append(number), [signal.SIGTERM]):
             yield
-    finally:  # also after the loss of a process, of which a signal to all of them is the cause
+    finally:  # also if a new process was lost to the same signal
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if heard:
             signal.raise_signal(heard[0])

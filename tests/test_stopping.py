@@ -85,5 +85,5 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path):
 def test_a_signal_waits_until_workers_are_started():
     with pytest.raises(Stopped) as stop, listening(stop_at_once), out_of_reach():  # noqa: PT012
         signal.raise_signal(signal.SIGTERM)
-        raise OSError("a worker is gone")  # ended by the same signal, of which the command speaks
+        raise OSError("a worker is gone")  # ended by the same signal
     assert isinstance(stop.value.__context__, OSError)

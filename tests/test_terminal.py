@@ -79,7 +79,7 @@ def test_a_config_file_that_contains_itself_is_one_line(tmp_path: Path):
     ],
 )  # fmt: skip
 def test_a_lost_device_is_one_line(monkeypatch, tmp_path: Path, message: str, peer: int, kind: type, words: str):
-    """As torch.distributed says it in the processes that are left, of which one has launched the others."""
+    """As torch.distributed says it in the remaining processes; one of them has launched the others."""
     fit, strategy = Mock(side_effect=RuntimeError(message)), Mock()
     strategy.launcher.procs = [Mock(wait=lambda timeout: peer)]
     trainer = SimpleNamespace(world_size=2, max_steps=4, is_global_zero=False, fit=fit, strategy=strategy)

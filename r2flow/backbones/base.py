@@ -173,7 +173,7 @@ def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:
     With into = V^(-1/2), input and output of F have unit variance at every t (Karras et al. 2022, "Elucidating the
     design space of diffusion-based generative models", table 1, for the straight path). At t = 0 F need not copy noise.
 
-    Of t, (B,) or (1,), and s = data_std it returns into, skip and out, each (B or 1, 1, 1, 1).
+    t is (B,) or (1,), and s is data_std; into, skip and out are (B or 1, 1, 1, 1) each.
     """
     t = t[:, None, None, None]
     variance = (t * data_std).square() + (1 - t).square()

@@ -28,18 +28,26 @@ DARK = (
 
 @dataclass(frozen=True)
 class Reading:
-    """How scans become images of a sensor."""
+    """How scans become images of a sensor.
+
+    Attributes:
+        projection, convention: As in `r2flow.lidar.projection.project`.
+        reflectance_scale: The value in the files that means full reflectance; None estimates it from each file.
+        reflectance: Whether images have reflectance: True requires it of every scan; `auto`: see `lacks_reflectance`.
+        on_bad_scan: Treatment of unusable scans. `error` raises; `skip` takes the next usable scan; `empty` raises,
+            but returns an empty image for a scan without a return in the sensor's view.
+        within_limits: Whether ranges of a range image beyond the sensor's limits are dropped, as those of points are.
+        columns: As in `r2flow.lidar.scan_files.read_points`.
+    """
 
     sensor: Sensor
-    projection: Projection = "spherical"  # as in `r2flow.lidar.projection.project`
-    convention: Convention = "centre"  # as there
-    reflectance_scale: float | None = 1.0  # the value in the files of full reflectance; None estimates it from each
-    reflectance: bool | str = AUTO  # of images; True requires it of every scan; `auto`: see `lacks_reflectance`
-    # Unusable scans: `error` raises; `skip` takes the next usable scan; `empty` raises, but returns an empty image for
-    # a scan without a return in the sensor's view.
+    projection: Projection = "spherical"
+    convention: Convention = "centre"
+    reflectance_scale: float | None = 1.0
+    reflectance: bool | str = AUTO
     on_bad_scan: str = "empty"
-    within_limits: bool = False  # whether a range image loses ranges beyond the sensor's limits, as points do
-    columns: tuple[str, ...] | None = None  # as in `r2flow.lidar.scan_files.read_points`
+    within_limits: bool = False
+    columns: tuple[str, ...] | None = None
 
     def described(self) -> dict[str, Any]:
         """All fields as plain values, for manifests."""

@@ -38,13 +38,21 @@ class ScanSource(ABC):
     """Numbered range images, (2 or 1, H, W) float32: range in metres and reflectance in [0, 1], 0 where missing.
 
     Subclasses must implement the four abstract methods; the others are optional.
+
+    Attributes:
+        slow: Whether reading an image is slow, so that images are kept in memory if they fit.
+        drawn: Whether a network draws the images on access: only in this process, and each image once if possible.
+        measured: Whether the measured points of the pixels are available; they are not for range images, prepared
+            shards, samples and simulated scans.
+        drives: Numbers of the scans of each recording, by its name, if known.
+        contents: Digest of what is cheaply known of the scans, equal for a copy of the data set.
     """
 
-    slow = False  # whether reading an image is slow, so that images are kept in memory if they fit
-    drawn = False  # whether a network draws the images on access: in this process alone, and each once if possible
-    measured = False  # whether points were measured: not of range images, prepared shards, samples, simulated scans
-    drives: Mapping[str, Sequence[int]] = {}  # numbers of the scans of each recording, by its name, if known
-    contents = ""  # digest of what is cheaply known of the scans, equal for a copy of the data set
+    slow = False
+    drawn = False
+    measured = False
+    drives: Mapping[str, Sequence[int]] = {}
+    contents = ""
 
     @abstractmethod
     def __len__(self) -> int: ...
