@@ -27,7 +27,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "211cf04c4c10227a0504f1e323af2e6b2a6562caa377ba2c95f8f689ed99c4b5",
+        "afaf18d78b0c53c1ce396a6351565c7f0e4e0ba36c8e8f274454d926f73b0147",
     ),
     densify=Model(
         "scans of few beams or points completed to all, in one evaluation, learned from simulated scans",
