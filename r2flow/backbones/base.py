@@ -94,9 +94,11 @@ class Backbone(ExactBuffers):
 
     def _velocity(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
         y = x.to(next(self.parameters()).dtype)
-        if not self.second_time:
-            return self.velocity(t, y)
-        return self.velocity(t, y, t if s is None else s)
+        v = self.velocity(t, y, t if s is None else s) if self.second_time else self.velocity(t, y)
+        expected = self.out_channels, *x.shape[2:]
+        if v.shape[1:] != expected:  # one channel would broadcast in the loss
+            raise InputError(f"a {type(self).__name__} must give images of {expected}, found {tuple(v.shape[1:])}.")
+        return v
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better.

@@ -6,14 +6,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from r2flow.backbones.convolutions import (
-    BlockOptions,
-    Resample,
-    ResidualBlock,
-    RingConv2d,
-    SelfAttention,
-    UNet,
-)
+from r2flow.backbones.convolutions import BlockOptions, Resample, ResidualBlock, RingConv2d, SelfAttention, UNet
 from r2flow.backbones.layers import zero_initialised
 
 FILTER = (1, 3, 3, 1)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tiny_backbones import TWO_TIMES, image, rays, tiny, untrained
+from tiny_backbones import COLUMNS, ROWS, TWO_TIMES, Plain, image, rays, tiny, untrained
 
 from r2flow.backbones import Backbone
 from r2flow.errors import InputError
@@ -74,3 +74,12 @@ def test_a_backbone_that_takes_one_time_says_so_when_it_is_built():
 
     with pytest.raises(InputError, match="OneTime takes no second time: choose a backbone that does"):
         OneTime(rays(), second_time=True)
+
+
+def test_a_backbone_that_gives_another_shape_is_named():
+    class Ranges(Plain):
+        def velocity(self, t, x, s=None):
+            return super().velocity(t, x)[:, :1]  # which would broadcast
+
+    with pytest.raises(InputError, match=rf"a Ranges must give images of \(2, {ROWS}, {COLUMNS}\), found \(1, "):
+        Ranges(rays())(0.5, image(1))
