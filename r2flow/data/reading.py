@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from r2flow.errors import InputError, naming, warn_odd
+from r2flow.errors import InputError, check, naming, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
@@ -153,12 +153,15 @@ def scaled_reflectance(path: str | Path, points: Points, scale: float | None, st
     if 0 < highest < FAINT * scale:
         warn_odd(Path(path), DARK)
     scaled = points.reflectance / np.float32(scale)
+    least = float(points.reflectance.min(initial=0))
+    check(not strict or not least < 0, f"{path}: reflectance must not be negative, found {least:g}; correct the file.")
     # NaN compares false and is refused, too.
-    if strict and not (np.count_nonzero(scaled > 1.001) <= OUTLIERS * len(scaled) and scaled.min(initial=0) >= 0):
+    if strict and not (np.count_nonzero(scaled > 1.001) <= OUTLIERS * len(scaled) and least >= 0):
+        full = max(full_reflectance([points]) or 0, 255)
         raise InputError(
             f"{path}: reflectance must lie in [0, {scale:g}], found {points.reflectance.min():g} to {highest:g}. "
-            "Give the value of full reflectance, often 255: data.reading.reflectance_scale=255, that of "
-            "its part of data.parts, or --reflectance-scale 255."
+            f"Give the value of full reflectance, often {full:g}: data.reading.reflectance_scale={full:g}, that of "
+            f"its part of data.parts, or --reflectance-scale {full:g}."
         )
     return scaled.clip(0, 1)
 

@@ -12,7 +12,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from r2flow.errors import InputError, naming
+from r2flow.errors import InputError, check, naming
 from r2flow.files import atomic_write, reading
 from r2flow.registry import Registry, UnknownName, check_options
 
@@ -54,8 +54,7 @@ class Sensor:
             ),
             (scale is None or 0 < scale < math.inf, "reflectance_scale must be a positive number", scale),
         ):
-            if not holds:
-                raise InputError(f"sensor {self.name!r}: {rule}; found {str(value)[:80]}.")
+            check(holds, f"sensor {self.name!r}: {rule}; found {str(value)[:80]}.")
 
     def described(self) -> dict[str, Any]:
         """All fields that images depend on, as plain values: all except `reflectance_scale`."""
