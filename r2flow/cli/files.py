@@ -41,6 +41,7 @@ def export(
     from r2flow.generators import RectifiedFlow
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
+    from r2flow.reports.pages import prepare_folder
 
     name = checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name
     out = out or Path(f"{name}{'-network' * (what == 'network')}.{to}")
@@ -58,6 +59,8 @@ def export(
         return
     flow = isinstance(loaded.generator, RectifiedFlow)  # others are refused whatever their sampler
     sampler = loaded.generator.choose(**how.given) if flow else None
+    prepare_folder(out.parent)
+    print("torch exports the network at each step: this takes up to some minutes", flush=True)
     written = writing.export(loaded, out, sampler, what == "network")
     batch = "any batch" if written.any_batch else "batch of one scan (torch could not export a variable batch)"
     print(

@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.registry import Registry
 
 FOLDER = Path(__file__).parent
@@ -47,8 +47,7 @@ def model_file(name: str) -> Path:
 def find_model(name: str) -> Path:
     """Find and verify the file of a model."""
     path = model_file(name)
-    if not path.is_file():
-        raise InputError(f"the model {name} is not here (no {path}): install r2flow again.")
+    check(path.is_file(), f"the model {name} is not here (no {path}): install r2flow again.")
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != MODELS[name].sha256:

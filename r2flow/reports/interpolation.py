@@ -16,12 +16,7 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.sampling import warn_unsolved
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page
-from r2flow.reports.pictures import (
-    draw_birds_eye,
-    draw_perspective,
-    draw_range,
-    draw_reflectance,
-)
+from r2flow.reports.pictures import draw_birds_eye, draw_perspective, draw_range, draw_reflectance
 from r2flow.reports.tables import table
 from r2flow.reports.view import Panel, most_images, write_page
 
