@@ -47,9 +47,10 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
     Raises:
         InputError: an unknown key or choice.
     """
-    check(not isinstance(overrides, str), f"overrides are a list, as {[overrides]}; found a text.")
-    search = ",".join(f"file://{Path(folder).resolve()}" for folder in folders)
-    overrides = [*as_hydra_takes(overrides), f"hydra.searchpath=[{search}]"]
+    for name, given in ("overrides", overrides), ("folders", folders):
+        check(not isinstance(given, str), f"{name} are a list, as {[given]}; found a text.")
+    search = [f"file://{Path(folder).resolve()}" for folder in folders]
+    overrides = [*as_hydra_takes(overrides), override("hydra.searchpath", search)]
     try:
         with _hydra():
             config = with_choices(partial(hydra.compose, "train", overrides, return_hydra_config=True))
@@ -210,11 +211,11 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
 
 
 def _plain(text: str) -> str:
-    """Quote a plain value that Hydra refuses, as ü and &, or takes for a number, as the date 2011_09_26; expand ~."""
+    """Quote a plain value that Hydra refuses, as ü and &, or takes for a number, as 2011_09_26, name=1e5; expand ~."""
     key, _, value = text.strip().partition("=")
     value = re.sub("^~(?=/|$)", str(Path.home()), value.strip())
     number = re.fullmatch(r"-?\d{1,3}(_\d{3})*(\.[\d_]*)?", value)
-    odd = re.search(r"[^\t -}]|[&#]|\d_\d", text) and not number
+    odd = key == "name" or (re.search(r"[^\t -}]|[&#]|\d_\d", text) and not number)
     plain = re.fullmatch(r"[\w.@/+]+", key) and not re.search(r"""[][{}(),='"]""", value)
     return override(key, value) if odd and plain else text.strip()
 

@@ -10,6 +10,7 @@ import yaml
 
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
+from r2flow.files import write_file
 from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
@@ -103,8 +104,15 @@ def test_python_refuses_a_wrong_key_and_a_chain():
         compose(["trainer.max_step=3"])
     with pytest.raises(InputError, match=r"overrides are a list, as \['data=prepared'\]"):
         compose("data=prepared")
+    with pytest.raises(InputError, match=r"folders are a list, as \['conf'\]"):
+        compose(folders="conf")
     with pytest.raises(InputError, match="a chain of runs: train it by `r2flow train`"):
         build(compose(["experiment=demo"]))
+
+
+def test_a_folder_of_configs_may_have_any_name(tmp_path: Path):
+    write_file(tmp_path / "é, [1]" / "experiment" / "mine.yaml", "# @package _global_\nseed: 9")
+    assert compose(["experiment=mine"], [tmp_path / "é, [1]"])["seed"] == 9
 
 
 def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
