@@ -32,20 +32,22 @@ COLUMNS = {
 def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu") -> None:
     """Sample every run, compare the samples with held-out scans, and write figure, table and scans.
 
-    The first run was trained on scans. Each makes `num` scans for each number of steps.
+    The first run was trained on scans. Each makes `num` scans for each number of steps; autoencoders make none.
     """
     out = Path(out)
-    flows = {name: load_checkpoint(run, device) for name, run in runs.items()}
-    (first, *_), (last, folder) = flows.values(), list(runs.items())[-1]
+    loaded = {name: load_checkpoint(run, device) for name, run in runs.items()}
+    flows = {name: flow for name, flow in loaded.items() if flow.generator.draws} or loaded
+    first, last = next(iter(loaded.values())), list(flows)[-1]
     real, rays = held_out(first, next(iter(runs.values()))), first.sensor.rays()
     truth = panel(real, first.sensor)
     rows, drawn = [], {}
     bends = {name: bend(flow, num) for name, flow in flows.items()}
-    fixed: dict[str, int] = {n: flow.generator.sampler.steps for n, flow in flows.items() if flow.generator.fixed}  # type: ignore[attr-defined]
+    fixed = {name: getattr(flow.generator.sampler, "steps", 1) for name, flow in flows.items()
+             if flow.generator.fixed or not hasattr(flow.generator.sampler, "steps")}  # fmt: skip
     every = sorted({1, *fixed.values(), MANY})  # numbers of steps of flows that are not distilled
     cells = [(name, steps) for name in flows for steps in ([fixed[name]] if name in fixed else every)]
     for name, steps in track(cells, "sampling"):
-        batches = list(sample(flows[name], num, steps=steps))
+        batches = list(sample(flows[name], num, steps=None if name in fixed else steps))
         images = np.concatenate([batch.images.numpy() for batch in batches])
         seconds = sum(batch.seconds for batch in batches) / num
         lines = distances(truth, panel(images, first.sensor))
@@ -78,7 +80,7 @@ in 3-D        {out / "samples.html"}, in a browser
 point clouds  {out / "000000.ply"} ...
 table         {written}
 flows         {", ".join(map(str, runs.values()))}
-{what_next(folder, out, config=learned)}
+{what_next(runs[last], out, config=learned)}
 
 Shown: in how many steps a flow draws a scan, and how far its scans are from held-out ones: {", then ".join(ends)}.
 Open {out / "chain.png"} first.""",

@@ -13,11 +13,13 @@ from types import FrameType
 from typing import Any
 
 from r2flow.config import flatten, key_of, override, rule
-from r2flow.errors import InputError
+from r2flow.errors import InputError, naming
 from r2flow.files import read_json, write_file
 from r2flow.model.checkpoint import checkpoints_of, step_of
+from r2flow.runs.composing import compose
 from r2flow.runs.folder import read_config
 from r2flow.signals import LATER, code_of, listening
+from r2flow.stages import STAGES
 
 RECORD = "link.json"
 
@@ -30,17 +32,17 @@ class Link:
     parent: str | None = None  # name of the link that it starts from, if any
 
 
-def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: Sequence[str]) -> list[Link]:
+def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], configs: Sequence[str] = ()) -> list[Link]:
     """The runs of a chain in the order of their parents; `init` names a link's parent.
 
     The user's command line, `given`, follows each link's own overrides, as far as it concerns the link.
+    `configs` are further folders of configs.
     """
     if any(key_of(text) == "stage.init" for text in given):
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
     links: list[Link] = []
     for name, difference in chain.items():
-        groups = isinstance(difference, Mapping) and isinstance(difference.get("stage") or {}, Mapping)
-        if not groups or not re.fullmatch(r"[\w-][\w.-]*", str(name)):
+        if not isinstance(difference, Mapping) or not re.fullmatch(r"[\w-][\w.-]*", str(name)):
             raise InputError(f"chain.{name}: a link has a folder's name and groups of keys; found {difference!r}.")
         settings = dict(difference)
         parent = settings.pop("init", None)
@@ -55,12 +57,14 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
             if parent not in [link.name for link in links]:
                 raise InputError(f"chain.{name}.init={parent}: no link of that name comes before it.")
             own.append(override("stage.init", str(Path(folder, parent))))
-        reads_scans = parent is None and (settings.get("stage") or {}).get("init") is None
-        concerning = ("all", "scans" if reads_scans else "pairs")
-        overrides = [text for text in given if rule(key_of(text)).links in concerning]
         # Overrides given for this link alone come last: they replace the link's own keys.
         alone = [text.lstrip("+") for text in given if text.lstrip("+").startswith(f"chain.{name}.")]
-        overrides += [key for text in alone if not (key := text.removeprefix(f"chain.{name}.")).startswith("init=")]
+        alone = [key for text in alone if not (key := text.removeprefix(f"chain.{name}.")).startswith("init=")]
+        with naming(f"chain.{name}"):
+            config = compose([*own, *alone], configs)
+            on_pairs = config["data"]["name"] == "pairs" or STAGES[config["stage"]["name"]].needs_pairs
+        concerning = ("all", "pairs" if on_pairs else "scans")
+        overrides = [text for text in given if rule(key_of(text)).links in concerning] + alone
         sets = [text for text in (*own, *overrides) if key_of(text) == "data"]
         if sets and not re.match("data='?(simulated|mixed)", sets[-1]):  # scans in files are not simulated scenes
             own = [text for text in own if key_of(text) != "data.scenes"]

@@ -238,7 +238,7 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     if settings["trainer"]["fast_dev_run"]:
         raise InputError("a chain's links start from earlier runs, and trainer.fast_dev_run leaves none.")
     folder = Path(settings["run_dir"])
-    links = links_of(settings["chain"], folder, given)
+    links = links_of(settings["chain"], folder, given, _config_folders())
     if not all(map(is_finished, links)):
         _check_links(links)
     if settings["preview"]:

@@ -14,16 +14,7 @@ from PIL import Image
 
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.reports.compare import (
-    cell,
-    compare_page,
-    configuration,
-    find_runs,
-    group_runs,
-    labels,
-    read_runs,
-    rows_of,
-)
+from r2flow.reports.compare import cell, compare_page, configuration, find_runs, group_runs, labels, read_runs, rows_of
 from r2flow.reports.pages import write_page
 from r2flow.reports.training import curves_figure, read_curves, smooth
 

@@ -100,11 +100,7 @@ X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
 
 
 @pytest.mark.parametrize(
-    ("stage", "options", "steps"),
-    [
-        (Reflow, {}, 1),
-        *((Distill, {"steps": k}, k) for k in (1, 4)),
-    ],
+    ("stage", "options", "steps"), [(Reflow, {}, 1), *((Distill, {"steps": k}, k) for k in (1, 4))]
 )
 def test_a_reflowed_gaussian_takes_one_step_and_a_distilled_one_its_own_number(stage, options: dict, steps: int):
     end = solve(fitted(stage(affine(), **options), pairs, 1200).generator.velocity, X_0, steps=steps).x.detach()

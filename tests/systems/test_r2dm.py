@@ -32,13 +32,7 @@ from r2flow.systems.diffusion.process import (
     step,
     walk,
 )
-from tests.reference import (
-    assert_near,
-    assert_norms,
-    assert_published,
-    backbone_of,
-    load_case,
-)
+from tests.reference import assert_near, assert_norms, assert_published, backbone_of, load_case
 
 CONFIG: dict[str, Any] = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
@@ -280,10 +274,7 @@ def exact() -> Exact:
 def test_a_diffusion_is_the_flow_of_its_own_data(exact):
     """The straight flow of N(m, s^2) carries x_0 to m + s x_0; the schedule ends where sigma is 6e-4."""
     noise = Draws(0, [0]).start(exact.noise_shape)
-    for sampler in (
-        build_sampler("dopri5", tolerance=1e-7),
-        build_sampler("ddim", steps=1000),
-    ):
+    for sampler in (build_sampler("dopri5", tolerance=1e-7), build_sampler("ddim", steps=1000)):
         found = exact(noise, sampler=sampler)
         torch.testing.assert_close(found.x, exact.mean + exact.std * noise, rtol=0, atol=2e-3)
     s = torch.tensor([0.1, 0.5, 0.9])

@@ -11,21 +11,13 @@ import torch
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
 from r2flow.models import find_model
+from r2flow.reports.chain import report
 from r2flow.runs import launch
 from r2flow.runs.chain import Link, is_finished, links_of
 from r2flow.runs.composing import compose
 from r2flow.training import build
-from tests.training.conftest import (
-    TINY,
-    Done,
-    hold_at,
-    in_process,
-    let_go,
-    run_train,
-    start,
-    tiny,
-    wait_for,
-)  # fmt: skip
+from tests.conftest import CONFIG, write_checkpoint
+from tests.training.conftest import TINY, Done, hold_at, in_process, let_go, run_train, start, tiny, wait_for
 
 HELD = Path("held")  # in the folder that a chain is started from
 CHAIN = ["experiment=demo", "preview=null", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8",
@@ -49,7 +41,7 @@ def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatc
         return 2, True
 
     monkeypatch.setattr(launch, "_check_links", lambda links: None)
-    monkeypatch.setattr(launch, "_restart", lambda command: command)
+    monkeypatch.setattr(launch, "_config_folders", lambda: [])
     monkeypatch.setattr("r2flow.reports.outputs.write_samples", write_samples)
     monkeypatch.setattr("r2flow.runs.chain.run_chain", run_chain)
     settings = compose(["experiment=demo", f"run_dir={tmp_path}"])
@@ -73,8 +65,7 @@ def chained(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     """(folder, what it printed) of the tiny chain that nobody disturbed."""
     cwd = tmp_path_factory.mktemp("chained")
     let_go(cwd / HELD)
-    done = run_train(cwd, scans, *CHAIN)
-    return cwd / "runs" / "demo", done.stdout
+    return cwd / "runs" / "demo", run_train(cwd, scans, *CHAIN).stdout
 
 
 def state(run: Path) -> dict[str, object]:
@@ -238,10 +229,22 @@ def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path
     assert len(ran) == 1  # of both
     (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=simulated"])
     assert link.overrides[:2] == ("data.scenes=9", "data=simulated")
-    chain = {"rf1": {"data": {"scenes": 8}}, "rf2": {"init": "rf1", "data": {"scenes": 9}}}
-    files, child = links_of(chain, "runs", ["data=folder"])  # which a child does not read
-    assert "data.scenes=8" not in files.overrides
-    assert "data.scenes=9" in child.overrides
+    more = {"more": {"init": "rf1", "data": {"scenes": 9}}, "rf2": {"experiment": "reflow", "init": "more"}}
+    links = links_of({"rf1": {"data": {"scenes": 8}}, **more}, "runs", ["data=folder"])
+    assert ["data=folder" in link.overrides for link in links] == [True, True, False]  # rf2 learns from pairs
+    assert not any(text.startswith("data.scenes") for link in links for text in link.overrides)
+
+
+def test_a_chain_s_report_draws_what_each_system_can(chained: tuple[Path, str], tmp_path: Path):
+    judge, first = {"name": "dcgan", "halvings": 2}, {"name": "autoencoder", "discriminator": {"layers": 1}}
+    others = {
+        "gan.ckpt": {"stage": {"name": "gan", "discriminator": judge}, "generator": {"name": "dusty2", "doublings": 2}},
+        "ae.ckpt": {"stage": first, "generator": {"name": "vq_autoencoder"}},
+    }
+    runs = {name: write_checkpoint(tmp_path / name, CONFIG | other) for name, other in others.items()}
+    report({"rf1": chained[0] / "rf1"} | runs, tmp_path / "report", num=2)
+    rows = json.loads((tmp_path / "report" / "chain.json").read_text())["rows"]
+    assert [(row["flow"], row["steps"]) for row in rows] == [("rf1", 1), ("rf1", 32), ("gan.ckpt", 1)]
 
 
 def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_options():
