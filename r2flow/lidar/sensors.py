@@ -40,6 +40,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         e, near, far, scale = self.elevations, self.min_range, self.max_range, self.reflectance_scale
+        rows = [*range(len(e))]
         fall = len(e) >= 2 and all(a > b for a, b in pairwise(e)) and e[0] < 90 and e[-1] > -90
         for holds, rule, value in (
             (fall, "elevations must be two or more, fall from the top row down, within (-90, 90) degrees", [*e[:4]]),
@@ -47,11 +48,7 @@ class Sensor:
             (len(e) * self.columns <= MOST_PIXELS, f"at most {MOST_PIXELS:,} pixels", f"{len(e)} x {self.columns}"),
             (0 < near < far < math.inf, "needs 0 < min_range < max_range in metres", f"{near} and {far}"),
             (0 < self.height < math.inf, "height must be metres above the ground", self.height),
-            (
-                self.firing is None or sorted(self.firing) == [*range(len(e))],
-                "firing must name each row once",
-                self.firing,
-            ),
+            (self.firing is None or sorted(self.firing) == rows, "firing must name each row once", self.firing),
             (scale is None or 0 < scale < math.inf, "reflectance_scale must be a positive number", scale),
         ):
             check(holds, f"sensor {self.name!r}: {rule}; found {str(value)[:80]}.")
