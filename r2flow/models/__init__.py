@@ -27,7 +27,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "afaf18d78b0c53c1ce396a6351565c7f0e4e0ba36c8e8f274454d926f73b0147",
+        "46045d4971b4a487bd9ee885691c0076fb2ae928b0dff605f73df5b18c651f67",
     ),
     densify=Model(
         "scans of few beams or points completed to all, in one evaluation, learned from simulated scans",
