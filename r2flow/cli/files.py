@@ -60,7 +60,7 @@ def export(
     flow = isinstance(loaded.generator, RectifiedFlow)  # others are refused whatever their sampler
     sampler = loaded.generator.choose(**how.given) if flow else None
     prepare_folder(out.parent)
-    print("torch exports the network at each step: this takes up to some minutes", flush=True)
+    print("torch exports the network: this takes up to some minutes", flush=True)
     written = writing.export(loaded, out, sampler, what == "network")
     batch = "any batch" if written.any_batch else "batch of one scan (torch could not export a variable batch)"
     print(
