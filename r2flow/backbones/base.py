@@ -95,9 +95,10 @@ class Backbone(ExactBuffers):
     def _velocity(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
         y = x.to(next(self.parameters()).dtype)
         v = self.velocity(t, y, t if s is None else s) if self.second_time else self.velocity(t, y)
-        expected = self.out_channels, *x.shape[2:]
-        if v.shape[1:] != expected:  # one channel would broadcast in the loss
-            raise InputError(f"a {type(self).__name__} must give images of {expected}, found {tuple(v.shape[1:])}.")
+        expected = x.shape[0], self.out_channels, *x.shape[2:]
+        found = tuple(v.shape) if isinstance(v, Tensor) else type(v).__name__
+        if found != expected:  # one channel or one image would broadcast in the loss
+            raise InputError(f"a {type(self).__name__} must give images of {expected}, found {found}.")
         return v
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
@@ -132,9 +133,7 @@ class Backbone(ExactBuffers):
         image and does not wrap a cropped turn, so that its field differs, mostly near the edges of the crop.
         """
         if not self.croppable:
-            raise InputError(
-                f"a {type(self).__name__} cannot be evaluated on a part of its image; ask for all rows and columns."
-            )
+            raise InputError(f"a {type(self).__name__} cannot be evaluated on a part of its image: ask for all of it.")
         for what, numbers, unit in zip(("rows", "columns"), (rows, columns), self.unit, strict=True):
             assert len(numbers) % unit == int(numbers[0]) % unit == 0, f"{what} must be whole units of {unit}"
         part = copy.deepcopy(self, {id(parameter): parameter for parameter in self.parameters()})
