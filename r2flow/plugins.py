@@ -68,10 +68,10 @@ def _identity(name: str) -> str:
 
 def _import(name: str) -> str:
     """Import a module, unless its file has been imported; return its file."""
+    folder = str(Path(_identity(name)).resolve().parent)  # of the file, or the working folder
+    if folder not in sys.path:
+        sys.path.append(folder)  # as Python does for a script and for `-m`, but last
     if not name.endswith(".py"):
-        folder = str(Path.cwd())
-        if folder not in sys.path and "" not in sys.path:
-            sys.path.append(folder)  # as `python -m` does, but last
         spec = importlib.util.find_spec(name)
         if spec is not None and spec.origin is not None and _identity(spec.origin) in _loaded:
             return _identity(spec.origin)
