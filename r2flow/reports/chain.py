@@ -71,7 +71,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     written = write_page(page, out)[-1]
     print_table(rows, COLUMNS)
     before = [row for row in rows if row["flow"] == cells[0][0]][-1]
-    ends = [f"{row['flow']} in {row['steps']} ({row['mean']:.3f})" for row in (before, rows[-1])]
+    ends = dict.fromkeys(f"{row['flow']} in {row['steps']} ({row['mean']:.3f})" for row in (before, rows[-1]))
     learned = flows[last].config | {"data": first.config.get("data", {})}  # the chain's scans are its first run's
     print(
         f"""
