@@ -212,12 +212,13 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
 
 def _plain(text: str) -> str:
     """Quote a plain value that Hydra refuses, as ü and &, or takes for a number, as 2011_09_26, name=1e5; expand ~."""
-    key, _, value = text.strip().partition("=")
+    text = re.sub(r"([=,[] *)(\d{4}_\d\d_\d\d)(?= *([],]|$))", r"\1'\2'", text.strip())  # also in lists and sweeps
+    key, _, value = text.partition("=")
     value = re.sub("^~(?=/|$)", str(Path.home()), value.strip())
     number = re.fullmatch(r"-?\d{1,3}(_\d{3})*(\.[\d_]*)?", value)
     odd = key == "name" or (re.search(r"[^\t -}]|[&#]|\d_\d", text) and not number)
     plain = re.fullmatch(r"[\w.@/+]+", key) and not re.search(r"""[][{}(),='"]""", value)
-    return override(key, value) if odd and plain else text.strip()
+    return override(key, value) if odd and plain else text
 
 
 def explain(error: Exception) -> str:
