@@ -221,12 +221,12 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     image = read_range_image(path)
     if image is None:
         raise InputError(f"{path} must be a range image of floats (2 or 1, H, W), found {stored.dtype} {stored.shape}.")
-    size = "x".join(map(str, image.shape[1:]))
     if source is not None and image.shape[1] == source.shape[0]:
         return _seen(image, source.resized(columns=image.shape[2]), target)
     if source is not None or image.shape[1:] != target.shape:
-        advice = f"--from {source.name} has {source.shape[0]} rows" if source else "name its sensor by --from"
-        model = "x".join(map(str, target.shape))
+        size, model = ("x".join(map(str, shape)) for shape in (image.shape[1:], target.shape))
+        found = f" ({source.name} has {source.shape[0]})" if source else ""
+        advice = f"name its sensor of {image.shape[1]} rows by --from{found}, or give --size {size} and no --from"
         raise InputError(f"{path} is a range image of {size}, those of the model are {model}: {advice}.")
     return image_of_same(image, target)
 
