@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from lightning.pytorch.callbacks import Callback, EarlyStopping, GradientAccumulationScheduler
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.registry import Registry, check_options
 from r2flow.runs.lineage import drawn_by
 
@@ -49,14 +49,14 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
             entry = registered if isinstance(registered, Entry) else Entry(registered)  # a class, as from a plug-in
             given = entry.given(config)
             check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
-            built.append(entry.constructor(*given, **wanted[name]))
-    if any(isinstance(callback, GradientAccumulationScheduler) for callback in built):  # the loader needs one number
-        raise InputError("leave the GradientAccumulationScheduler out, and give trainer.accumulate_grad_batches.")
-    if any(isinstance(callback, EarlyStopping) for callback in built):  # such a run would count as stopped
-        raise InputError(
-            "a run ends at trainer.max_steps: leave EarlyStopping out, give callbacks.checkpoint.keep, and take the "
-            "checkpoint of the lowest val/loss."
-        )
+            made = entry.constructor(*given, **wanted[name])
+            check(isinstance(made, Callback), f"callbacks.{name} makes {type(made)}, no lightning Callback.")
+            built.append(made)
+    for kind, instead in (
+        (GradientAccumulationScheduler, "trainer.accumulate_grad_batches"),  # the loader needs one number
+        (EarlyStopping, "callbacks.checkpoint.keep: runs end at trainer.max_steps; take the one of lowest val/loss"),
+    ):
+        check(not any(isinstance(one, kind) for one in built), f"leave the {kind.__name__} out, and give {instead}.")
     if config["loggers"]:
         built.append(LearningRates("step"))
     return built
