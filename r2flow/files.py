@@ -125,8 +125,6 @@ def refuse_unreadable(path: Path, largest: int, what: str = "file", least: int =
 
 
 def _sync_folder(folder: Path) -> None:
-    if os.name == "nt":  # folders cannot be opened for syncing there
-        return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
