@@ -142,13 +142,12 @@ def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(complete, tmp_path):
     image = full_scan(tmp_path / "one.npy")
     image[:, ::2, ::3] = 0
     np.save(tmp_path / "one.npy", image)
-    asked = [tmp_path / "one.npy"]
-    assert complete(*asked, "--fill-gaps")[0] == 0
+    assert complete(tmp_path / "one.npy", "--fill-gaps")[0] == 0
     filled = np.load(tmp_path / "out" / "one.npy")
     there = image[0] > 0
     assert np.array_equal(filled[:, there], image[:, there])
     assert (filled[0][~there] > 0).any()
-    assert "fill_gaps" in refusal(complete(*asked))
+    assert "fill_gaps" in refusal(complete(tmp_path / "one.npy"))
 
 
 def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):
@@ -184,6 +183,7 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
         (None, ["--mask", "{folder}/mask.npy"], "is of (4, 4), the scans are of (8, 64) rays"),
         (None, ["--from", "vlp16"], "sensor of 8 rows by --from (vlp16 has 16), or give --size 8x64 and no --from"),
         (np.full((2, 8, 64), np.nan, np.float32), [], "give 0 for NaN"),
+        (np.zeros((0, 8, 64), np.float32), [], "must be a range image of floats (2 or 1, H, W), found float32 (0, 8"),
         (-scans()[0].numpy(), [], "must hold ranges in metres, of 0 or more"),
         (np.full((2, 8, 64), 3, np.float32), [], "reflectances of [0, 1]. Divide"),
         (scans()[0].numpy() * np.float32([[[1000]], [[1]]]), [], "none of its ranges lies within 1.45-80 m"),

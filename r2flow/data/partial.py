@@ -208,6 +208,8 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     stored = read_numbers(path)
+    if stored.dtype.kind != "f" or len(stored) not in (1, 2) or not stored.size:
+        raise InputError(f"{path} must be a range image of floats (2 or 1, H, W), found {stored.dtype} {stored.shape}.")
     r = stored[0]
     if not (stored >= 0).all() or not (stored[1:] <= 1).all() or not np.isfinite(stored).all():
         raise InputError(
@@ -219,8 +221,7 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
             f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they metres?"
         )
     image = read_range_image(path)
-    if image is None:
-        raise InputError(f"{path} must be a range image of floats (2 or 1, H, W), found {stored.dtype} {stored.shape}.")
+    assert image is not None
     if source is not None and image.shape[1] == source.shape[0]:
         return _seen(image, source.resized(columns=image.shape[2]), target)
     if source is not None or image.shape[1:] != target.shape:
