@@ -165,8 +165,6 @@ def _by_keyword(parameters: Sequence[inspect.Parameter]) -> dict[str, inspect.Pa
 def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
     """Parameters of a constructor; if a class passes `**options` to its base class, also those of the base."""
     parameters = list(inspect.signature(constructor).parameters.values())
-    if parameters and parameters[0].name == "self":  # a decorated __init__
-        parameters = parameters[1:]
     passes_on = any(p.kind is p.VAR_KEYWORD for p in parameters)
     if passes_on and inspect.isclass(constructor) and constructor.__bases__[0] is not object:
         direct = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
