@@ -216,9 +216,6 @@ class PairDataset(Dataset[Item]):
         self.source, self.seed, self.purpose, self.scans = source, seed, purpose, scans
         self.order = Permutations(0 if scans is None else len(scans), seed)
 
-    def __len__(self) -> int:
-        return len(self.source)
-
     def __getitem__(self, key: tuple[int, int]) -> Item:
         k, index = key
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
