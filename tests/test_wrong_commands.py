@@ -93,6 +93,8 @@ weights --add
 weights --add rangenet53 file.txt
 evaluate scans # nothing to compare with
 evaluate scans scans --generated-split train # no split named 'train'
+evaluate simulated:3 scans --split test # simulated:3 has no split: leave 'test' out
+evaluate scans --reference --train-split test # --train; found none
 evaluate scans --reference --steps 4 # found none
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans scans --json file.txt/a.json

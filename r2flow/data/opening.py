@@ -107,6 +107,7 @@ def open_scans(
     options, file = parse(label)
     check(reading is None or (sensor is None and size is None), "give a reading, or a sensor and a size, not both.")
     reading = reading or reading_for([label], sensor=sensor, size=size)
+    check(not split or (file is None and options.name != SIMULATED), f"{label} has no split: leave {split!r} out.")
     if file is None:
         columns = reading.columns and list(reading.columns)
         options = replace(options, split=split, scenes=num or SCENES, reading={"columns": columns})
