@@ -17,7 +17,7 @@ from r2flow.errors import check
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import selected
-from r2flow.flow.times import TIMES
+from r2flow.flow.times import build_density
 from r2flow.registry import Portion, Registry
 
 MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # u(t, x, s), in the argument order of backbones
@@ -109,7 +109,7 @@ class JumpTimes:
         check(steps and min(steps) >= 1, f"the steps of a flow map's jumps must be at least 1, found {steps}.")
         check(diagonal + ends <= 1, f"diagonal + ends must be at most 1; found {diagonal}, {ends}.")
         self.grid, self.share, self.diagonal, self.ends = grid, share, diagonal, ends
-        self.velocities = TIMES.build(time or {"name": "u_shaped"})
+        self.velocities = build_density(time or {"name": "u_shaped"})
         self.steps = torch.tensor(tuple(steps))
         grids = [build_grid(grid, 0.0, 1.0, count) for count in steps]
         self.times = pad_sequence(grids, batch_first=True, padding_value=math.nan)

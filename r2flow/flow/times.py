@@ -5,12 +5,13 @@ depends on k alone.
 """
 
 import math
-from collections.abc import Callable
-from typing import Annotated
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
+from r2flow.errors import check
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.registry import Bound, Count, Portion, Positive, Registry
 
@@ -106,3 +107,12 @@ TIMES: Registry[Callable[..., TimeDensity]] = Registry(
     late=Late,
     discrete=Discrete,
 )
+
+
+def build_density(config: Mapping[str, Any]) -> TimeDensity:
+    """Build a density of `TIMES`; InputError: it maps uniform numbers in [0, 1) to others than times, as p(t) does."""
+    density, u = TIMES.build(config), torch.arange(64) / 64
+    t = density(u)
+    within = t.shape == u.shape and ((t >= 0) & (t <= 1)).all()
+    check(within, f"time density {config['name']!r} must map u in [0, 1), (B,), to t in [0, 1], (B,): its inverse CDF.")
+    return density

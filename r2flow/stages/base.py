@@ -103,12 +103,8 @@ class Stage(L.LightningModule):
 
     def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
         """AdamW or `Muon` with a schedule for each group of parameters, in the format of `configure_optimizers`."""
-        options: dict[str, Any] = {
-            "lr": self.learning_rate,
-            "betas": (self.betas[0], self.betas[1]),
-            "eps": 1e-8,
-            "weight_decay": self.weight_decay,
-        }
+        betas = self.betas[0], self.betas[1]
+        options: dict[str, Any] = {"lr": self.learning_rate, "betas": betas, "weight_decay": self.weight_decay}
         total = max(int(self.trainer.max_steps), 1)
         warmup = min(self.warmup_steps, total)
 

@@ -5,10 +5,10 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.losses import LOSSES
 from r2flow.flow.path import interpolate
-from r2flow.flow.times import TIMES
+from r2flow.flow.times import build_density
 from r2flow.generators import Condition, Flow, Generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.registry import Count
@@ -40,7 +40,7 @@ class Rectify(SingleLoss):
                 "stage=transfer, or the stage that it was trained with."
             )
         self.loss = LOSSES[loss]
-        self.time = TIMES.build(time or {"name": "uniform"})
+        self.time = build_density(time or {"name": "uniform"})
 
     def condition(self, batch: Batch) -> Condition | None:
         """Condition of the velocity; None here."""
@@ -75,16 +75,8 @@ class Distill(Reflow):
         grid: Time grid: uniform as in the paper, or another one of `r2flow.flow.solvers.fixed.named_grid`.
     """
 
-    def __init__(
-        self,
-        generator: Generator,
-        steps: Count = 1,
-        grid: str = "uniform",
-        **options: Any,
-    ) -> None:
-        if options.pop("time", None) is not None:
-            raise InputError(
-                f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."
-            )
+    def __init__(self, generator: Generator, steps: Count = 1, grid: str = "uniform", **options: Any) -> None:
+        time = options.pop("time", None)
+        check(time is None, f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out.")
         super().__init__(generator, time={"name": "discrete", "k": steps, "grid": grid}, **options)
         generator.run_by(FixedSteps(steps, grid), fixed=True)
