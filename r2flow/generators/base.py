@@ -149,7 +149,8 @@ class Generator(nn.Module):
         given = (parse_sampler(str(name)) if name else {}) | {k: v for k, v in options.items() if v is not None}
         name = given.pop("name", None)
         default, steps = self.sampler, getattr(self.sampler, "steps", None)
-        if self.few and (name == self.few.name if name else steps and given.get("steps", steps) < steps):
+        asked = given.get("steps")
+        if self.few and (name == self.few.name if name else steps and hasattr(asked, "__index__") and asked < steps):
             default, steps = self.few, None
         if not given and name in (None, default.name):
             return default

@@ -96,11 +96,12 @@ def complete(
             sensor's range.
     """
     generator = source if isinstance(source, Generator) else source.generator
+    whole = hasattr(num, "__index__") and hasattr(batch_size, "__index__")
+    check(whole and min(num, batch_size) >= 1, f"give answers and a batch of at least 1; found {num!r}, {batch_size}.")
     if isinstance(sampler, Sampler):
         how = sampler.changed(**changes)
     else:
         how = completing(generator, sampler, several=num > 1, **changes)
-    check(min(num, batch_size) >= 1, f"give answers and a batch of at least 1; found {num}, {batch_size}.")
     plain = generator.sampler if how.completes else how  # for a scan without a known ray
     images = torch.as_tensor(images).detach().float().cpu()
     if state is None:
