@@ -110,8 +110,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
     """Convert a composed config to plain dicts, resolved and without Hydra's own keys."""
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     settings._set_parent(config._get_parent())
-    resolved = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
-    assert isinstance(resolved, dict)
+    resolved: Any = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
     return {str(key): value for key, value in resolved.items()}
 
 
@@ -227,7 +226,7 @@ def explain(error: Exception) -> str:
     if unknown := re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text):
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)
-        others = [other for other in known_keys() if not key.startswith(f"{other}.")]  # without the key's group
+        others = [other for other in known_keys(error) if not key.startswith(f"{other}.")]  # without the key's group
         return f"the config has no key '{key}'.{did_you_mean(key, others)} See --cfg job for all of them."
     if missing := re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL):
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."
@@ -244,9 +243,10 @@ def explain(error: Exception) -> str:
     return " ".join([line.strip() for line in text.splitlines() if line.strip()][:2])
 
 
-def known_keys() -> list[str]:
-    """All keys and groups of the default config."""
+def known_keys(error: Exception) -> list[str]:
+    """All keys and groups of the config that lacks one, with the choices of its command line; else of the default."""
+    node = getattr(error.__cause__, "parent_node", None)
     with _hydra():
-        settings: Any = OmegaConf.to_container(hydra.compose("train"), resolve=False)
-    leaves = (key.split(".") for key, _ in flatten(settings))
+        keys: Any = OmegaConf.to_container(hydra.compose("train") if node is None else node._get_root(), resolve=False)
+    leaves = (key.split(".") for key, _ in flatten(keys))
     return list(dict.fromkeys(".".join(leaf[: n + 1]) for leaf in leaves for n in range(len(leaf))))

@@ -100,8 +100,8 @@ def test_a_wrong_value_is_refused(tmp_path: Path, arguments: str, words: str):
 
 
 def test_python_refuses_a_wrong_key_and_a_chain():
-    with pytest.raises(InputError, match=r"no key 'trainer.max_step'. Did you mean 'trainer.max_steps'\?"):
-        compose(["trainer.max_step=3"])
+    with pytest.raises(InputError, match=r"no key 'stage.step'. Did you mean 'stage.steps'\?"):
+        compose(["stage=distill", "stage.step=3"])
     with pytest.raises(InputError, match=r"overrides are a list, as \['data=prepared'\]"):
         compose("data=prepared")
     with pytest.raises(InputError, match=r"folders are a list, as \['conf'\]"):
