@@ -81,6 +81,7 @@ def prepare(
     check(file is None, f"{scans} is one scan; give the folder of a data set.")
     options = replace(options, split=split, drives=[*drives.split(",")] if drives else None)
     drives_found = SOURCES[options.name].find_drives(options)
+    check(out.resolve() != Path(options.folder).resolve(), f"{out} holds the scans: give another folder by --out.")
     store = plan_files(out, options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
     shards, levels = len(store.shards), store.described["levels"]
     with Bar("checking", shards, "shards") as checked, Bar("preparing", shards, "shards") as made:
@@ -89,9 +90,8 @@ def prepare(
     left_out = sum(len(note["left_out"]) for note in notes)
     usable = len(store.names) - left_out
     range_error, error = (max(note["errors"][channel] for note in notes) for channel in (0, 1))
-    kept = "no reflectance in the scans"
-    if levels is not None:
-        kept = f"reflectance as n/{levels}, " + (f"at most {error:.2g} off" if error else "exactly")
+    exact = f"at most {error:.2g} off" if error else "exactly"
+    kept = "no reflectance in the scans" if levels is None else f"reflectance as n/{levels}, {exact}"
     skipped = f"; {left_out} scans left out" if left_out else ""
     there = shards - round(made.tasks[0].completed)
     of = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"
