@@ -13,13 +13,19 @@ import pytest
 from r2flow.model.checkpoint import checkpoints_of
 from tests.conftest import write_scan
 from tests.killing import is_gone, wait_until
-from tests.training.conftest import COMMAND, TINY, let_go, start, tiny
+from tests.training.conftest import COMMAND, let_go, start, tiny
 from tests.training.test_chain import CHAIN, HELD, assert_alike
 from tests.training.test_train import assert_bit_equal
 
 pytestmark = pytest.mark.slow
 
 VERB = [sys.executable, "-m", "r2flow"]
+VERBS = {
+    "simulate": ["--num", 40, "--size", "32x512", "--labels", "--workers", 2],
+    "prepare": ["scans", "--shard-scans", 2, "--workers", 2],
+    "pairs": ["run", "--num", 200, "--sampler", "midpoint", "--steps", 8, "--batch-size", 4, "--shard-mib", 0.05,
+              "--device", "cpu"],
+}  # fmt: skip
 TIMES = 10
 
 
@@ -32,12 +38,13 @@ def finish(cwd: Path, command: Sequence[object]) -> float:
     return time.monotonic() - begin
 
 
-def end_ten_times(cwd: Path, command: Sequence[object], seconds: float, seed: int) -> None:
-    """End a command that takes so long ten times, then let it come to its end.
+def end_ten_times(cwd: Path, command: Sequence[object], seed: int, into: str = "") -> None:
+    """Run a command to its end into `one`, the last word behind `into`; end it ten times, then finish, into `ended`.
 
     Signals go to the process alone and to its whole group by turns, as `kill` and a terminal send them.
     """
-    draw, ended = random.Random(seed), 0
+    seconds = finish(cwd, [*command, f"{into}one"])
+    command, draw, ended = [*command, f"{into}ended"], random.Random(seed), 0
     for number in range(TIMES):
         by = (signal.SIGTERM, signal.SIGINT, signal.SIGKILL)[number % 3]
         process = start(cwd, command, command=[])
@@ -62,45 +69,21 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_simulate(tmp_path: Path):
-    command = [*VERB, "simulate", "--num", 40, "--size", "32x512", "--labels", "--workers", 2, "--out"]
-    seconds = finish(tmp_path, [*command, "one"])
-    end_ten_times(tmp_path, [*command, "ended"], seconds, 0)
-    assert files(tmp_path / "ended") == files(tmp_path / "one")
-
-
-def test_prepare(tmp_path: Path):
+@pytest.mark.parametrize(("seed", "verb"), [*enumerate(VERBS)])
+def test_a_verb(saved, tmp_path: Path, seed: int, verb: str):
     for number in range(60):
         write_scan(tmp_path / "scans" / f"{number}.bin", number)
-    command = [*VERB, "prepare", "scans", "--shard-scans", 2, "--workers", 2, "--out"]
-    seconds = finish(tmp_path, [*command, "one"])
-    end_ten_times(tmp_path, [*command, "ended"], seconds, 1)
-    assert files(tmp_path / "ended") == files(tmp_path / "one")
-
-
-def test_pairs(saved, tmp_path: Path):
-    command = [*VERB, "pairs", saved[0], "--num", 200, "--sampler", "midpoint", "--steps", 8, "--batch-size", 4,
-               "--shard-mib", 0.05, "--device", "cpu", "--out"]  # fmt: skip
-    seconds = finish(tmp_path, [*command, "one"])
-    end_ten_times(tmp_path, [*command, "ended"], seconds, 2)
+    end_ten_times(tmp_path, [*VERB, verb, *VERBS[verb], "--out"], seed)
     assert files(tmp_path / "ended") == files(tmp_path / "one")
 
 
 def test_training(scans: Path, tmp_path: Path):
-    def command(name: str) -> list[str]:
-        return [*COMMAND, *tiny(scans, f"name={name}", "data.workers=2", "data.memory_gib=0")]
-
-    seconds = finish(tmp_path, command("one"))
-    end_ten_times(tmp_path, command("ended"), seconds, 3)
+    end_ten_times(tmp_path, [*COMMAND, *tiny(scans, "data.workers=2", "data.memory_gib=0")], 3, "name=")
     assert_bit_equal(tmp_path / "runs" / "one", tmp_path / "runs" / "ended")
 
 
 def test_a_sweep(scans: Path, tmp_path: Path):
-    def command(folder: str) -> list[str]:
-        return [*COMMAND, "-m", *tiny(scans, "seed=1,2", f"hydra.sweep.dir={folder}", "samples.num=0")]
-
-    seconds = finish(tmp_path, command("one"))
-    end_ten_times(tmp_path, command("ended"), seconds, 4)
+    end_ten_times(tmp_path, [*COMMAND, "-m", *tiny(scans, "seed=1,2", "samples.num=0")], 4, "hydra.sweep.dir=")
     jobs = [path.name for path in (tmp_path / "one").iterdir() if checkpoints_of(path)]
     assert len(jobs) == 2
     for job in jobs:
@@ -109,6 +92,5 @@ def test_a_sweep(scans: Path, tmp_path: Path):
 
 def test_a_chain(scans: Path, tmp_path: Path):
     let_go(tmp_path / HELD)
-    seconds = finish(tmp_path, [*COMMAND, *TINY, f"data.root={scans}", *CHAIN, "name=one"])
-    end_ten_times(tmp_path, [*COMMAND, *TINY, f"data.root={scans}", *CHAIN, "name=ended"], seconds, 5)
+    end_ten_times(tmp_path, [*COMMAND, *tiny(scans, *CHAIN)], 5, "name=")
     assert_alike(tmp_path / "runs" / "one", tmp_path / "runs" / "ended")
