@@ -3,7 +3,6 @@
 import json
 import math
 import zlib
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,10 +43,13 @@ SENSOR = SENSORS["hdl64e"].resized(8, 64)
 READING = Reading(SENSOR)
 
 
-def figures(real: ScanSet, generated: ScanSet, cache: Cache | None = None, work: Work | None = None):
+def measured(real: ScanSet, generated: ScanSet, cache: Cache | None = None, work: Work | None = None):
     metrics, work = {"jsd": JSD(), "mmd": MMD()}, work or Work()
-    measured = measure(metrics, gather_real(metrics, real, work, cache), generated, work)
-    return {name: value for one in measured for name, value in one.figures.items()}
+    return measure(metrics, gather_real(metrics, real, work, cache), generated, work)
+
+
+def figures(*given, **how) -> dict[str, float]:
+    return {name: value for one in measured(*given, **how) for name, value in one.figures.items()}
 
 
 def test_figures_do_not_depend_on_order_batches_or_reading_processes(real, generated, tmp_path):
@@ -201,7 +203,7 @@ class TestExtremes:
         made = images(4, 2)
         made[1] = 0
         made[2, 0] = np.where(made[2, 0] > 0, 70, 0)  # beyond the mask
-        found = self.measured(real, folder(tmp_path / "g", made))
+        found = measured(*(open_scans(str(one), READING) for one in (real, folder(tmp_path / "g", made))))
         assert all(math.isfinite(value) for one in found for value in one.figures.values())
         assert all(one.protocol["sizes"]["generated_empty"] == 2 for one in found)
         assert all("2 of 4 generated scans" in " ".join(one.remarks) for one in found)
@@ -209,15 +211,10 @@ class TestExtremes:
     def test_points_out_of_view_are_an_empty_scan_and_no_points_a_clear_error(self, real, tmp_path):
         write_points(tmp_path / "g" / "0.ply", np.array([[0, 0, 9.0]]), np.array([0.5]))
         assert not open_scans(str(tmp_path / "g"), READING).source[0].any()
-        found = self.measured(real, tmp_path / "g")
+        found = measured(*(open_scans(str(one), READING) for one in (real, tmp_path / "g")))
         for one in found:
             assert any(math.isnan(value) for value in one.figures.values()) <= bool(one.remarks)
             assert "single" in " ".join(one.remarks)
-
-    def measured(self, real: Path, generated: Path) -> Sequence[measuring.MetricResult]:
-        metrics = {"jsd": JSD(), "mmd": MMD()}
-        gathered = gather_real(metrics, open_scans(str(real), READING), Work())
-        return measure(metrics, gathered, open_scans(str(generated), READING), Work())
 
 
 def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path, monkeypatch):

@@ -24,8 +24,7 @@ from r2flow.noise import standard_normal
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
 from r2flow.store import Store
-from tests.conftest import numbers as of_source
-from tests.conftest import prepare_folder, write_scan
+from tests.conftest import numbers, prepare_folder, write_scan
 from tests.fields import Field
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
@@ -40,10 +39,6 @@ def write_image(path: Path, number: int, channels: int = 2, size: tuple[int, int
     image[1:, 1:, :4] = 0.5
     np.save(path, image)
     return path
-
-
-def numbers(scans) -> list[int]:
-    return of_source(scans.source)
 
 
 def test_a_usual_sensor_is_the_data_set_s():
@@ -62,7 +57,7 @@ class TestSamples:
     def test_nobody_types_their_size(self, tmp_path: Path):
         scans = open_scans(self.samples(tmp_path))
         assert scans.sensor == SENSOR
-        assert numbers(scans) == [2]
+        assert numbers(scans.source) == [2]
         assert own_reading(tmp_path / "000000.npy") == READING  # one of them, too
 
     def test_another_size_is_one_line(self, tmp_path: Path):
@@ -223,14 +218,14 @@ def test_a_function_that_finds_drives_and_one_line_are_a_data_set(tmp_path: Path
     SOURCES.add("weeks", Layout(find_weeks, {"train": ("week-1", "week-2"), "test": ("week-3",)}))
     for number in range(9):
         write_scan(tmp_path / f"week-{1 + number // 3}" / f"{number}.bin", number)
-    assert numbers(open_scans(f"weeks:{tmp_path}", READING, "test")) == [6, 7, 8]
+    assert numbers(open_scans(f"weeks:{tmp_path}", READING, "test").source) == [6, 7, 8]
     assert resolve_reflectance("auto", {"name": "weeks", "root": str(tmp_path)})
     held = {"data": {"name": "weeks", "root": str(tmp_path), "split": "test"}}
     data = ScanDataModule(SENSOR, Encoding(SENSOR), 0, name="weeks", root=str(tmp_path), split="train", validation=held)
     data.setup()
     assert [len(data.training_source), len(data.validation_source)] == [6, 3]
     prepare_folder(tmp_path, tmp_path / "shards", SENSOR, "weeks")
-    assert numbers(open_scans(tmp_path / "shards", split="test")) == [6, 7, 8]
+    assert numbers(open_scans(tmp_path / "shards", split="test").source) == [6, 7, 8]
 
 
 class Walls(ScanSource):
@@ -306,7 +301,7 @@ def test_a_part_of_a_part_is_not_the_same_part_of_the_whole(numbered: Path):
     whole = open_scans(numbered, READING)
     for some, other in ((8, 9), (8, None)):
         a, b = (whole.limited(most).part(range(4), "first") for most in (some, other))
-        assert numbers(a) != numbers(b)
+        assert numbers(a.source) != numbers(b.source)
         assert a.identity != b.identity
 
 
