@@ -11,6 +11,7 @@ from r2flow.generators.surroundings import nearest_returns
 from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import SENSORS
+from tests.conftest import ground
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 SHAPE = SENSOR.shape
@@ -68,28 +69,19 @@ def test_a_mask_from_a_file_has_the_size_of_the_scans(tmp_path):
             parse_mask(str(tmp_path / "other.npy"))
 
 
-def ground() -> np.ndarray:
-    """A plane 1.73 m below the sensor: r = 1.73 / sin(-e); every ray above -4 degrees looks into the sky."""
-    elevation = np.deg2rad(np.asarray(SENSOR.elevations))
-    r = np.where(elevation < np.deg2rad(-4), 1.73 / np.sin(-elevation).clip(1e-3), 0)
-    image = np.zeros((2, *SHAPE), dtype=np.float32)
-    image[0], image[1] = r[:, None], (r > 0)[:, None] * 0.25
-    return image
-
-
 @pytest.mark.parametrize("name", INTERPOLATIONS)
 def test_interpolation_keeps_what_is_measured_and_fills_the_rest(name):
-    image = ground()
+    image = ground(SENSOR)
     measured = parse_mask("points:0.3")(WHOLE, draws())
     found = INTERPOLATIONS[name](np.where(measured, image, 7), measured)
     assert (found[:, measured] == image[:, measured]).all()
     assert ((found[0] > 0) == (image[0] > 0)).mean() > 0.9
-    assert np.allclose(found[1][found[0] > 0], 0.25)
+    assert np.allclose(found[1][found[0] > 0], 0.3)
     assert not INTERPOLATIONS[name](image, np.zeros(SHAPE, dtype=bool)).any()  # nothing is guessed from nothing
 
 
 def test_the_inverse_of_range_is_nearly_linear_on_the_ground():
-    image = ground()
+    image = ground(SENSOR)
     measured = parse_mask("rows:2")(WHOLE, draws())
     hidden = ~measured & (image[0] > 0)
     hidden[: np.flatnonzero(measured.any(1) & (image[0] > 0).all(1))[0]] = False  # above the first known ground
