@@ -23,10 +23,6 @@ def test_a_draw_is_that_of_its_seed_purpose_index_and_step(purpose: str, seed: i
     assert torch.equal(standard_normal((2, 4, 8), seed, purpose, index, step), expected(seed, purpose, index, step))
 
 
-def test_no_two_purposes_share_a_draw():
-    assert len({expected(0, purpose, 0)[0, 0, 0].item() for purpose in PURPOSES}) == len(PURPOSES)
-
-
 @pytest.mark.parametrize("number", [-1, 2**64, 1.5])
 def test_a_seed_or_index_that_is_none_is_an_input_error(number):
     for seed, index in ((number, 0), (0, number)):
