@@ -1,10 +1,9 @@
 """The vanilla GAN, DUSty v1 and DUSty v2: networks, losses, rules, augmentation, data, published files and training."""
 
-import functools
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -38,11 +37,6 @@ NETWORKS = [
 PUBLISHED = ["vanilla", "dusty1", "dusty2"]
 
 
-@pytest.fixture
-def cases(shared: Path) -> Callable[[str], dict[str, Any]]:
-    return functools.partial(load_case, shared)
-
-
 def space(rows: int, columns: int, channels: int = 1) -> Any:
     """What a GAN reads of a model space."""
     return SimpleNamespace(shape=(channels, rows, columns), rays=torch.zeros(2, rows, columns))
@@ -71,8 +65,8 @@ def discriminator_of(cfg: Mapping[str, Any]) -> nn.Module:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_a_generator_is_the_published_one(cases: Any, name: str):
-    case, tolerance = cases(f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
+def test_a_generator_is_the_published_one(shared: Path, name: str):
+    case, tolerance = load_case(shared, f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
     network = generator_of(case["cfg"]).train(case["mode"] == "train")
     assert list(network.state_dict()) == list(case["state_dict"])
     network.load_state_dict(case["state_dict"])
@@ -88,8 +82,8 @@ def test_a_generator_is_the_published_one(cases: Any, name: str):
 
 
 @pytest.mark.parametrize("name", ["vanilla_d_32x64", "dusty2_d_64x64"])
-def test_a_discriminator_is_the_published_one_with_its_penalty(cases: Any, name: str):
-    case, tolerance = cases(f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
+def test_a_discriminator_is_the_published_one_with_its_penalty(shared: Path, name: str):
+    case, tolerance = load_case(shared, f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
     network = discriminator_of(case["cfg"])
     assert list(network.state_dict()) == list(case["state_dict"])
     network.load_state_dict(case["state_dict"])
@@ -145,8 +139,8 @@ def test_a_turn_by_whole_columns_is_a_roll():
     torch.testing.assert_close(style_gan.turned_back(x, torch.tensor([2 / 8, 5 / 8])), expected)
 
 
-def test_losses_and_their_gradients(cases: Any):
-    case = cases("gan_losses.pt")
+def test_losses_and_their_gradients(shared: Path):
+    case = load_case(shared, "gan_losses.pt")
     for name, loss in (("nsgan_G", lambda real, fake: generator_loss(fake)), ("nsgan_D", discriminator_loss)):
         expected = case["cases"][name]
         real, fake = (case[key].clone().requires_grad_() for key in ("y_real", "y_fake"))
@@ -171,8 +165,8 @@ def test_a_mask_is_drawn_with_its_probability_and_has_the_relaxed_gradient():
     torch.testing.assert_close(logit.grad, soft * (1 - soft) / 0.5)
 
 
-def test_rules_of_training(cases: Any):
-    case = cases("gan_training_rules.pt")
+def test_rules_of_training(shared: Path):
+    case = load_case(shared, "gan_training_rules.pt")
     ema = case["ema_decay"]
     found = [
         half_life_decay(step, ema["batch_size"], 1000 * ema["ema_kimg"], ema["rampup"]) for step in ema["iteration"]
@@ -197,8 +191,8 @@ def test_rules_of_training(cases: Any):
     assert torch.equal(Warmup(images=100, blur=1.7)(blur["x"], 100, None), blur["x"])
 
 
-def test_p_of_ada_follows_the_published_trace(cases: Any):
-    case = cases("gan_training_rules.pt")["ada_p"]
+def test_p_of_ada_follows_the_published_trace(shared: Path):
+    case = load_case(shared, "gan_training_rules.pt")["ada_p"]
     augment = AdaptiveAugment(case["p_target"], case["kimg"], highest=case["p_max"], every=case["every"])
     signs, found = [], []
     for step, scores in enumerate(case["preds"]):
@@ -211,8 +205,8 @@ def test_p_of_ada_follows_the_published_trace(cases: Any):
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_augmentation_is_the_published_one(cases: Any, number: int):
-    case = cases("ada_transforms.pt")["cases"][number]
+def test_augmentation_is_the_published_one(shared: Path, number: int):
+    case = load_case(shared, "ada_transforms.pt")["cases"][number]
     names = [name for name in (*TRANSFORMATIONS, "hue", "saturation") if case["policy"].get(name)]
     drawn = [tensor.float() for _, tensor in case["draws"]]
     given = zip(names, zip(drawn[::2], drawn[1::2], strict=True), strict=True)
@@ -273,8 +267,8 @@ def test_whole_shifts_on_a_ring_are_rolls_where_the_filter_lets_all_pass():
     assert_near(transformed(x, torch.ones(2, 1), torch.tensor([[0.0], [5.0]])), x.roll(5, 3), 1e-3)
 
 
-def test_data_are_the_published_ones(cases: Any):
-    case = cases("dusty_data.pt")
+def test_data_are_the_published_ones(shared: Path):
+    case = load_case(shared, "dusty_data.pt")
     sensor = SENSORS["hdl64e_rings"].resized(16, 64)
     assert (sensor.min_range, sensor.max_range) == (case["min_depth"], case["max_depth"])
     encoding = Encoding(sensor, "inverse_depth", reflectance=False)
@@ -287,8 +281,8 @@ def test_data_are_the_published_ones(cases: Any):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 @pytest.mark.parametrize("averaged", [True, False])
-def test_a_published_file_is_a_generator(cases: Any, shared: Path, name: str, averaged: bool):
-    io = cases(f"{name}_published_io.pt")
+def test_a_published_file_is_a_generator(shared: Path, name: str, averaged: bool):
+    io = load_case(shared, f"{name}_published_io.pt")
     checkpoint = load_checkpoint(shared / "oracle_baselines" / f"{name}_published.pth", averaged=averaged)
     assert checkpoint.config["published"] == io["cfg"]
     assert checkpoint.step == 1_000_000 // 32
