@@ -26,6 +26,7 @@ from r2flow.simulator.folder import SimulatedFolder
 from r2flow.store import Store
 from tests.conftest import numbers, prepare_folder, write_scan
 from tests.fields import Field
+from tests.simulator.test_folder import write_folder
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
 READING = Reading(SENSOR)
@@ -107,9 +108,7 @@ class TestWhatR2FlowWrote:
 
     def test_simulated_scans_need_no_sensor_and_no_size(self, tmp_path: Path, caplog):
         sensor = SENSORS["vlp32c"].resized(16, 64)
-        folder = SimulatedFolder(tmp_path, sensor, 3, ("ply",))
-        folder.begin()
-        folder.simulate(5)
+        write_folder(SimulatedFolder(tmp_path, sensor, 3, ("ply",)), [5], workers=1)
         reading = reading_for([tmp_path, "simulated:3"])
         assert (reading.sensor, reading.reflectance_scale) == (replace(sensor, reflectance_scale=None), 1.0)
         image = simulate(sensor, 3, 5).image
@@ -124,10 +123,8 @@ class TestWhatR2FlowWrote:
 
     def test_another_sensor_than_their_own_is_warned_of(self, tmp_path: Path, caplog):
         for name in ("pandar64", "vlp16"):
-            folder = SimulatedFolder(tmp_path / name, SENSORS[name].resized(32, 64), 3, ("bin",))
-            folder.begin()
-            folder.simulate(5)
-            open_scans(folder.folder, Reading(SENSORS[name].resized(16, 64)))
+            write_folder(SimulatedFolder(tmp_path / name, SENSORS[name].resized(32, 64), 3, ("bin",)), [5], workers=1)
+            open_scans(tmp_path / name, Reading(SENSORS[name].resized(16, 64)))
         assert not caplog.text  # fewer rows are of the same sensor
         for root in (tmp_path / "vlp16", tmp_path):  # the second one also has a folder of the requested sensor
             caplog.clear()

@@ -19,6 +19,7 @@ from r2flow.noise import Draws
 from r2flow.reports.view import MOST, Panel, page
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
+from tests.simulator.test_folder import write_folder
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
 RAYS = SENSOR.rays()
@@ -195,8 +196,7 @@ class TestTheVerb:
 
     def test_sees_scans_through_the_sensor_of_a_model(self, r2flow, saved, scan, tmp_path):
         own = SimulatedFolder(tmp_path / "own", SENSORS["vlp16"].resized(16, 64), 0, ("bin",))
-        own.begin()
-        own.simulate(0)
+        write_folder(own, [0], workers=1)
         wide = scan, saved[0], "--size", "64x1024"
         for what, rows in (((saved[0], scan, own.folder), [8, 8, 16]), (wide, [64, 8])):
             assert r2flow("view", *what, "--num", 1, "--out", tmp_path / "a.html")[::2] == (0, "")

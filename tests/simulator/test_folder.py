@@ -1,6 +1,5 @@
 """`r2flow simulate`: the files hold the simulator's scans, however many processes write them and in whatever order."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
+from r2flow.store import read_manifest
 from tests.conftest import files
 
 SMALL = SENSORS["hdl64e"].resized(16, 128)
@@ -70,7 +70,4 @@ def test_the_verb_writes_the_scans_of_any_sensor(r2flow, tmp_path, sensor):
     assert "1 scans (npy, ply)" in r2flow.said("simulate", *asked, "--out", tmp_path)
     image = np.load(tmp_path / "000000.npy")
     np.testing.assert_array_equal(image, simulate(sensor.resized(16, 64), 4, 0).image)
-    assert (
-        json.loads((tmp_path / "manifest.json").read_text("utf-8"))["recipe"]["reading"]["sensor"]["name"]
-        == sensor.name
-    )
+    assert read_manifest(tmp_path)["recipe"]["reading"]["sensor"]["name"] == sensor.name
