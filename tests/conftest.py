@@ -44,6 +44,7 @@ CONFIG: dict[str, Any] = {
     "stage": {"name": "rectify"},
     "seed": 0,
 }
+SENSOR = SENSORS["hdl64e"].resized(8, 64)  # of that flow
 
 TINY: dict[str, dict[str, Any]] = {
     "hdit": {"base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},

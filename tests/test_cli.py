@@ -18,7 +18,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.export import Difference
 from r2flow.samplers import build_sampler
-from tests.conftest import CONFIG, tiny_options, write_checkpoint, write_run, write_scan
+from tests.conftest import CONFIG, SENSOR, tiny_options, write_checkpoint, write_run, write_scan
 from tests.test_sampling import network, scans
 
 
@@ -164,9 +164,6 @@ def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_b
     np.testing.assert_allclose(np.linalg.norm(xyz, axis=1), found, rtol=1e-5)
     assert "bin centres" not in r2flow("sample", published, *drawn, "--format", "npy")[2]
     assert "bin centres" not in r2flow("sample", saved[0], *drawn, "--format", "ply")[2]
-
-
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
 
 
 @pytest.fixture

@@ -23,11 +23,10 @@ from r2flow.model.completion import Completed
 from r2flow.noise import generator
 from r2flow.reports.completed import hidden_errors
 from r2flow.simulator import simulate
-from tests.conftest import prepare_folder, refusal, success, write_run
+from tests.conftest import SENSOR, prepare_folder, refusal, success, write_run
 from tests.test_completion import network
 from tests.test_sampling import scans
 
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
 VLP16 = SENSORS["vlp16"]
 TRANSFER = {"name": "transfer"}
 

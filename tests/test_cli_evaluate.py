@@ -26,9 +26,8 @@ from r2flow.metrics.sums import SumMetric
 from r2flow.model.checkpoint import Checkpoint, save_checkpoint
 from r2flow.reports.paper import read_results
 from r2flow.samplers import build_sampler
-from tests.conftest import CONFIG, folder, images
+from tests.conftest import CONFIG, SENSOR, folder, images
 from tests.metrics.conftest import Summary
-from tests.test_evaluation import SENSOR
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
 QUICK = ("--metrics", "jsd,mmd", "--size", "8x64", "--workers", 0)

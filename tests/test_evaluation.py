@@ -30,16 +30,14 @@ from r2flow.evaluation.measuring import (
 from r2flow.evaluation.sets import reference_sets, sampled_set
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
-from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.jsd_mmd import JSD, MMD
 from r2flow.metrics.panel import PANEL, REFLECTANCE
 from r2flow.noise import standard_normal
 from r2flow.reports.evaluation import Comparison, verdict
 from r2flow.samplers import build_sampler
-from tests.conftest import folder, images
+from tests.conftest import SENSOR, folder, images
 from tests.test_sampling import flow
 
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
 READING = Reading(SENSOR)
 
 

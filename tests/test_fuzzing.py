@@ -22,7 +22,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from r2flow.store import Store
-from tests.conftest import CONFIG, prepare_folder
+from tests.conftest import CONFIG, SENSOR, prepare_folder
 from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
 
 ROOT, SEED = Path(__file__).resolve().parents[1], 20261120
@@ -31,7 +31,6 @@ DRAW = np.random.default_rng(0)
 XYZ = np.round(DRAW.standard_normal((64, 3)) * [20, 20, 2], 2).astype(np.float32)
 REFLECTANCE = np.round(DRAW.random(64), 2).astype(np.float32)
 TABLE = np.column_stack([XYZ, REFLECTANCE])
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
 
 
 def write_scans(folder: Path) -> None:

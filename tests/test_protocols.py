@@ -17,8 +17,7 @@ from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.protocols import PAPER, R2FLOW, published_choice
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
-from tests.conftest import folder, images
-from tests.test_evaluation import SENSOR
+from tests.conftest import SENSOR, folder, images
 
 READING = Reading(SENSOR, convention="reference")
 H, W = SENSOR.shape

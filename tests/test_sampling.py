@@ -18,7 +18,6 @@ from r2flow.generators import Generator, Sampler, build_generator
 from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.region import region
-from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import completing
 from r2flow.model.sampling import draw, evaluated_region, sample
@@ -26,10 +25,9 @@ from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
 from r2flow.runs.composing import compose
 from r2flow.samplers import build_sampler
-from tests.conftest import CONFIG
+from tests.conftest import CONFIG, SENSOR
 from tests.fields import Field
 
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
 M, S = 0.2, 0.4
 SIZE = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true"]
 

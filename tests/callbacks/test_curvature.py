@@ -12,16 +12,14 @@ from r2flow.callbacks import EMA, SamplePictures
 from r2flow.callbacks.curvature import Curvature
 from r2flow.callbacks.periodic import Periodic
 from r2flow.lidar.encoding import Encoding, ModelSpace
-from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import standard_normal
 from r2flow.reports import pictures
 from r2flow.reports.training import read_curves
-from tests.conftest import quiet_trainer
+from tests.conftest import SENSOR, quiet_trainer
 from tests.fields import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*")
 
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
 SPACE = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays())
 # Of 1, 2 and 3 at steps 2 and 3: the average copies 1, takes 1 - 2^(-2/3) of it and the rest of 2, then half of 3.
 AVERAGES = 1 + 2 ** (-2 / 3), (1 + 2 ** (-2 / 3) + 3) / 2

@@ -12,10 +12,7 @@ from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation.copies import copies_result, find_nearest
 from r2flow.evaluation.measuring import Work
-from r2flow.lidar.sensors import SENSORS
-from tests.test_evaluation import folder, images
-
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
+from tests.conftest import SENSOR, folder, images
 
 
 @pytest.fixture

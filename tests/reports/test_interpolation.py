@@ -17,7 +17,8 @@ from r2flow.reports.interpolation import interpolation, interpolation_figure
 from r2flow.reports.pictures import figure_pixels
 from r2flow.samplers import build_sampler
 from r2flow.store import Store
-from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
+from tests.conftest import SENSOR
+from tests.test_sampling import GaussianFlow, flow, scans
 
 
 def test_extreme_scans_are_drawn_too():

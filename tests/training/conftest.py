@@ -139,13 +139,9 @@ def link_in_process(command: Sequence[str]) -> int:
 
 def run_train(cwd: Path, scans: Path, *overrides: str, check: bool = True, flags: tuple[str, ...] = ()) -> Done:
     """The tiny run, a chain's links and a sweep's jobs too in this process."""
-    return run_links(cwd, [*flags, *tiny(scans, *overrides)], check)
-
-
-def run_links(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("r2flow.runs.chain.run_process", link_in_process)
-        return in_process(cwd, arguments, check)
+        return in_process(cwd, [*flags, *tiny(scans, *overrides)], check)
 
 
 def start(cwd: Path, arguments: Sequence[object], command: Sequence[str] = COMMAND) -> subprocess.Popen[str]:
