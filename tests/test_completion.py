@@ -72,11 +72,6 @@ def test_a_scan_of_which_nothing_is_known_is_the_sample_of_its_number():
     assert torch.equal(later.images, found[2, :1])
 
 
-def test_a_scan_of_which_nothing_is_known_is_refused_by_a_model_that_only_completes():
-    with pytest.raises(InputError, match="give one of which a ray is known"):
-        network().complete(torch.zeros(1, 2, *SHAPE))
-
-
 def test_a_scan_of_which_nothing_is_known_is_drawn_in_the_precision_that_was_asked_for():
     flow = network("rectified_flow")
     nothing, coarse = torch.zeros(1, 2, *SHAPE), flow.sample(1, precision="bf16-mixed")

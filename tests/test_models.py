@@ -31,7 +31,7 @@ def test_a_model_of_the_package_draws(name):
     assert name_of(found.path) == name
     assert all(value.isfinite().all() for value in found.generator.state_dict().values())
     if not found.generator.draws:
-        with pytest.raises(InputError, match="r2flow complete"):
+        with pytest.raises(InputError, match="give one of which a ray is known, as r2flow complete"):
             found.sample(1)
         return
     images = found.sample(1, steps=1)

@@ -103,7 +103,6 @@ def test_the_verb_measures_what_it_is_asked_for(r2flow):
     options = ("--only", "hdit_tiny,adm_unet_large", "--size", "16x64", "--repeats", 0, "--device", "cpu")
     out = r2flow.said("report", "backbones", *options)
     assert [line.split()[0] for line in out.splitlines()[2:4]] == ["hdit_tiny", "adm_unet_large"]
-    assert "'hdit'" in r2flow.refusal("report", "backbones", "--only", "hditt", "--repeats", 0)
 
 
 @pytest.mark.parametrize(("load", "busy"), [(0.0, False), (1e4, True)])

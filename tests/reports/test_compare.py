@@ -219,18 +219,11 @@ def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path, 
     assert f"{log}: ignored 1 values" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("a: 1", "config.yaml is not the config of a run"),
-        ("stage: [unclosed", "config.yaml is damaged"),
-        ("{stage: {name: rectify}, backbone: {name: hdit}, data: {}}", "config.yaml is not the config of a run"),
-    ],
-)
-def test_a_folder_that_is_no_run_is_named(tmp_path, content, words):
+@pytest.mark.parametrize("content", ["a: 1", "{stage: {name: rectify}, backbone: {name: hdit}, data: {}}"])
+def test_a_folder_that_is_no_run_is_named(tmp_path, content):
     (tmp_path / "thing").mkdir()
     (tmp_path / "thing" / "config.yaml").write_text(content)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=r"config\.yaml is not the config of a run"):
         read_runs([tmp_path / "thing"])
 
 

@@ -262,7 +262,6 @@ def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_optio
         (["stage.init=x"], "stage.init is each link's own"),
         # What only building finds out, in links that would run last.
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
-        (["+chain.td2.data.augment.flip=true"], "chain.td2: data.augment changes scans"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
         (["+chain.td2.data.batch_size=3", "trainer.accumulate_grad_batches=2"], "chain.td2: data.batch_size=3"),
     ],
