@@ -168,18 +168,11 @@ def run(tmp_path: Path) -> Path:
     return write_run(tmp_path / "run", network(), {"name": "rectify"}, 0.3)
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> list[Path]:
-    """Two scans, as .bin and .ply."""
-    paths = [tmp_path / "scans" / "one.bin", tmp_path / "scans" / "two.ply"]
-    for path, image in zip(paths, scans(2).numpy(), strict=True):
-        write_points(path, *image_to_points(image, SENSOR.rays()))
-    return paths
-
-
 @pytest.mark.usefixtures("quick_pictures")
-def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):
-    out = tmp_path / "between"
+def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
+    out, files = tmp_path / "between", [tmp_path / "scans" / "one.bin", tmp_path / "scans" / "two.ply"]
+    for path, image in zip(files, scans(2).numpy(), strict=True):
+        write_points(path, *image_to_points(image, SENSOR.rays()))
     said = r2flow.said("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8)
     assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [f"{i:03d}.ply" for i in range(4)]
     for index in range(4):

@@ -203,15 +203,11 @@ class MeanRange(SumMetric):
         return {"mine": abs(means[0] - means[1])}
 
 
-@pytest.fixture
-def plugged_in(monkeypatch):
+def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, monkeypatch):
     for table in (METRICS, EXTRACTORS):
         monkeypatch.setattr(table, "_entries", dict(table._entries))
     METRICS.add("mine", MeanRange)
     EXTRACTORS.add("means", SimpleNamespace(trained=partial(Summary, "means")))
-
-
-def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, plugged_in):
     options = ("--metrics", "mine,frechet_means,kid_means,panel", *QUICK[2:])
     said = r2flow.said("evaluate", real, generated, *options, "--json", tmp_path / "e.json")
     ranges = [scans[:, 0][(scans[:, 0] > 0) & (scans[:, 0] < 63)].mean() for scans in (images(12, 1), images(10, 2))]

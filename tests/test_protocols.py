@@ -111,12 +111,10 @@ def test_scans_without_measured_points_are_refused(generated, kitti_360):
         PAPER.check(open_scans(str(generated), READING))
 
 
+@pytest.mark.usefixtures("coarse")
 def test_several_sets_stand_in_one_table_with_references_and_baselines(
     r2flow, measured, generated, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)  # millions of cells take time
-    monkeypatch.setattr("r2flow.metrics.lidm.JSDLiDM.width", 200**2)
-    monkeypatch.setattr("r2flow.metrics.lidm.COARSE", 5)
     monkeypatch.setenv("R2FLOW_CACHE", str(tmp_path / "cache"))
     other = folder(tmp_path / "other", images(3, 7))
     options = ("--metrics", "all", "--size", "8x64", "--workers", 0, "--json", tmp_path / "e.json")

@@ -80,14 +80,6 @@ def given(metric: ScanMetric, real: ArrayLike, generated: ArrayLike) -> dict[str
 
 
 @pytest.fixture
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Larger cells on the ground, for tests to which their size is nothing: millions of them take time."""
-    monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)
-    monkeypatch.setattr("r2flow.metrics.lidm.JSDLiDM.width", 200**2)
-    monkeypatch.setattr("r2flow.metrics.lidm.COARSE", 5)
-
-
-@pytest.fixture
 def summary(monkeypatch: pytest.MonkeyPatch) -> Summary:
     """The stand-in; also what every name of a network loads."""
     put_in_place_of_networks(monkeypatch)

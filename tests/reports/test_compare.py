@@ -65,16 +65,13 @@ def make_run(
     return folder
 
 
-def single(folder: Path) -> dict[str, Any]:
-    run = read_runs([folder])[0]
-    return {**run.values, "label": run.label}
-
-
 def test_every_number_is_the_folder_s(tmp_path):
-    found = single(make_run(
+    folder = make_run(
         tmp_path / "run", train=[1.0] * 36 + [0.5, 0.3, 0.2, 0.2], val=[0.9, 0.4, 0.6], curvature=[0.2, 0.05],
         checkpoint=38,
-    ))  # fmt: skip
+    )  # fmt: skip
+    (run,) = read_runs([folder])
+    found = run.values
     assert found["stage"] == "rectify"
     assert found["backbone"] == "hdit"
     assert found["steps"] == 38  # of the newest checkpoint
@@ -83,7 +80,7 @@ def test_every_number_is_the_folder_s(tmp_path):
     assert found["val_best"] == 0.4
     assert found["val_last"] == 0.6
     assert found["straightness"] == 0.05
-    assert found["label"] == "run"
+    assert run.label == "run"
 
 
 @pytest.mark.parametrize("order", [1, -1])

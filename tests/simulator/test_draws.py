@@ -40,11 +40,6 @@ def test_the_smooth_step_rises_from_0_to_1_like_a_logistic():
     assert slope[0] == pytest.approx(0.25, abs=1e-6)
 
 
-@pytest.fixture
-def draws() -> ScalarDraws:
-    return ScalarDraws(np.random.default_rng(0))
-
-
 @pytest.mark.parametrize(
     ("name", "arguments", "mean", "deviation"),
     [
@@ -58,7 +53,8 @@ def draws() -> ScalarDraws:
         ("pick", ((0, 1, 2), (1, 2, 1)), 1.0, math.sqrt(0.5)),
     ],
 )
-def test_mean_and_deviation(draws, name, arguments, mean, deviation):
+def test_mean_and_deviation(name, arguments, mean, deviation):
+    draws = ScalarDraws(np.random.default_rng(0))
     drawn = np.array([getattr(draws, name)(*arguments) for _ in range(N)], dtype=float)
     assert drawn.mean() == pytest.approx(mean, abs=5 * deviation / math.sqrt(N))
     assert drawn.std() == pytest.approx(deviation, rel=0.05)

@@ -336,17 +336,11 @@ def test_what_a_diffusion_cannot_do_is_said(exact):
 
 @pytest.mark.parametrize("farthest", [5.0, 15.0, 20.0])
 def test_a_cosine_schedule_has_its_digits_up_to_its_ends(farthest):
-    """2 ln cot of the angle in float64, at times of float32."""
-    t = torch.linspace(0, 1, 33)
-    expected = torch.tensor([_cosine_log_snr(float(one), farthest) for one in t], dtype=torch.float64)
+    """2 ln cot of the angle in float64, at times of float32; both ends, -farthest and farthest, leave the angle q."""
+    t, q = torch.linspace(0, 1, 33), math.atan(math.exp(-farthest / 2))
+    sine, cosine = ((q + share * (math.pi / 2 - 2 * q)).sin() for share in (t.double(), 1 - t.double()))
+    expected = 2 * (cosine.log() - sine.log())
     torch.testing.assert_close(Cosine(-farthest, farthest)(t).double(), expected, rtol=0, atol=0.005)
-
-
-def _cosine_log_snr(t: float, farthest: float) -> float:
-    """lambda(t) from highest = farthest to lowest = -farthest, where both ends leave the same angle, q."""
-    q = math.atan(math.exp(-farthest / 2))
-    sine, cosine = (math.sin(q + share * (math.pi / 2 - 2 * q)) for share in (t, 1 - t))
-    return 2 * (math.log(cosine) - math.log(sine))
 
 
 @pytest.mark.parametrize(
