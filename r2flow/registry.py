@@ -10,7 +10,7 @@ from pkgutil import resolve_name
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 
 T = TypeVar("T")
 
@@ -117,8 +117,7 @@ class Registry(Mapping[str, T]):
 
 def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> None:
     """Check options against the signature of a constructor that takes `given` further arguments by position."""
-    if not isinstance(options, Mapping):
-        raise InputError(f"{what} must be a group of keys, found {options!r}.")
+    check(isinstance(options, Mapping), f"{what} must be a group of keys, found {options!r}.")
     parameters = _parameters(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return

@@ -30,7 +30,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from r2flow.config import at_most_three, differences
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.files import parse_json, read_json, write_file
 from r2flow.lidar.scan_files import FIRM_ENDINGS
 from r2flow.signals import end_with_parent, out_of_reach
@@ -287,8 +287,7 @@ def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
         raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         damaged = True
-    if damaged:
-        raise InputError(f"{path} is damaged. If r2flow wrote {folder}, remove it and make it again.")
+    check(not damaged, f"{path} is damaged. If r2flow wrote {folder}, remove it and make it again.")
     if kind is not None and format_name != f"r2flow {kind}":
         raise InputError(f"{folder} holds {format_name.removeprefix('r2flow ')}, not {kind}; give another folder.")
     return content

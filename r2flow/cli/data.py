@@ -121,8 +121,7 @@ def sensor(
 
     if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
         raise InputError(f"--out must be a .yaml file, as for --sensor; found {out}.")
-    if out is not None and out.exists() and not overwrite:
-        raise InputError(f"{out} exists; give another --out, or --overwrite to replace it.")
+    check(overwrite or not (out and out.exists()), f"{out} exists; give another --out, or --overwrite to replace it.")
     name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
     name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
     paths = [points_beside(folder[index]) for folder in map(scans_of, scans) for index in spread(len(folder), most)]

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from r2flow import simulator
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
-from r2flow.errors import InputError, warn_odd
+from r2flow.errors import InputError, check, warn_odd
 from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -148,8 +148,7 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
     if mismatch is None or mismatch.finer:
         return
     seen, name, hopeless = mismatch[:3]
-    if hopeless and reading.within_limits:
-        raise InputError(f"{root}: {seen}.")
+    check(not (hopeless and reading.within_limits), f"{root}: {seen}.")
     edges = sensor.row_edges
     advice = f"give the right one, or estimate it: r2flow sensor {shlex.quote(str(root))} --out mine.yaml"
     if name is not None and name != sensor.name:

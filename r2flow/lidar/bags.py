@@ -29,10 +29,9 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.typesys import Stores, get_typestore
 
-    old, folder = path.suffix.lower() == ".bag" and path.is_file(), path
+    old = path.suffix.lower() == ".bag" and path.is_file()
+    folder = path.parent if path.suffix.lower() == ".db3" and path.is_file() else path  # a .db3 is a part of a bag
     check(path.is_dir() or path.is_file(), f"{path} is not a .mcap, .db3 or .bag file, nor the folder of a ROS 2 bag.")
-    if path.suffix.lower() == ".db3" and path.is_file():  # a part of a bag; the topics are in its folder
-        folder = path.parent
     if folder.is_dir():
         whole = (folder / "metadata.yaml").is_file()
         check(whole, f"{folder} has no metadata.yaml: give a .mcap, or make it by ros2 bag reindex {folder}")

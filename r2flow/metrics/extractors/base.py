@@ -187,8 +187,7 @@ def _joined(path: Path, members: Mapping[str, bytes]) -> tuple[dict[str, Tensor]
     check(parts, f"{path} holds none of {', '.join(PARTS)}; give the published archive.")
     with telling(path / CONFIG):
         config = yaml.safe_load(members.get(CONFIG, b"{}"))
-        if not isinstance(config, dict):
-            raise InputError(f"{path / CONFIG} is not a table of settings; is the archive whole?")
+        check(isinstance(config, dict), f"{path / CONFIG} is not a table of settings; is the archive whole?")
     return {name: tensor for part in parts for name, tensor in part.items()}, config
 
 
