@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from matplotlib.image import imread
 
-from r2flow.errors import require
+from r2flow.errors import InputError, require
 from r2flow.registry import Registry
 
 PROJECT = "r2flow"
@@ -88,11 +88,13 @@ def log_picture(loggers: Iterable[Logger], name: str, pixels: np.ndarray, step: 
 
 def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
     """Log a run's config to the loggers outside its folder."""
-    for logger in loggers:
-        if isinstance(logger, MLFlowLogger) and logger.experiment.get_run(logger.run_id).data.params:
-            continue  # parameters of a resumed run cannot be changed
-        if isinstance(logger, ELSEWHERE):
+    for logger in filter(lambda logger: isinstance(logger, ELSEWHERE), loggers):
+        try:
+            if isinstance(logger, MLFlowLogger) and logger.experiment.get_run(logger.run_id).data.params:
+                continue  # parameters of a resumed run cannot be changed
             logger.log_hyperparams(dict(config))
+        except Exception as error:  # the services raise many kinds, as without a key or a connection
+            raise InputError(f"{type(logger).__name__}: {' '.join(str(error).split())[:300]}") from error
 
 
 def log_figures(loggers: Iterable[Logger], run_dir: Path, step: int) -> None:
