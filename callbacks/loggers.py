@@ -34,11 +34,11 @@ def _mlflow(run_dir: Path) -> Logger:
     """MLflow logger at MLFLOW_TRACKING_URI, else in the run's folder, where it resumes an existing run."""
     require("loggers=[mlflow]", "mlflow", "mlflow")
     uri, run_id = os.environ.get("MLFLOW_TRACKING_URI"), None
+    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # otherwise a folder is refused
     if uri is None or uri in _STORES:
         store = run_dir.absolute() / "mlruns"
         uri = store.as_uri()
         _STORES.add(uri)  # MLflow writes it into the environment, which the next run of this process reads
-        os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # otherwise it requires a database
         files = sorted(store.glob("*/*/meta.yaml"), key=lambda file: file.stat().st_mtime)
         run_id = files[-1].parent.name if files else None
     return MLFlowLogger(PROJECT, run_dir.name, uri, run_id=run_id)
