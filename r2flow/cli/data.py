@@ -160,10 +160,10 @@ def unpack(
     The time is header.stamp, if 0 that of recording. The files contain x, y, z and, if present, intensity and ring.
     """
     from r2flow.lidar.bags import read_bag
-    from r2flow.lidar.scan_files import write_points
+    from r2flow.lidar.scan_files import read_points, write_points
     from r2flow.progress import track
 
-    written, stamps = 0, Counter[int]()
+    stamps = Counter[int]()
     read = track(read_bag(recording, topic), "unpacking", "scans", most or 0)
     for stamp, points in islice(read, 0, None, every):
         if isinstance(points, InputError):
@@ -172,9 +172,11 @@ def unpack(
         stamps[stamp] += 1
         again = f"-{stamps[stamp]}" if stamps[stamp] > 1 else ""  # distinct names for clouds of the same time
         points = points.with_lost_rays()
-        write_points(out / f"{stamp:019d}{again}.ply", points.xyz, points.reflectance, points.ring)
-        written += 1
-        if written == most:
+        file = out / f"{stamp:019d}{again}.ply"
+        same = not file.exists() or read_points(file).xyz.tobytes() == points.xyz.tobytes()  # as after a stop
+        check(same, f"{file} holds other points: give another folder by --out.")
+        write_points(file, points.xyz, points.reflectance, points.ring)
+        if stamps.total() == most:
             break
-    check(written, f"{recording} contains no usable scan.")
-    print(f"{written} scans in {out}")
+    check(stamps, f"{recording} contains no usable scan.")
+    print(f"{stamps.total()} scans in {out}")

@@ -103,6 +103,8 @@ def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):
     assert {path.name for path in out.iterdir()} == set(names)
     for name, xyz in zip(names, CLOUDS, strict=True):
         assert_points(read_points(out / name), xyz, *fields(len(xyz)))
+    other = record(tmp_path / "other.bag", "bag", stamps=(0, 1, 2))  # its second cloud has the time of names[0]
+    assert f"{names[0]} holds other points" in r2flow("unpack", other, "--out", out)[2]
     for option, value, kept in (("--every", 2, [names[0], names[2]]), ("--num", 1, names[:1])):
         some = tmp_path / option
         assert r2flow("unpack", file, "--topic", "/rear", option, value, "--out", some)[0] == 0
