@@ -56,7 +56,7 @@ class SourceKind(ABC):
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
         """The drives of scan files, in order."""
-        raise InputError(f"{options.name} scans are not files in drives.")
+        raise InputError(f"{options.name} scans are not files in drives: train on them by data={options.name}.")
 
     def split_of(self, drive: str) -> str | None:
         """The part of the standard split that contains a drive, by its name, or None."""
