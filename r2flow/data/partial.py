@@ -18,7 +18,7 @@ from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, scale_o
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
-from r2flow.errors import InputError, naming
+from r2flow.errors import InputError, check, naming
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -216,10 +216,9 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
             f"{path} must hold ranges in metres, of 0 or more, and reflectances of [0, 1]. Divide the reflectances by "
             "what means full reflectance; give 0 for NaN and infinity, and --mask FILE.npy for what was not measured."
         )
-    if r.any() and not ((r >= target.min_range) & (r <= target.max_range)).any():
-        raise InputError(
-            f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they metres?"
-        )
+    within = not r.any() or ((r >= target.min_range) & (r <= target.max_range)).any()
+    limits = f"{target.min_range:g}-{target.max_range:g} m"
+    check(within, f"{path}: none of its ranges lies within {limits}. Are they metres?")
     image = read_range_image(path)
     assert image is not None
     if source is not None and image.shape[1] == source.shape[0]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
@@ -90,7 +90,8 @@ class Evaluations:
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         self.counts[self.scenes] += 1
         v = self._velocity(t, x)
-        check(v.shape == x.shape, f"a velocity must have the state's shape {tuple(x.shape)}, found {tuple(v.shape)}.")
+        if v.shape != x.shape:
+            raise InputError(f"a velocity must have the state's shape {tuple(x.shape)}, found {tuple(v.shape)}.")
         self.precision = self.coarsest(v, x)
         if self._progress is not None:
             self._progress()
