@@ -63,9 +63,8 @@ def export(
     print("torch exports the network: this takes up to some minutes", flush=True)
     written = writing.export(loaded, out, sampler, what == "network")
     batch = "any batch" if written.any_batch else "batch of one scan (torch could not export a variable batch)"
-    print(
-        f"{out}: {out.stat().st_size / 1e6:.1f} MB, {sampler if what == 'sampler' else 'the network v(t, x)'}, {batch}"
-    )
+    content = "the network v(t, x)" if what == "network" else sampler
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {content}, {batch}")
     if what == "network":
         return
     try:
