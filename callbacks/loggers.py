@@ -5,7 +5,6 @@ config, which the run's folder and its checkpoints store.
 """
 
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoa
 from matplotlib.image import imread
 
 from r2flow.errors import InputError, require
-from r2flow.files import write_file
 from r2flow.registry import Registry
 
 PROJECT = "r2flow"
@@ -43,8 +41,6 @@ def _mlflow(run_dir: Path) -> Logger:
         _STORES.add(uri)  # MLflow writes it into the environment, which the next run of this process reads
         files = sorted(store.glob("*/*/meta.yaml"), key=lambda file: file.stat().st_mtime)
         run_id = files[-1].parent.name if files else None
-        for file in (*files, *store.glob("*/meta.yaml")):  # they hold full paths, which a copied run folder changes
-            write_file(file, re.sub(r"(artifact_\w+: ).*/mlruns/", rf"\g<1>{uri}/", file.read_text("utf-8")))
     return MLFlowLogger(PROJECT, run_dir.name, uri, run_id=run_id)
 
 
