@@ -94,7 +94,8 @@ def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
                 continue  # parameters of a resumed run cannot be changed
             logger.log_hyperparams(dict(config))
         except Exception as error:  # the services raise many kinds, as without a key or a connection
-            raise InputError(f"{type(logger).__name__}: {' '.join(str(error).split())[:300]}") from error
+            text = " ".join(str(error).split())[:300]
+            raise InputError(f"{type(logger).__name__}: {type(error).__name__}: {text}") from error
 
 
 def log_figures(loggers: Iterable[Logger], run_dir: Path, step: int) -> None:

@@ -178,7 +178,7 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
         (None, ["--mask", "points:0"], "one: the mask keeps nothing that was measured"),
         (None, ["--mask", "points:1"], "one: the mask keeps everything that was measured"),
         (None, ["--mask", "{folder}/mask.npy"], "is of (4, 4), the scans are of (8, 64) rays"),
-        (None, ["--from", "vlp16"], "sensor of 8 rows by --from (vlp16 has 16), or give --size 8x64 and no --from"),
+        (None, ["--from", "vlp16"], "sensor of 8 rows by --from (vlp16 has 16), or --size 8x64 alone"),
         (np.full((2, 8, 64), np.nan, np.float32), [], "give 0 for NaN"),
         (np.zeros((0, 8, 64), np.float32), [], "must be a range image of floats (2 or 1, H, W), found float32 (0, 8"),
         (-scans()[0].numpy(), [], "must hold ranges in metres, of 0 or more"),

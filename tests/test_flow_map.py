@@ -9,6 +9,7 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import FlowDataset
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairSource, PairStore, make_pairs
+from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.problems import Gaussian
@@ -300,6 +301,8 @@ def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
         stage({**DATA, "scans": scans})
     with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
         build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent())
+    with pytest.raises(InputError, match=r"data\.scans needs the name of a data set"):
+        resolve({"name": "pairs", "scans": {"scenes": 4}})
 
 
 def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path: Path):

@@ -113,6 +113,6 @@ def build_density(config: Mapping[str, Any]) -> TimeDensity:
     """Build a density of `TIMES`; InputError: it maps uniform numbers in [0, 1) to others than times, as p(t) does."""
     density, u = TIMES.build(config), torch.arange(64) / 64
     t = density(u)
-    within = t.shape == u.shape and ((t >= 0) & (t <= 1)).all()
+    within = isinstance(t, Tensor) and t.shape == u.shape and ((t >= 0) & (t <= 1)).all()
     check(within, f"time density {config['name']!r} must map u in [0, 1), (B,), to t in [0, 1], (B,): its inverse CDF.")
     return density

@@ -211,7 +211,8 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
 
 def _plain(text: str) -> str:
     """Quote a plain value that Hydra refuses, as ü and &, or takes for a number, as 2011_09_26, name=1e5; expand ~."""
-    text = re.sub(r"([=,[] *)(\d{4}_\d\d_\d\d)(?= *([],]|$))", r"\1'\2'", text.strip())  # also in lists and sweeps
+    dates = r"""('[^']*'|"[^"]*")|(?<=[=,[])( *)(\d{4}_\d\d_\d\d)(?= *([],]|$))"""  # also in lists and sweeps
+    text = re.sub(dates, lambda found: found[1] or f"{found[2]}'{found[3]}'", text.strip())
     key, _, value = text.partition("=")
     value = re.sub("^~(?=/|$)", str(Path.home()), value.strip())
     number = re.fullmatch(r"-?\d{1,3}(_\d{3})*(\.[\d_]*)?", value)

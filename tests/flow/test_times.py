@@ -4,8 +4,9 @@ from decimal import Decimal, getcontext
 import pytest
 import torch
 
+from r2flow.errors import InputError
 from r2flow.flow.path import interpolate
-from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped, golden_sequence
+from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped, build_density, golden_sequence
 
 N = 400_000
 U = (torch.arange(N, dtype=torch.float64) + 0.5) / N  # every quantile once: no sampling error
@@ -51,6 +52,13 @@ def test_times_stay_on_the_path_in_float32(options):
     assert ((t >= 0) & (t <= 1)).all()
     if options["name"] == "discrete":
         assert (t < 1).all()
+
+
+@pytest.mark.parametrize("density", [lambda u: 2 * u, lambda u: u[:1], lambda u: 0.5])
+def test_a_density_that_is_no_inverse_cdf_is_refused(monkeypatch, density):
+    monkeypatch.setitem(TIMES._entries, "mine", lambda: density)
+    with pytest.raises(InputError, match=r"'mine' must map u in \[0, 1\)"):
+        build_density({"name": "mine"})
 
 
 def test_the_reference_densities(shared):
