@@ -50,11 +50,11 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
             given = entry.given(config)
             check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
             made = entry.constructor(*given, **wanted[name])
-            check(isinstance(made, Callback), f"callbacks.{name} makes {type(made)}, no lightning Callback.")
+            check(isinstance(made, Callback), f"callbacks.{name} must make a Lightning callback, found {made!r}.")
             built.append(made)
     for kind, instead in (
         (GradientAccumulationScheduler, "trainer.accumulate_grad_batches"),  # the loader needs one number
-        (EarlyStopping, "callbacks.checkpoint.keep: runs end at trainer.max_steps; take the one of lowest val/loss"),
+        (EarlyStopping, "callbacks.checkpoint.keep: runs end at trainer.max_steps; take the file of least val/loss"),
     ):
         check(not any(isinstance(one, kind) for one in built), f"leave the {kind.__name__} out, and give {instead}.")
     if config["loggers"]:

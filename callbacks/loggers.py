@@ -88,7 +88,7 @@ def log_picture(loggers: Iterable[Logger], name: str, pixels: np.ndarray, step: 
 
 def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
     """Log a run's config to the loggers outside its folder."""
-    for logger in filter(lambda logger: isinstance(logger, ELSEWHERE), loggers):
+    for logger in (one for one in loggers if isinstance(one, ELSEWHERE)):
         try:
             if isinstance(logger, MLFlowLogger) and logger.experiment.get_run(logger.run_id).data.params:
                 continue  # parameters of a resumed run cannot be changed

@@ -56,7 +56,7 @@ def read_npz(path: Path) -> Table:
             with archive.open(members[name]) as file:
                 arrays[name] = read_array(file, members[name].file_size)
     if table is None:
-        return others if len(others) > 2 else list(members), list(arrays.values())
+        return others if len(others) > 2 else list(members), list(arrays.values())  # fewer: refused, with all names
     names, fields = _columns_of(arrays.pop(table))
     if names is None and others:
         names = list(usual_names(len(fields), None))
