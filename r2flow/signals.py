@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from types import FrameType
 
 Handler = Callable[[int, FrameType | None], None] | signal.Handlers
@@ -117,13 +118,14 @@ def end_with_parent(worker: int = 0) -> None:
 
 @contextmanager
 def out_of_reach() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C also during imports; this process hears signals after the block."""
+    """Start processes that block stop signals; this process hears them after the block."""
     heard: list[int] = []
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the processes
+    resource_tracker.ensure_running()  # which unblocks signals
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # inherited by the processes
     try:
-        with listening(lambda number, frame: heard.append(number), [signal.SIGTERM]):
+        with listening(lambda number, frame: heard.append(number)):  # in other threads
             yield
-    finally:  # also if a new process was lost to the same signal
+    finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if heard:
             signal.raise_signal(heard[0])

@@ -17,11 +17,12 @@ import math
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+import traceback
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from multiprocessing import connection
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ from r2flow.config import at_most_three, differences
 from r2flow.errors import InputError, check
 from r2flow.files import parse_json, read_json, write_file
 from r2flow.lidar.scan_files import FIRM_ENDINGS
-from r2flow.signals import end_with_parent, out_of_reach
+from r2flow.signals import code_of, end_with_parent, out_of_reach
 
 log = logging.getLogger(__name__)
 
@@ -186,11 +187,12 @@ class Store:
         left, since = list(items), time.monotonic()
         while left:
             waiting = []
-            for item, done in self._attempts(left, work, workers):
-                if done:
-                    advance(item)
-                else:
-                    waiting.append(item)
+            with closing(self._attempts(left, work, workers)) as attempts:
+                for item, done in attempts:
+                    if done:
+                        advance(item)
+                    else:
+                        waiting.append(item)
             if not wait:
                 return
             if len(waiting) < len(left):
@@ -202,26 +204,51 @@ class Store:
                 log.warning("waiting for another process, which makes %s", self.files(waiting[0])[0])
             left = waiting
 
-    def _attempts(self, items: list[int], work: Callable[[int], None], workers: int) -> Iterator[tuple[int, bool]]:
+    def _attempts(self, items: list[int], work: Callable[[int], None], workers: int) -> Generator[tuple[int, bool]]:
         if workers == 1 or len(items) == 1:
             for item in items:
                 yield item, self.attempt(item, work)
             return
-        # Spawn, since torch's threads do not survive a fork.
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(workers, len(items)), context, _begin_worker, (self, work))
+        context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+        processes, doing, left = {}, {}, iter(items)
         try:
             with out_of_reach():
-                futures = {pool.submit(_attempt, item): item for item in items}
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BrokenProcessPool:
-            raise InputError(
-                f"a process that wrote {self.folder} was killed; is there memory for {workers} of them? "
-                "The same command resumes."
-            ) from None
+                for _ in range(min(workers, len(items))):
+                    end, other = context.Pipe()
+                    process = context.Process(target=_serve, args=(other,), daemon=True)
+                    process.start()
+                    processes[end] = process
+                    other.close()  # so that the end of the process is heard
+            # Sent once, and not as an argument: Python waits forever if a process ends before it reads a large one.
+            for end, item in zip(processes, left, strict=False):
+                doing[end] = item
+                with suppress(OSError):  # heard below
+                    end.send((self, work))
+                    end.send(item)
+            while doing:
+                ready = connection.wait(doing)
+                for end in [end for end in doing if end in ready]:
+                    item = doing.pop(end)
+                    try:
+                        result = end.recv()
+                    except (EOFError, OSError):
+                        result = InputError(
+                            f"a process that wrote {self.folder} was killed; is there memory for {workers} of them? "
+                            "The same command resumes."
+                        )
+                    if isinstance(result, Exception):
+                        raise result
+                    if (following := next(left, None)) is not None:
+                        doing[end] = following
+                        with suppress(OSError):
+                            end.send(following)
+                    yield item, result
         finally:
-            pool.shutdown(cancel_futures=True)
+            for end, process in processes.items():
+                process.terminate()
+                end.close()  # if compiled code of the process has swallowed the exception
+            for process in processes.values():
+                process.join()
 
     def attempt(self, item: int, work: Callable[[int], None]) -> bool:
         """Make an item unless it exists; False if another process is making it.
@@ -258,20 +285,26 @@ class FileStore(Store):
         return all(file.is_file() for file in self.files(item))
 
 
-_job: tuple[Store, Callable[[int], None]]  # of a worker process: large work is not sent with every item
-
-
-def _begin_worker(store: Store, work: Callable[[int], None]) -> None:
-    """Ignore Ctrl-C in a worker, and end it with the parent process."""
-    global _job
-    _job = (store, work)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _serve(end: connection.Connection) -> None:
+    """Make items for the parent process until SIGTERM, or the end of the parent."""
     end_with_parent()
+    signal.signal(signal.SIGTERM, _leave)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    with suppress(EOFError, OSError):  # the parent is gone
+        store, work = end.recv()
+        while True:
+            item = end.recv()
+            try:
+                result = store.attempt(item, work)
+            except Exception as error:
+                error.add_note(traceback.format_exc())
+                result = error
+            end.send(result)
 
 
-def _attempt(item: int) -> bool:
-    store, work = _job
-    return store.attempt(item, work)
+def _leave(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_IGN)
+    raise SystemExit(code_of(number))  # removes the files of an item that is half made
 
 
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:

@@ -1,14 +1,18 @@
 """Ctrl-C and SIGTERM at moments when nothing of a run is under way yet: one line and the signal's exit code."""
 
+import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from r2flow.errors import InputError
 from r2flow.signals import Stopped, listening, out_of_reach, stop_at_once
+from r2flow.store import Store
 from tests.conftest import ROOT
 from tests.killing import is_gone, wait_until
 
@@ -80,6 +84,47 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path):
         parent.kill()
         parent.wait()
     wait_until(lambda: is_gone(parent.pid), seconds=20)
+
+
+WORKERS = """
+import os, signal, sys
+from functools import partial
+from r2flow.signals import Stopped, listening, stop_at_once
+from r2flow.store import Store
+
+if __name__ != "__main__":
+    os.killpg(0, {number})  # when a worker has started and imports this file
+else:
+    try:
+        with listening(stop_at_once):
+            Store("out", "scans", {{}}).make(range(4), partial(print, bytes(2**20)), 2)  # more than a pipe takes
+    except Stopped as stop:
+        sys.exit(stop.code)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_told_to_stop_when_workers_start(tmp_path: Path, number: int):
+    (tmp_path / "script.py").write_text(WORKERS.format(number=int(number)))
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
+        start_new_session=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "")
+
+
+def be_killed(item: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuse(item: int) -> None:
+    raise InputError("a worker refuses it")
+
+
+@pytest.mark.parametrize(("work", "message"), [(be_killed, "was killed; is there memory for 2"), (refuse, "refuses")])
+def test_an_error_of_a_worker(tmp_path: Path, work: Callable[[int], None], message: str):
+    with pytest.raises(InputError, match=message):
+        Store(tmp_path, "scans", {}).make(range(3), work, 2)
 
 
 def test_a_signal_waits_until_workers_are_started():
