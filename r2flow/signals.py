@@ -104,14 +104,14 @@ def _hear_at_exit() -> None:
             signal.signal(number, end_at_once)
 
 
-def end_with_parent(worker: int = 0) -> None:
+def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exit(1)) -> None:
     """End a worker when its parent process ends, since it would wait forever for a reader of its results."""
 
     def wait() -> None:
         parent = multiprocessing.parent_process()
         if parent is not None:
             parent.join()
-            os._exit(1)
+            end()
 
     threading.Thread(target=wait, daemon=True).start()
 
@@ -121,7 +121,7 @@ def out_of_reach() -> Iterator[None]:
     """Start processes that block stop signals; this process hears them after the block."""
     heard: list[int] = []
     resource_tracker.ensure_running()  # which unblocks signals
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # inherited by the processes
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {*STOPPING, signal.SIGHUP})  # also in the processes
     try:
         with listening(lambda number, frame: heard.append(number)):  # in other threads
             yield

@@ -15,6 +15,7 @@ import json
 import logging
 import math
 import multiprocessing
+import os
 import signal
 import time
 import traceback
@@ -205,7 +206,7 @@ class Store:
             left = waiting
 
     def _attempts(self, items: list[int], work: Callable[[int], None], workers: int) -> Generator[tuple[int, bool]]:
-        if workers == 1 or len(items) == 1:
+        if min(workers, len(items)) <= 1:
             for item in items:
                 yield item, self.attempt(item, work)
             return
@@ -228,16 +229,16 @@ class Store:
             while doing:
                 ready = connection.wait(doing)
                 for end in [end for end in doing if end in ready]:
-                    item = doing.pop(end)
                     try:
                         result = end.recv()
                     except (EOFError, OSError):
                         result = InputError(
-                            f"a process that wrote {self.folder} was killed; is there memory for {workers} of them? "
-                            "The same command resumes."
+                            f"a process that wrote {self.folder} was killed or could not start; is there memory for "
+                            f"{workers} of them? The same command resumes."
                         )
                     if isinstance(result, Exception):
                         raise result
+                    item = doing.pop(end)
                     if (following := next(left, None)) is not None:
                         doing[end] = following
                         with suppress(OSError):
@@ -260,14 +261,14 @@ class Store:
         lock = FileLock(path, timeout=0)
         try:
             lock.acquire()
-        except Timeout:
-            return False
-        try:
             if not self.has(item):
                 work(item)
+        except Timeout:
+            return False
         finally:
-            path.unlink(missing_ok=True)
-            lock.release()
+            if lock.is_locked:
+                path.unlink(missing_ok=True)
+                lock.release()
         return True
 
 
@@ -287,19 +288,28 @@ class FileStore(Store):
 
 def _serve(end: connection.Connection) -> None:
     """Make items for the parent process until SIGTERM, or the end of the parent."""
-    end_with_parent()
-    signal.signal(signal.SIGTERM, _leave)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    end_with_parent(end=lambda: os.kill(os.getpid(), signal.SIGTERM))
     with suppress(EOFError, OSError):  # the parent is gone
-        store, work = end.recv()
-        while True:
-            item = end.recv()
-            try:
-                result = store.attempt(item, work)
-            except Exception as error:
-                error.add_note(traceback.format_exc())
-                result = error
-            end.send(result)
+        try:
+            with _within_reach():
+                store, work = end.recv()  # imports modules, and SIGTERM ends it at once
+            signal.signal(signal.SIGTERM, _leave)
+            work = _within_reach()(work)
+            while True:
+                end.send(store.attempt(end.recv(), work))
+        except Exception as error:
+            error.add_note(traceback.format_exc())
+            end.send(error)
+
+
+@contextmanager
+def _within_reach() -> Iterator[None]:
+    """Hear SIGTERM in the block, and not where an exception leaves a lock, or ends in `FileLock.__del__`."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

@@ -55,7 +55,7 @@ def test_told_to_stop_during_an_import(tmp_path: Path, command: str, argv: list[
     assert list(tmp_path.iterdir()) == []
 
 
-PARENT = """
+LOADER = """
 import os, time
 from pathlib import Path
 from torch.utils.data import DataLoader
@@ -75,15 +75,24 @@ if __name__ == "__main__":
 """
 
 
-def test_workers_end_when_their_parent_is_killed(tmp_path: Path):
-    parent = subprocess.Popen([sys.executable, "-c", PARENT], cwd=tmp_path, start_new_session=True)
+STORE = """
+import time
+from r2flow.store import Store
+Store(".", "scans", {}).make([100, 101], time.sleep, 2)
+"""
+
+
+@pytest.mark.parametrize("script", [LOADER, STORE])
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path, script: str):
+    parent = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, start_new_session=True)
     try:
-        wait_until(lambda: len(list(tmp_path.glob("pid-*"))) == 2)
+        wait_until(lambda: len(list(tmp_path.iterdir())) == 2)  # a file of each
         time.sleep(0.2)  # until both wait
     finally:
         parent.kill()
         parent.wait()
     wait_until(lambda: is_gone(parent.pid), seconds=20)
+    assert not list(tmp_path.glob(".*"))  # locks of a store
 
 
 WORKERS = """
@@ -121,7 +130,14 @@ def refuse(item: int) -> None:
     raise InputError("a worker refuses it")
 
 
-@pytest.mark.parametrize(("work", "message"), [(be_killed, "was killed; is there memory for 2"), (refuse, "refuses")])
+class Unreadable:
+    def __reduce__(self):
+        return refuse, (0,)  # when it is unpickled
+
+
+@pytest.mark.parametrize(
+    ("work", "message"), [(be_killed, "killed.* memory for 2"), (refuse, "refuses"), (Unreadable(), "refuses")]
+)
 def test_an_error_of_a_worker(tmp_path: Path, work: Callable[[int], None], message: str):
     with pytest.raises(InputError, match=message):
         Store(tmp_path, "scans", {}).make(range(3), work, 2)
