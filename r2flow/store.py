@@ -21,9 +21,10 @@ import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
+from logging.handlers import QueueHandler
 from multiprocessing import connection
 from pathlib import Path
-from types import FrameType
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -238,6 +239,9 @@ class Store:
                         )
                     if isinstance(result, Exception):
                         raise result
+                    if isinstance(result, logging.LogRecord):
+                        logging.getLogger(result.name).handle(result)
+                        continue
                     item = doing.pop(end)
                     if (following := next(left, None)) is not None:
                         doing[end] = following
@@ -287,8 +291,9 @@ class FileStore(Store):
 
 
 def _serve(end: connection.Connection) -> None:
-    """Make items for the parent process until SIGTERM, or the end of the parent."""
+    """Make items for the parent process until SIGTERM, or the end of the parent, which logs what this one would."""
     end_with_parent(end=lambda: os.kill(os.getpid(), signal.SIGTERM))
+    logging.getLogger().handlers = [QueueHandler(SimpleNamespace(put_nowait=end.send))]
     with suppress(EOFError, OSError):  # the parent is gone
         try:
             with _within_reach():

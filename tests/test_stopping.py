@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM at moments when nothing of a run is under way yet: one line and the signal's exit code."""
 
+import logging
 import os
 import signal
 import subprocess
@@ -141,6 +142,11 @@ class Unreadable:
 def test_an_error_of_a_worker(tmp_path: Path, work: Callable[[int], None], message: str):
     with pytest.raises(InputError, match=message):
         Store(tmp_path, "scans", {}).make(range(3), work, 2)
+
+
+def test_the_parent_logs_what_a_worker_logs(tmp_path: Path, caplog):
+    Store(tmp_path, "scans", {}).make(range(2), logging.getLogger("work").warning, 2)
+    assert sorted(caplog.messages) == ["0", "1"]
 
 
 def test_a_signal_waits_until_workers_are_started():
