@@ -11,7 +11,7 @@ from .periodic import Periodic
 
 
 class Curvature(Periodic):
-    """Logs int s(t) dt (paper, eq. 6) of a few scans from fixed noise, if the generator is a flow.
+    """Logs int s(t) dt (paper, eq. 6) of a few scans from fixed noise; of flows alone, and not of distilled ones.
 
     The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/s_normalised`: an untrained
     flow is straight because its paths have almost no length. One measurement is one pass of `steps` Euler steps;
@@ -29,7 +29,7 @@ class Curvature(Periodic):
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         flow = pl_module.generator
-        if not isinstance(flow, Flow) or not flow.draws:
+        if not isinstance(flow, Flow) or not flow.draws or flow.fixed:
             return
         x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
         result = curvature(flow.velocity, x_0, self.steps)

@@ -167,6 +167,8 @@ def test_a_distilled_model_keeps_its_steps(points, r2flow, real, tmp_path):
     assert [row["evaluations"] for row in rows] == [2]
     quick = ("evaluate", real, tmp_path / "td.safetensors", "--num", 2, *QUICK, "--sampler")
     assert "td.safetensors is distilled for euler, 2 steps alone" in r2flow(*quick, "heun2")[2]
+    curvature = ("report", "curvature", tmp_path / "td.safetensors", "--out", tmp_path / "report")
+    assert "it has learned no other times" in r2flow.refusal(*curvature)
 
 
 def test_an_adaptive_solver_is_one_set(points, saved):

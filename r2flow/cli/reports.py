@@ -58,8 +58,9 @@ def curvature(
 
     where = choose_device(draw.device)
     loaded = {name: load_checkpoint(name, where) for name in dict.fromkeys(models)}
-    for checkpoint in loaded.values():
-        as_flow(checkpoint.generator, "curvature")
+    for name, checkpoint in loaded.items():
+        flow = as_flow(checkpoint.generator, "curvature")
+        check(not flow.fixed, f"{name} is distilled for {flow.sampler} alone: it has learned no other times.")
     prepare_folder(out)
     with Bar("measuring", len(loaded) * math.ceil(draw.num / draw.batch_size) * 2 * steps, "evaluations") as advance:
         flows = [

@@ -96,9 +96,9 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 
 def bend(flow: Checkpoint, num: int) -> float:
-    """int s(t) dt over |x_1 - x_0|^2, mean over scans: 0 is straight; NaN for generators without paths."""
+    """int s(t) dt over |x_1 - x_0|^2, mean over scans: 0 is straight; NaN for a distilled flow."""
     generator = flow.generator
-    if not isinstance(generator, Flow):
+    if not isinstance(generator, Flow) or generator.fixed:  # a distilled network knows the times of its steps
         return math.nan
     x_0 = Draws(0, range(num)).start(generator.noise_shape).to(generator.device)
     with torch.inference_mode():
