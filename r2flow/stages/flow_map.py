@@ -85,7 +85,7 @@ class LearnFlowMap(Reflow):
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
             mask = expand_time(diagonal, x_t)
             aim = Aim(torch.where(mask, x_t, aim.x_t), torch.where(mask, v, aim.target))
-        return self.loss(u_ts(t, aim.x_t, s), aim.target).mean()
+        return self.mean_loss(u_ts(t, aim.x_t, s), aim.target)
 
 
 def paths_of(batch: Batch) -> Paths:

@@ -49,7 +49,16 @@ class Rectify(SingleLoss):
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         t = self.time(u)
         x_t, u_t = interpolate(batch["x_0"], batch["x_1"], t)
-        return self.loss(self.generator.velocity(t, x_t, self.condition(batch)), u_t).mean()
+        return self.mean_loss(self.generator.velocity(t, x_t, self.condition(batch)), u_t)
+
+    def mean_loss(self, v_t: Tensor, u_t: Tensor) -> Tensor:
+        """Mean of the loss over a batch."""
+        each = self.loss(v_t, u_t)
+        if each.shape != v_t.shape[:1]:
+            raise InputError(
+                f"a loss gives a value for each of the {len(v_t)} scans of a batch, found shape {(*each.shape,)}."
+            )
+        return each.mean()
 
 
 class Reflow(Rectify):

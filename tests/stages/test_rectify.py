@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from r2flow.errors import InputError
+from r2flow.flow.losses import LOSSES
 from r2flow.flow.solvers import solve
 from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler
@@ -94,6 +95,13 @@ def test_an_untrained_stage_has_the_loss_of_predicting_nothing():
     x_1 = M + S * torch.stack([standard_normal((1, 32, 32), 0, "evaluation", k) for k in range(64)])
     loss = stage.training_step({"x_0": x_0, "x_1": x_1, "u": torch.rand(64)}, 0)
     assert loss.item() == pytest.approx(M**2 + S**2 + 1, abs=5 / math.sqrt(x_0.numel()))
+
+
+@pytest.mark.parametrize("wrong", [torch.Tensor.sum, lambda loss: loss[:1], lambda loss: loss[:, None]])
+def test_a_loss_gives_a_value_a_scan(monkeypatch, wrong):
+    monkeypatch.setitem(LOSSES._entries, "wrong", lambda v_t, u_t: wrong((v_t - u_t).square().flatten(1).mean(1)))
+    with pytest.raises(InputError, match="a value for each of the 512 scans of a batch, found shape"):
+        Rectify(affine(), loss="wrong").training_step(independent(0), 0)
 
 
 X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
