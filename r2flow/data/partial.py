@@ -180,7 +180,7 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
     if lost := int((rows < 0).sum()):
         lines.append(f"{spec}: {lost} of its {len(e)} beams look past the view of {target.name} and are not used")
         to = SENSORS[source.name] if source.name in SENSORS else replace(source, name="FILE (r2flow sensor)")
-        lines[-1] += f": --to {to.name} --size {max(64, len(e))}x{to.columns} uses them"
+        lines[-1] += f": --to {to.name} --size {max(target.shape[0], len(e))}x{to.columns} uses them"
     return lines
 
 
