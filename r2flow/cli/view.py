@@ -115,13 +115,7 @@ def view(
     title = ", ".join(Path(spec).name or spec for spec in what)
     path = write_page(out or Path(mkdtemp(prefix="r2flow-"), "view.html"), panels, title)
     print(path)
-    if out is None:
-        open_browser(path)
-
-
-def open_browser(path: Path) -> None:
-    """Open a page if there is a display: a text browser would block the terminal."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        return
-    with suppress(webbrowser.Error):
-        webbrowser.open(path.resolve().as_uri())
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or not sys.platform.startswith("linux")
+    if out is None and display:  # without one, a text browser would block the terminal
+        with suppress(webbrowser.Error):
+            webbrowser.open(path.resolve().as_uri())
