@@ -193,7 +193,12 @@ def _job(
             return
         settings = plain(config)
         check_keys(settings)
-        code = _chain(settings, given, command) if settings["chain"] else _fit(settings, given)
+        if settings["chain"]:
+            code = _chain(settings, given, command)
+        else:  # imported here, so that errors in the config are reported before torch is loaded
+            from r2flow.training import build, fit
+
+            code = 0 if fit(build(settings, given)).finished else LATER
     except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print more lines
         message = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
         print(f"error: {message}", file=sys.stderr)
@@ -224,13 +229,6 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
         ended.append((code, str(run_dir)))
 
 
-def _fit(settings: dict[str, Any], given: Sequence[str]) -> int:
-    # Imported here, so that errors in the config are reported before torch is loaded.
-    from r2flow.training import build, fit
-
-    return 0 if fit(build(settings, given)).finished else LATER
-
-
 def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str]) -> int:
     """Run the links of a config's `chain`, then the report on them."""
     from r2flow.runs.chain import is_finished, is_noted, links_of, note, run_chain
@@ -241,8 +239,15 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     links = links_of(settings["chain"], folder, given, _config_folders())
     if not all(map(is_finished, links)):
         _check_links(links)
-    if settings["preview"]:
-        _preview(settings["preview"], folder / "preview")
+    if model := settings["preview"]:  # scans of a trained model, while the chain trains
+        from r2flow.model.checkpoint import load_checkpoint
+        from r2flow.models import find_model
+        from r2flow.reports.outputs import write_samples
+
+        picture = folder / "preview" / "samples.png"
+        if not picture.is_file():
+            write_samples(load_checkpoint(find_model(model)), picture.parent, num=4, seed=0)
+        print(f"preview: scans of the model {model} in {picture}, point clouds next to it", flush=True)
     code, ran = run_chain(links, _restart(command))
     if code:
         return code
@@ -260,17 +265,6 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     report({link.name: link.run_dir for link in links}, out, device=device)
     note(out, *links)
     return 0
-
-
-def _preview(model: str, out: Path) -> None:
-    """Draw scans of a trained model, as a preview while a chain trains."""
-    from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.models import find_model
-    from r2flow.reports.outputs import write_samples
-
-    if not (out / "samples.png").is_file():
-        write_samples(load_checkpoint(find_model(model)), out, num=4, seed=0)
-    print(f"preview: scans of the model {model} in {out / 'samples.png'}, point clouds next to it", flush=True)
 
 
 def _check_links(links: Sequence[Any]) -> None:
