@@ -65,7 +65,14 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         stage = (parent.config.get("stage") or {}).get("name", "rectify")
         config["parent"] = {"path": str(parent.path), "weights": parent.weights, "step": parent.step, "stage": stage}
     if parent and data["name"] == "pairs":
-        drawer = _drawer(config, parent)
+        of = (data.get("pairs") or {}).get("of")
+        drawer = find_parent(of) or parent
+        for group in ("sensor", "encoding"):
+            if drawer is not parent and drawer.config.get(group) != config[group]:
+                raise InputError(
+                    f"data.pairs.of={of} has another {group} than {parent.path}, which this run starts from. Leave it "
+                    f"out, or start from a flow with the same {group}."
+                )
         data["root"] = data["root"] or str(default_folder(drawer.path))
         data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
         theirs = drawer.config.get("data", {}).get("reading") or {}
@@ -106,20 +113,6 @@ def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapp
 def drawn_by(config: Mapping[str, Any]) -> str | None:
     """The flow that draws a run's pairs: `data.pairs.of`, else `stage.init`."""
     return (config["data"].get("pairs") or {}).get("of") or config["stage"].get("init")
-
-
-def _drawer(config: Mapping[str, Any], parent: Parent) -> Parent:
-    of = (config["data"].get("pairs") or {}).get("of")
-    drawer = find_parent(of)
-    if drawer is None:
-        return parent
-    for group in ("sensor", "encoding"):
-        if drawer.config.get(group) != config[group]:
-            raise InputError(
-                f"data.pairs.of={of} has another {group} than {parent.path}, which this run starts from. Leave it out, "
-                f"or start from a flow with the same {group}."
-            )
-    return drawer
 
 
 def inherited(key: str, config: Mapping[str, Any]) -> str:
