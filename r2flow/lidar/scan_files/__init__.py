@@ -82,7 +82,11 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     """
     path = Path(path)
     check_columns(columns)
-    ending = _ending(path)
+    ending = scan_ending(path.name)
+    if not ending:
+        unknown = f"has no ending of a scan file; known: {', '.join(SCAN_ENDINGS)}. Convert or rename it"
+        advice = next((advice for other, advice in ELSEWHERE.items() if path.name.lower().endswith(other)), unknown)
+        raise InputError(f"{path} {advice.format(path=path)}.")
     if ending == ".pcd.bin" and columns is None:
         columns = ("x", "y", "z", "intensity", "ring")
     raw = ending in _ROWS
@@ -164,12 +168,3 @@ def write_points(
 def scan_ending(name: str) -> str:
     """The ending of a scan file's name in lower case, including `.pcd.bin`; empty for other files."""
     return next((ending for ending in SCAN_ENDINGS if name.lower().endswith(ending)), "")
-
-
-def _ending(path: Path) -> str:
-    name = path.name.lower()
-    if ending := scan_ending(name):
-        return ending
-    unknown = f"has no ending of a scan file; known: {', '.join(SCAN_ENDINGS)}. Convert or rename it"
-    advice = next((advice for other, advice in ELSEWHERE.items() if name.endswith(other)), unknown)
-    raise InputError(f"{path} {advice.format(path=path)}.")
