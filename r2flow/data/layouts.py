@@ -244,14 +244,9 @@ def _numbers(name: str) -> set[int]:
     return {int(digits)} if digits.isdecimal() else set()
 
 
-def _in_order(name: str) -> list[tuple[int, str]]:
-    """Sort key by the numbers in a name: 2.bin comes before 10.bin."""
-    return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"([0-9]+)", name)]
-
-
 def _files(folder: Path, endings: tuple[str, ...]) -> tuple[str, ...]:
     """The files of a folder with some endings, in order, without hidden files (macOS writes ._NAME next to NAME)."""
-    names = sorted(
-        (n for n in os.listdir(folder) if n.lower().endswith(endings) and not n.startswith(".")), key=_in_order
-    )
+    names = [n for n in os.listdir(folder) if n.lower().endswith(endings) and not n.startswith(".")]
+    # By the numbers in a name: 2.bin comes before 10.bin.
+    names.sort(key=lambda n: [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"([0-9]+)", n)])
     return tuple(os.path.join(folder, name) for name in names)
