@@ -91,8 +91,14 @@ def project_indices(
     within = finite & (r >= sensor.min_range) & (r <= sensor.max_range)
     if convention != "centre":
         pixel[~(within if convention == "lidm" else finite)] = rows * columns
-        hit, chosen = _nearest_by_sorting(pixel, r)
-        hit, chosen = hit[within[chosen]], chosen[within[chosen]]
+        # Points are written from far to near, the nearest last. Under 1 % of KITTI's pixels have two points of equal
+        # range, in millimetres. The reference's choice depends on NumPy's unstable sort, so the same sort is used.
+        order = np.argsort(-r)
+        owner = np.full(rows * columns + 1, -1, dtype=np.int64)
+        owner[pixel[order]] = order
+        hit = np.flatnonzero(owner >= 0)
+        hit = hit[within[owner[hit]]]
+        chosen = owner[hit]
     else:
         # Omitted points share an extra pixel after the last: faster than removing them from every array.
         pixel[(row < 0) | (row >= rows) | ~within] = rows * columns
@@ -141,17 +147,6 @@ def nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray, 
     np.minimum.at(best, pixel, key)
     hit = np.flatnonzero(best[:pixels] != empty)
     return hit, (best[hit] & np.uint64(2**32 - 1)).astype(np.int64)
-
-
-def _nearest_by_sorting(pixel: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `nearest`, but like the reference: points are written from far to near, the nearest last."""
-    # Under 1 % of KITTI's pixels have two points of equal range, in millimetres. The reference's choice depends on
-    # NumPy's unstable sort, so the same sort is used.
-    order = np.argsort(-r)
-    owner = np.full(int(pixel.max(initial=0)) + 1, -1, dtype=np.int64)
-    owner[pixel[order]] = order
-    hit = np.flatnonzero(owner >= 0)
-    return hit, owner[hit]
 
 
 def unproject(r: Tensor, rays: Tensor) -> Tensor:
