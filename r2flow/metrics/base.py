@@ -159,7 +159,15 @@ class ScanMetric(Metric):
     def compute(self) -> dict[str, float]:
         """Values by name; undefined values are NaN and explained in `remarks`."""
         values, remarks = self.figures()
-        self._remarks = self._left_out() + remarks
+        self._remarks = []
+        for side in SIDES:
+            scans, compared = self.given(side), self.count(side)
+            if scans == 0:
+                self._remarks.append(f"there are no {side} scans.")
+            elif compared < scans:
+                skipped = f"{scans - compared} of {scans} {side} scans"
+                self._remarks.append(f"{skipped} are left out: empty, or nothing to compare.")
+        self._remarks += remarks
         return values
 
     def remarks(self) -> list[str]:
@@ -204,14 +212,3 @@ class ScanMetric(Metric):
     def set_dtype(self, dst_type: str | torch.dtype) -> Self:
         """Do nothing: states stay float64, since lower precision would lose digits."""
         return self
-
-    def _left_out(self) -> list[str]:
-        remarks = []
-        for side in SIDES:
-            scans, compared = self.given(side), self.count(side)
-            if scans == 0:
-                remarks.append(f"there are no {side} scans.")
-            elif compared < scans:
-                skipped = f"{scans - compared} of {scans} {side} scans"
-                remarks.append(f"{skipped} are left out: empty, or nothing to compare.")
-        return remarks

@@ -36,11 +36,12 @@ def errors(truth: np.ndarray, answer: np.ndarray, hidden: np.ndarray, sensor: Se
     both = hidden & (r > 0) & (s > 0)
     a, b = (image_to_points(image, sensor.rays())[0] for image in (truth, answer))
     a_to_b, b_to_a = _distances(a, b)
+    cells, others = ({*map(tuple, np.floor(points / VOXEL).astype(np.int64))} for points in (a, b))
     return {
         "mae_all_m": float(np.abs(r - s).mean()),
         "mae_m": _mean(np.abs(r - s)[both]),
         "drop_wrong": _mean(((r > 0) != (s > 0))[hidden]),
-        "iou": _iou(a, b),
+        "iou": len(cells & others) / len(cells | others) if cells | others else float("nan"),
         "chamfer_m": _mean(a_to_b) + _mean(b_to_a),
         "chamfer_m2": _mean(a_to_b**2) + _mean(b_to_a**2),
         "reflectance_mae": _mean(np.abs(truth[1] - answer[1])[both]) if len(truth) > 1 < len(answer) else float("nan"),
@@ -84,12 +85,6 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not len(a) or not len(b):
         return (np.full(1, np.nan if len(a) == len(b) else np.inf),) * 2
     return cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
-
-
-def _iou(a: np.ndarray, b: np.ndarray) -> float:
-    cells = [{*map(tuple, np.floor(points / VOXEL).astype(np.int64))} for points in (a, b)]
-    either = len(cells[0] | cells[1])
-    return len(cells[0] & cells[1]) / either if either else float("nan")
 
 
 def _mean(values: np.ndarray) -> float:

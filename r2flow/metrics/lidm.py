@@ -90,11 +90,7 @@ class MMDLiDM(ScanMetric):
         nearest = torch.full((len(real),), torch.inf, dtype=torch.float64)
         for i, x in blocks(real, BLOCK):
             for _, y in blocks(generated, BLOCK):
-                nearest[i] = torch.minimum(nearest[i], _chamfer(x, y).amin(1))
+                a, b = (x == 0).double(), (y == 0).double()  # occupied cells
+                chamfer = ((a @ y.T) / a.sum(1)[:, None] + (x @ b.T) / b.sum(1)) / 2  # of all pairs, in squared cells
+                nearest[i] = torch.minimum(nearest[i], chamfer.amin(1))
         return nearest.mean() * (COARSE / (2 * EXTENT)) ** 2
-
-
-def _chamfer(x: Tensor, y: Tensor) -> Tensor:
-    """Chamfer distances in squared cells of all pairs of distance maps, (N, cells) and (M, cells)."""
-    a, b = (x == 0).double(), (y == 0).double()
-    return ((a @ y.T) / a.sum(1)[:, None] + (x @ b.T) / b.sum(1)) / 2

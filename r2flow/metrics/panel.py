@@ -108,11 +108,6 @@ def drop_incidence(scan: Scan) -> np.ndarray:
     return drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, INCIDENCES)
 
 
-def range_pairs(scan: Scan) -> np.ndarray:
-    """Joint histogram of ranges of pixels 2.8 degrees or one column apart, 16 x 16 logarithmic bins."""
-    return _pairs(scan.r, scan.r > 0, RANGES, APART[0])
-
-
 def reflectance_pairs(scan: Scan) -> np.ndarray:
     """Joint histogram of reflectances of pixels 0.7 degrees or one column apart, 13 x 13 bins; 0 without."""
     if scan.q is None:
@@ -177,7 +172,8 @@ PANEL: dict[str, Member] = {
     "drop rate by incidence": Member(drop_incidence, 3 * (len(INCIDENCES) - 1), rate_distance),
     "surface normals": histogram_of(lambda scan: scan.surfaces[0], NORMALS),
     "incidence": histogram_of(lambda scan: scan.surfaces[1], COSINES),
-    "range pairs": Member(range_pairs, (len(RANGES) - 1) ** 2),
+    # joint histogram of ranges of pixels 2.8 degrees or one column apart, 16 x 16 logarithmic bins
+    "range pairs": Member(lambda scan: _pairs(scan.r, scan.r > 0, RANGES, APART[0]), (len(RANGES) - 1) ** 2),
     REFLECTANCE: Member(reflectance_pairs, (len(REFLECTANCES) - 1) ** 2, reflectance_distance),
     # over points, the number of points in the same 1.6 m bird's-eye cell
     "bird's-eye density": histogram_of(lambda scan: scan.birds_eye, DENSITIES, weighted=True),

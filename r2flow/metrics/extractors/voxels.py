@@ -136,13 +136,12 @@ class MinkowskiNet(Extractor):
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
         # One scan at a time, since a batch is no faster and needs more memory.
-        return torch.stack([self._scan(points.to(self.device)) for points in scans.points])
-
-    def _scan(self, points: Tensor) -> Tensor:
-        if not len(points):
-            return torch.full((self.dim,), torch.nan, device=self.device)
-        coords, features = voxelise(points)
-        return mean_by_distance(self(coords, features), coords)
+        means = torch.full((len(scans), self.dim), torch.nan, device=self.device)
+        for row, points in zip(means, scans.points, strict=True):
+            if len(points):
+                coords, features = voxelise(points.to(self.device))
+                row[:] = mean_by_distance(self(coords, features), coords)
+        return means
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
