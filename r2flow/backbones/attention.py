@@ -40,8 +40,11 @@ def neighbourhood_attention(
     check_window(window)
     rows = _Axis(q.shape[1], window[0], wrap=False)
     columns = _Axis(q.shape[2], window[1], wrap=wrap)
-    name = _fastest(q, columns) if backend == "auto" else backend
-    return BACKENDS[name](q, k, v, rows, columns)
+    if backend == "auto":
+        supported = q.is_cuda and q.dtype != torch.float64 and q.shape[-1] >= 16 and columns.span <= columns.size
+        flex = supported and not torch.compiler.is_compiling() and importlib.util.find_spec("triton")
+        backend = "flex" if flex else "tiles"
+    return BACKENDS[backend](q, k, v, rows, columns)
 
 
 def check_window(window: Sequence[int]) -> None:
@@ -176,9 +179,3 @@ def _flex(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tenso
 
 Backend = Callable[[Tensor, Tensor, Tensor, _Axis, _Axis], Tensor]
 BACKENDS: Registry[Backend] = Registry("attention backend", tiles=_tiles, flex=_flex)
-
-
-def _fastest(q: Tensor, columns: _Axis) -> str:
-    """The backend of "auto" for this input."""
-    supported = q.is_cuda and q.dtype != torch.float64 and q.shape[-1] >= 16 and columns.span <= columns.size
-    return "flex" if supported and not torch.compiler.is_compiling() and importlib.util.find_spec("triton") else "tiles"

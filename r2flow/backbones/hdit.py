@@ -264,7 +264,8 @@ class Attention(nn.Module):
     def forward(self, x: Tensor, condition: Tensor, table: Tensor) -> Tensor:
         q, k, v = in_bands(lambda x, table: self._project(x, condition, table), x, table)
         if self.neighbourhood is None:
-            out = _global_attention(q, k, v)
+            q, k, v = (part.flatten(1, 2).transpose(1, 2) for part in (q, k, v))
+            out = F.scaled_dot_product_attention(q, k, v, scale=1.0).transpose(1, 2).unflatten(1, x.shape[1:3])
         else:
             out = neighbourhood_attention(q, k, v, *self.neighbourhood)
         return self.out_proj(self.dropout(out.flatten(-2)))
@@ -290,12 +291,6 @@ class Attention(nn.Module):
         scale = at_least_float32(self.scale).clamp(max=LARGEST_LOG_SCALE).exp().sqrt()
         qk = qk * (scale * torch.rsqrt(qk.square().sum(-1, keepdim=True) + 1e-6))
         return *rotate(qk, table).to(v.dtype).unbind(-3), v
-
-
-def _global_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    rows, columns = q.shape[1:3]
-    q, k, v = (x.flatten(1, 2).transpose(1, 2) for x in (q, k, v))
-    return F.scaled_dot_product_attention(q, k, v, scale=1.0).transpose(1, 2).unflatten(1, (rows, columns))
 
 
 class FeedForward(nn.Module):
