@@ -12,7 +12,6 @@ from r2flow.reports.tables import print_table
 def describe(path: str | Path) -> dict[str, Any]:
     """Generator, parameters, sensor, encoding, step and config of a checkpoint file or run folder."""
     loaded = load_checkpoint(path)
-    rows, columns = loaded.sensor.shape
     model = name_of(loaded.path)
     about = {"model": model, "draws": MODELS[model].about, "licence": MODELS[model].licence} if model else {}
     return {
@@ -25,7 +24,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "generator": (loaded.config.get("generator") or {}).get("name", "rectified_flow"),
         "backbone": (loaded.config["backbone"] or {}).get("name"),
         "parameters": sum(p.numel() for p in loaded.generator.parameters()),
-        "image": [loaded.encoding.channels, rows, columns],
+        "image": list(loaded.encoding.shape),
         "sensor": loaded.sensor.name,
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],
         "encoding": loaded.config["encoding"],

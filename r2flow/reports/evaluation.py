@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.sets import AS_MANY, HALVES
-from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
+from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.pictures import draw_range
 from r2flow.reports.tables import print_table, shown, table, words
 
@@ -258,7 +259,9 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
             axes.plot(at, [row.get(name, math.nan) * factor for row in line_rows], **style, ms=5, lw=1.2, label=flow)
         positive = all(row[name] > 0 for row in rows if name in row)
         axes.set(xscale="log", yscale="log" if positive else "linear", xlabel=label, ylabel=title)
-        few_log_ticks(axes.xaxis)
+        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))  # labels of 1, 2 and 5 alone: nine would overlap
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}")
         axes.grid(True, which="major", color="0.88", lw=0.6)
         axes.tick_params(labelsize=8)
     handles, labels = figure.axes[0].get_legend_handles_labels()

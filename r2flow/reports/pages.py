@@ -16,7 +16,6 @@ from typing import Any
 
 import torch
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 
 import r2flow
 from r2flow.errors import check
@@ -108,13 +107,6 @@ def blank_figure(width: float, height: float, title: str = "") -> Figure:
     if title:
         figure.suptitle(title, fontsize=11)
     return figure
-
-
-def few_log_ticks(axis: Any) -> None:
-    """Label only 1, 2 and 5 of each decade, since nine labels would overlap."""
-    axis.set_minor_locator(LogLocator(subs=(2, 5)))
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(lambda value, _: f"{value:g}")
 
 
 def _json(page: Page, origin: Mapping[str, Any]) -> str:

@@ -197,11 +197,16 @@ def solvers_page(
         axes = product(("evaluations", "seconds"), ("error", "range_rms_m"))
         figures["solvers"] = _figure([(subject.name, flow, x, y) for x, y in axes], 2)
     if groups:
+        lines = []
+        for name, group in groups.items():
+            best = [best_within(group, budget) for budget in sorted(budgets)]
+            found = ("none" if row is None else f"{row['method']} {shown(reached(row))}" for row in best)
+            lines.append([name, *found])
         text += [
             "## Exact problems",
             f"{rows[0]['scans']} scans each, in float64: the most accurate solver within a number of evaluations and "
             "its median RMS error; none if x_0 has a smaller error.",
-            problems_table(groups, budgets),
+            table(lines, ["problem", *(f"within {budget}" for budget in sorted(budgets))]),
         ]
         panels = [(name, group, "evaluations", "error") for name, group in groups.items()]
         figures["solvers_problems"] = _figure(panels, 4)
@@ -226,15 +231,6 @@ def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> 
         "Most accurate solver within a number of evaluations:",
         table(by_budget, {"budget": "evaluations", "label": "solver", **errors}),
     ]
-
-
-def problems_table(groups: Mapping[str, Sequence[Row]], budgets: Sequence[int]) -> str:
-    """Table of the most accurate solver per exact problem and budget."""
-    lines = []
-    for name, rows in groups.items():
-        best = [best_within(rows, budget) for budget in sorted(budgets)]
-        lines.append([name, *("none" if row is None else f"{row['method']} {shown(reached(row))}" for row in best)])
-    return table(lines, ["problem", *(f"within {budget}" for budget in sorted(budgets))])
 
 
 LABELS = {
