@@ -135,14 +135,11 @@ class Baseline(MadeScans):
         return np.stack([r, 0.3 * (r > 0)])[: self.training.shape[1]].astype(np.float32)
 
     @cached_property
-    def _mean(self) -> np.ndarray:
+    def mean_scan(self) -> np.ndarray:
+        """Mean of the training scans, at pixels where more than half of them return."""
         returned = self.training[:, 0] > 0
         mean = self.training.sum(0) / np.maximum(returned.sum(0), 1)
         return np.where(returned.mean(0) > 0.5, mean, 0).astype(np.float32)
-
-    def mean_scan(self, number: int) -> np.ndarray:
-        """Mean of the training scans, at pixels where more than half of them return."""
-        return self._mean
 
     def shuffled_pixels(self, number: int) -> np.ndarray:
         """Each pixel from a random training scan."""
@@ -154,7 +151,7 @@ class Baseline(MadeScans):
 BASELINES = {
     "noise": Baseline.noise,
     "flat ground": Baseline.flat_ground,
-    "mean scan": Baseline.mean_scan,
+    "mean scan": lambda baseline, number: baseline.mean_scan,
     "shuffled pixels": Baseline.shuffled_pixels,
 }
 
