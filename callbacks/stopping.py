@@ -117,20 +117,17 @@ class Stopping(L.Callback):
         if self.told == signal.SIGUSR1:
             code = LATER
             if first:
-                self._requeue(where)
+                assert self.job is not None
+                log.info("%s; scontrol requeue %s", where, self.job)
+                try:
+                    subprocess.run(["scontrol", "requeue", self.job], check=True)
+                except (OSError, subprocess.CalledProcessError) as error:
+                    raise InputError(
+                        f"{where}, but SLURM did not take job {self.job} back ({error}). Submit the same script again."
+                    ) from None
         has_checkpoint = bool(checkpoints_of(self.run_dir))
         consequence = "resumes from the last checkpoint" if has_checkpoint else "starts it again: no checkpoint yet"
         raise Stopped(code, f"{where}; the same command {consequence}" if first else "") from None
-
-    def _requeue(self, where: str) -> None:
-        assert self.job is not None
-        log.info("%s; scontrol requeue %s", where, self.job)
-        try:
-            subprocess.run(["scontrol", "requeue", self.job], check=True)
-        except (OSError, subprocess.CalledProcessError) as error:
-            raise InputError(
-                f"{where}, but SLURM did not take job {self.job} back ({error}). Submit the same script again."
-            ) from None
 
 
 def slurm_job() -> str | None:
