@@ -47,7 +47,7 @@ class Mixed(Problem):
 
     def select(self, scenes: Tensor) -> "Mixed":
         """The problem of some of the scenes, indices (N,)."""
-        return Mixed([self.problems[scene] for scene in scenes.tolist()])
+        return type(self)([self.problems[scene] for scene in scenes.tolist()])
 
     def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         v = torch.empty_like(x)

@@ -23,9 +23,6 @@ X_0 = torch.randn(4, 16, generator=torch.Generator().manual_seed(3))
 class Spoiled(Mixed):
     """Scene 2 becomes NaN once t passes .5."""
 
-    def select(self, scenes):
-        return Spoiled([self.problems[scene] for scene in scenes.tolist()])
-
     def __call__(self, t, x):
         late = torch.tensor([problem is SPOILED for problem in self.problems])[:, None] & (expand_time(t, x) > 0.5)
         return torch.where(late, math.nan, super().__call__(t, x))

@@ -93,9 +93,6 @@ def test_a_scene_that_has_arrived_is_not_evaluated():
     seen = []
 
     class Watched(Mixed):
-        def select(self, scenes):
-            return Watched([self.problems[scene] for scene in scenes.tolist()])
-
         def __call__(self, t, x):
             seen.append(len(x))
             return super().__call__(t, x)
