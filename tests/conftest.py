@@ -231,6 +231,12 @@ def write_scan(path: Path, number: int, reflectance: float = 0.5) -> None:
     write_points(path, np.array([[r, 0.01, -0.05 * r]], np.float32), np.array([reflectance], np.float32))
 
 
+def folder_of(folder: Path, first: int, count: int) -> Path:
+    for number in range(first, first + count):
+        write_scan(folder / f"{number:06d}.bin", number)
+    return folder
+
+
 def numbers(source: Sequence[np.ndarray]) -> list[int]:
     """The number that each scan of `write_scan` carries in its range."""
     return [round(float(source[i][0].max())) - 5 for i in range(len(source))]
@@ -253,9 +259,7 @@ def kitti_360(tmp_path: Path) -> Path:
 @pytest.fixture
 def numbered(tmp_path: Path) -> Path:
     """Twelve scans in a folder, at 5 to 16 m."""
-    for number in range(12):
-        write_scan(tmp_path / "scans" / f"{number:06d}.bin", number)
-    return tmp_path / "scans"
+    return folder_of(tmp_path / "scans", 0, 12)
 
 
 def images(count: int, seed: int) -> np.ndarray:

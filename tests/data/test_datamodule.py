@@ -14,7 +14,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from tests.conftest import numbers, prepare_folder, write_scan
+from tests.conftest import folder_of, numbers, prepare_folder, write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 
@@ -33,12 +33,6 @@ def test_validation_batches_are_the_same_every_time(numbered: Path):
     assert [len(batch["k"]) for batch in first] == [4, 2]
     for a, b in zip(first, second, strict=True):
         assert all(torch.equal(a[name], b[name]) for name in a)
-
-
-def folder_of(folder: Path, first: int, count: int) -> Path:
-    for number in range(first, first + count):
-        write_scan(folder / f"{number:06d}.bin", number)
-    return folder
 
 
 def mixed(tmp_path: Path, weights=(3, 1), **options) -> ScanDataModule:
@@ -112,6 +106,10 @@ FOLDER = {"name": "folder", "root": "x"}
 DRIVES = {"name": "kitti_360", "root": "x"}
 
 
+def mixture(part) -> dict:
+    return {"name": "mixed", "parts": [part, FOLDER]}
+
+
 @pytest.mark.parametrize(
     ("options", "word"),
     [
@@ -124,31 +122,21 @@ DRIVES = {"name": "kitti_360", "root": "x"}
         ({"name": "pairs", "root": "x", "scans": DRIVES}, r"data\.scans: kitti_360 has a standard split: give split"),
         ({"name": "pairs", "root": "x", "scans": {**DRIVES, "split": None}}, "x is not a folder"),
         ({"name": "mixed"}, "data=mixed needs its parts"),
+        (mixture({"root": "x"}), r"data.parts\[0\] needs the name"),
+        (mixture({"name": "folder", "rot": "x"}), r"data.parts\[0\] has no option 'rot'.*Did you mean 'root'"),
+        (mixture(DRIVES), "has a standard split: give split, one of train, test, or null"),
+        (mixture({**FOLDER, "weight": 1}), "every part a weight"),
+        (mixture({"name": "simulated", "sensor": {"name": "vlp"}}), "no sensor named .vlp"),
+        (mixture({"name": "folder"}), "data.root=FOLDER"),
+        (mixture({**FOLDER, "weight": 0}), "weight must be a finite number above 0 or null, found 0"),
+        (mixture("folder"), "a list, each a group of keys"),
+        (mixture({"name": "simulated", "scenes": 0}), "scenes must be a whole number from 1 to 10,000,000"),
+        (mixture({"name": "simulated", "scenes": 2**31}), "scenes must be a whole number from 1 to 10,000,000"),
     ],
 )
 def test_what_cannot_be_is_refused(options: dict, word: str):
     with pytest.raises(InputError, match=word):
         module(**options)
-
-
-@pytest.mark.parametrize(
-    ("part", "word"),
-    [
-        ({"root": "x"}, r"data.parts\[0\] needs the name"),
-        ({"name": "folder", "rot": "x"}, r"data.parts\[0\] has no option 'rot'.*Did you mean 'root'"),
-        (DRIVES, "has a standard split: give split, one of train, test, or null"),
-        ({**FOLDER, "weight": 1}, "every part a weight"),
-        ({"name": "simulated", "sensor": {"name": "vlp"}}, "no sensor named .vlp"),
-        ({"name": "folder"}, "data.root=FOLDER"),
-        ({**FOLDER, "weight": 0}, "weight must be a finite number above 0 or null, found 0"),
-        ("folder", "a list, each a group of keys"),
-        ({"name": "simulated", "scenes": 0}, "scenes must be a whole number from 1 to 10,000,000"),
-        ({"name": "simulated", "scenes": 2**31}, "scenes must be a whole number from 1 to 10,000,000"),
-    ],
-)
-def test_a_part_that_cannot_be_is_refused(part, word: str):
-    with pytest.raises(InputError, match=word):
-        module(name="mixed", parts=[part, FOLDER])
 
 
 def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_path: Path, caplog):
