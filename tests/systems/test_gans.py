@@ -1,8 +1,6 @@
 """The vanilla GAN, DUSty v1 and DUSty v2: networks, losses, rules, augmentation, data, published files and training."""
 
 import math
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from r2flow.callbacks.ema import HalfLifeEMA, half_life_decay
 from r2flow.errors import InputError
@@ -22,14 +20,15 @@ from r2flow.model.checkpoint import load_checkpoint, read_checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.training import read_curves
 from r2flow.systems.gan import dcgan, style_gan
-from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, affine, coloured, transformed
+from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, BatchDraws, affine, coloured, transformed
 from r2flow.systems.gan.dcgan import DustyV1, VanillaGan
 from r2flow.systems.gan.layers import logistic, straight_through_mask
 from r2flow.systems.gan.stage import Warmup, blurred, discriminator_loss, generator_loss, lazy_adam, r1
 from r2flow.systems.gan.style_gan import DustyV2
 from r2flow.training import build, compose, fit
-from tests.conftest import ROOT, Trap
+from tests.conftest import Trap
 from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
+from tests.training.conftest import start
 
 NETWORKS = [
     "vanilla_g_32x64", "dusty1_g_32x64", "dusty1_g_32x64_2ch", "dusty2_g_32x64_eval", "dusty2_g_32x64_train",
@@ -223,22 +222,13 @@ def test_augmentation_is_the_published_one(shared: Path, number: int):
     assert_near(x.grad, case["grad_x"], 1e-4)
 
 
-class Source:
-    """Draws of torch's own generator."""
-
-    def __init__(self, batch: int) -> None:
-        self.batch = batch
-
-    def uniform(self, shape: tuple[int, ...]) -> Tensor:
-        return torch.rand(self.batch, *shape)
-
-    def normal(self, shape: tuple[int, ...]) -> Tensor:
-        return torch.randn(self.batch, *shape)
+def draws_of(count: int) -> BatchDraws:
+    return BatchDraws(0, {"k": torch.arange(count), "x_1": torch.empty(0)}, 0)
 
 
 def test_augmentation_draws_the_published_distributions():
     augment = AdaptiveAugment(initial=0.4)
-    draws = augment.draw(Source(20_000))
+    draws = augment.draw(draws_of(20_000))
     assert list(draws) == list(TRANSFORMATIONS)
     for name, draw in draws.items():
         assert draw[1].mean().item() == pytest.approx(0.4, abs=0.015), name
@@ -257,7 +247,7 @@ def test_augmentation_draws_the_published_distributions():
 def test_augmentation_without_a_transformation_leaves_it_out_and_refuses_an_unknown_one():
     augment = AdaptiveAugment(initial=0.9, policy=dict.fromkeys(TRANSFORMATIONS, 0))
     x = torch.randn(2, 1, 8, 16)
-    assert_near(augment(x, augment.draw(Source(2))), x, 0.05)  # the filter alone, there and back
+    assert_near(augment(x, augment.draw(draws_of(2))), x, 0.05)  # the filter alone, there and back
     with pytest.raises(InputError, match="no augmentation named 'flip'"):
         AdaptiveAugment(policy={"flip": 1})
 
@@ -369,14 +359,12 @@ def test_two_processes_equal_one(tmp_path: Path):
     runs = {}
     for name, more in (("one", []), ("two", ["trainer.devices=2", "trainer.strategy=ddp"])):
         options = [
-            *TINY, "trainer.max_steps=3", "data.batch_size=8", f"run_dir={tmp_path / name}", "callbacks.pictures=null",
-            "samples.num=0", *more,
+            "experiment=dusty2", "size=small", *TINY, "trainer.max_steps=3", "data.batch_size=8",
+            f"run_dir={tmp_path / name}", "callbacks.pictures=null", "samples.num=0", *more,
         ]  # fmt: skip
-        done = subprocess.run(
-            [sys.executable, str(ROOT / "train.py"), "experiment=dusty2", "size=small", *options],
-            capture_output=True, text=True, timeout=300, check=False, cwd=tmp_path,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
+        process = start(tmp_path, options)
+        said, _ = process.communicate(timeout=300)
+        assert process.returncode == 0, said
         runs[name] = read_checkpoint(tmp_path / name / "checkpoints" / "step-00000003.ckpt")
     one, two = runs["one"], runs["two"]
     assert torch.equal(one["current_model_state"]["augment.p"], two["current_model_state"]["augment.p"])
