@@ -3,13 +3,13 @@
 import json
 import os
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
@@ -111,19 +111,7 @@ FAMILIES = {
 FIRST = ["experiment=lidm_autoencoder", "size=small", *TINY, "trainer.max_steps=3", "generator.autoencoder.codes=16"]
 
 
-def assert_equal(a: Any, b: Any) -> None:
-    """Bit-equal, whatever is nested in what."""
-    if isinstance(a, Tensor):
-        assert torch.equal(a, b)
-    elif isinstance(a, Mapping):
-        assert a.keys() == b.keys()
-        for key in a:
-            assert_equal(a[key], b[key])
-    elif isinstance(a, list | tuple):
-        for one, other in zip(a, b, strict=True):
-            assert_equal(one, other)
-    else:
-        assert a == b
+assert_equal = partial(torch.testing.assert_close, rtol=0, atol=0)  # bit-equal, whatever is nested in what
 
 
 @pytest.mark.slow
