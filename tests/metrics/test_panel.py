@@ -39,12 +39,12 @@ def apart(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     return distances(panel(a, SENSOR), panel(b, SENSOR))
 
 
-def scan_of(image: np.ndarray, sensor=SENSOR) -> Scan:
-    return Scan(image[0], None, sensor, np.zeros((100, 100)))
+def scan_of(image: np.ndarray) -> Scan:
+    return Scan(image[0], None, SENSOR, np.zeros((100, 100)))
 
 
-def baseline(name: str, training: np.ndarray, num: int) -> np.ndarray:
-    source = Baseline(name, training, SENSOR, range(num))
+def baseline(name: str, training: np.ndarray, num: int, sensor=SENSOR) -> np.ndarray:
+    source = Baseline(name, training, sensor, range(num))
     return np.stack([source[i] for i in range(num)])
 
 
@@ -106,8 +106,7 @@ def test_every_member_tells_real_drives_from_baselines(shared):
     truth = panel(one, sensor)
     d = distances(truth, panel(other, sensor))
     for name in BASELINES:
-        source = Baseline(name, one, sensor, range(len(other)))
-        made = distances(truth, panel(np.stack([source[i] for i in range(len(other))]), sensor))
+        made = distances(truth, panel(baseline(name, one, len(other), sensor), sensor))
         for line in PANEL:
             assert d[line] < 0.5 * made[line], (name, line)
 
