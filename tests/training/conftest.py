@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from r2flow.runs.launch import main
 from r2flow.signals import LATER
 from r2flow.training import build, compose, fit
 from tests.conftest import ROOT, draw_quickly, refusal, success
+from tests.killing import wait_until
 
 HOLDING = Path(__file__).with_name("holding.py")
 COMMAND = [sys.executable, str(ROOT / "train.py")]
@@ -165,11 +165,8 @@ def let_go(file: Path) -> None:
 
 def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = 200.0) -> None:
     """Wait until a process has written a file."""
-    begin = time.monotonic()
-    while not path.exists():
-        assert process.poll() is None, process.communicate()[0]
-        assert time.monotonic() - begin < seconds, f"{path} is not there after {seconds} s"
-        time.sleep(0.005)
+    wait_until(lambda: path.exists() or process.poll() is not None, seconds)
+    assert path.exists(), process.communicate()[0]
 
 
 @pytest.fixture
