@@ -16,6 +16,7 @@ from r2flow.signals import Stopped, listening, out_of_reach, stop_at_once
 from r2flow.store import Store
 from tests.conftest import ROOT
 from tests.killing import is_gone, wait_until
+from tests.training.conftest import start
 
 # Sends this process a signal when it begins to import a module, then does what a command does.
 AT_IMPORT = """
@@ -47,12 +48,9 @@ TRAIN = f"runpy.run_path({str(ROOT / 'train.py')!r}, run_name='__main__')"
 def test_told_to_stop_during_an_import(tmp_path: Path, command: str, argv: list[str], module: str):
     number = signal.SIGTERM if module == "lightning" else signal.SIGINT
     script = AT_IMPORT.format(module=module, number=int(number), argv=argv, command=command)
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
-    assert done.returncode == 128 + number
-    assert (done.stdout + done.stderr).splitlines() == ["stopped"]
+    process = start(tmp_path, ["-c", script], [sys.executable])
+    assert process.communicate(timeout=100)[0].splitlines() == ["stopped"]
+    assert process.returncode == 128 + number
     assert list(tmp_path.iterdir()) == []
 
 
@@ -116,11 +114,9 @@ else:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_told_to_stop_when_workers_start(tmp_path: Path, number: int):
     (tmp_path / "script.py").write_text(WORKERS.format(number=int(number)))
-    done = subprocess.run(
-        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
-        start_new_session=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
-    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "")
+    process = start(tmp_path, ["script.py"], [sys.executable])
+    assert process.communicate(timeout=60)[0] == ""
+    assert process.returncode == 128 + number
 
 
 def be_killed(item: int) -> None:
