@@ -188,10 +188,6 @@ name=x +parent=3
 USUAL = {"", "-", "c", "o", "x", "a", "1", "0", "3", "name", "run", "out", "scans", "train", "data", "report"}
 
 
-def commands(text: str) -> list[str]:
-    return [line for line in text.splitlines() if line]
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scans, a finished run and one that has stopped, and files that are none of these."""
@@ -259,12 +255,12 @@ def _quiet() -> Iterator[None]:
     root.handlers[:], root.level = handlers, level
 
 
-@pytest.mark.parametrize("line", [*commands(VERBS), *wrong_places(), *wrong_values()])
+@pytest.mark.parametrize("line", [*VERBS.strip().splitlines(), *wrong_places(), *wrong_values()])
 def test_a_wrong_verb_or_option_is_refused(refused, line: str):
     refused(line)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("line", commands(TRAIN))
+@pytest.mark.parametrize("line", TRAIN.strip().splitlines())
 def test_a_wrong_config_is_refused(refused, line: str):
     refused(f"train {line}")

@@ -55,15 +55,10 @@ def test_the_linear_system_is_solved_by_conjugate_gradients():
             torch.testing.assert_close(x, directions @ torch.linalg.solve(inner, directions.T @ row))
 
 
-def bad_matrix(least: float) -> tuple[Tensor, Tensor]:
-    """One that is not quite symmetric, as a network's Jacobian, and the eigenvectors of its symmetric part."""
-    vectors = torch.linalg.qr(randn(WIDTH, WIDTH, seed=5))[0]
-    spectrum = torch.logspace(math.log10(least), 0, WIDTH).double()
-    return vectors * spectrum @ vectors.T + 0.002 * randn(WIDTH, WIDTH, seed=6), vectors
-
-
 def test_each_scan_whose_residual_grows_tenfold_gets_the_least_one():
-    matrix, vectors = bad_matrix(1e-4)
+    vectors = torch.linalg.qr(randn(WIDTH, WIDTH, seed=5))[0]
+    # not quite symmetric, as a network's Jacobian; these are the eigenvectors of its symmetric part
+    matrix = vectors * torch.logspace(-4, 0, WIDTH).double() @ vectors.T + 0.002 * randn(WIDTH, WIDTH, seed=6)
     r = torch.stack([5 * vectors[:, 0] + vectors[:, -1], vectors[:, -1]])  # most of the first lies where S is least
     found = _solved(lambda p: (p, p @ matrix.T), r, 1)
     moved = r @ matrix.T

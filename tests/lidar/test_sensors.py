@@ -135,9 +135,6 @@ def test_an_impossible_sensor_of_a_user_is_refused(options, words):
     assert "\n" not in str(error.value)
 
 
-MINE = "name: mine\nelevations: [10, 4.5, -3, -20]\n"
-
-
 def written(folder: Path, text: str) -> Path:
     path = folder / "mine.yaml"
     path.write_text(text, errors="surrogateescape")
@@ -174,7 +171,7 @@ def test_a_sensor_of_one_s_own_has_every_option(tmp_path):
         ("name: 2001-13-45", "not a readable .yaml file"),
         ("name: 0b_", "not a readable .yaml file"),
         ("elevations: [2, 1]", "needs the option 'name'"),
-        (MINE + "colums: 3", "Did you mean 'columns'?"),
+        ("name: mine\nelevations: [2, 1]\ncolums: 3", "Did you mean 'columns'?"),
         ("name: mine\nelevations: 5", "elevations must be a list"),
     ],
 )

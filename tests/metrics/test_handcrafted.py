@@ -20,9 +20,9 @@ from r2flow.metrics.extractors.handcrafted import (
     HandcraftedRange,
 )
 from r2flow.metrics.scans import Scans
+from tests.conftest import SENSOR
 from tests.metrics.conftest import scans_of
 
-SENSOR = SENSORS["hdl64e"].resized(8, 64)
 BOTH, RANGE = Handcrafted(), HandcraftedRange()
 
 

@@ -26,7 +26,7 @@ def images(seed, n):
 
 
 def measure(rank, ranks):
-    """Figures and remarks of all metrics, of two generated sets one after the other."""
+    """Figures and remarks of all metrics, of two generated sets one after the other; figures of some on their own."""
     network = EXTRACTORS["handcrafted"].trained()
     metrics = [METRICS[name]() for name in PLAIN]
     metrics += [FrechetDistance(network), Manifold(network)]
@@ -39,14 +39,9 @@ def measure(rank, ranks):
             metric.load_real_state(kept)
             give(metric, images(seed, 11), False, rank, ranks)
             found.append([metric.compute(), metric.remarks()])
-    return found + on_their_own(network, rank, ranks)
-
-
-def on_their_own(network, rank, ranks):
-    """Figures of metrics without a common folder, of images that nobody numbers; twice, with more scans in between."""
+    # without a common folder, of images that nobody numbers; twice, with more scans in between
     metrics = [METRICS[name](sensor=SENSOR) for name in ("jsd", "mmd")]
     metrics += [FrechetDistance(network, sensor=SENSOR), Manifold(network, sensor=SENSOR)]
-    found = []
     for metric in metrics:
         for seed in (1, 4):
             for real, scans in ((True, images(seed, 14)), (False, images(seed + 1, 11))):
