@@ -105,10 +105,10 @@ def test_an_export_leaves_the_model_as_it_was_and_takes_a_samplers_name(tmp_path
     assert checkpoint.generator.backbone.training
 
 
-def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
+def test_a_missing_package_names_its_extra_before_the_work_begins(r2flow, saved, tmp_path, monkeypatch):
     monkeypatch.setattr("r2flow.errors.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"an .onnx needs the package onnx: python -m pip install 'r2flow\[export\]'"):
-        export(flow("efficient_unet"), tmp_path / "flow.onnx", SHORT)
+    missing = "an .onnx needs the package onnx: python -m pip install 'r2flow[export]'."
+    assert r2flow("export", saved[0], "--out", tmp_path / "flow.onnx") == (2, "", f"error: {missing}\n")
 
 
 @pytest.mark.slow

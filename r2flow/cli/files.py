@@ -60,7 +60,7 @@ def export(
     flow = isinstance(loaded.generator, RectifiedFlow)  # others are refused whatever their sampler
     sampler = loaded.generator.choose(**how.given) if flow else None
     prepare_folder(out.parent)
-    print("torch exports the network: this takes up to some minutes", flush=True)
+    logging.getLogger("r2flow.model.export").setLevel(logging.INFO)
     written = writing.export(loaded, out, sampler, what == "network")
     batch = "any batch" if written.any_batch else "batch of one scan (torch could not export a variable batch)"
     content = "the network v(t, x)" if what == "network" else sampler

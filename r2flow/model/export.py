@@ -154,7 +154,12 @@ def export(
     own = type(flow).velocity is not RectifiedFlow.velocity
     check(not (network and own), f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler.")
     steps = None if network else tableau(flow, how)
+    if write is _write_onnx:
+        require("an .onnx", "export", "onnx", "onnxscript")
+        size = sum(value.numel() * value.element_size() for value in flow.state_dict().values())
+        check(size <= LARGEST, f"an .onnx holds at most 2 GiB, and these weights are {size:,} bytes: use --to pt2.")
     notes = _notes(checkpoint, how, steps)
+    logging.getLogger(__name__).info("torch exports the network: this takes up to some minutes")
     with _quiet():
         data, any_batch = write(flow, steps, notes)
     write_file(path, data)
@@ -192,9 +197,6 @@ def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) 
 
 
 def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> tuple[bytes, bool]:
-    require("an .onnx", "export", "onnx", "onnxscript")
-    size = sum(value.numel() * value.element_size() for value in flow.state_dict().values())
-    check(size <= LARGEST, f"an .onnx holds at most 2 GiB, and these weights are {size:,} bytes: use --to pt2.")
     from r2flow.model.onnx_graphs import sampler_graph, to_onnx
 
     program, any_batch = _traced(flow.backbone, _network_inputs(flow, (2,) if how is None else ()))
@@ -202,9 +204,8 @@ def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any])
     if how is not None:
         decoded, any_too = _traced(Decoded(flow.space), _noise(flow))
         any_batch = any_batch and any_too
-        network = sampler_graph(
-            network, to_onnx(decoded, ["x_1"], ["scan", "points"]), how.times, how.second, how.states.numpy()
-        )
+        ends = to_onnx(decoded, ["x_1"], ["scan", "points"])
+        network = sampler_graph(network, ends, how.times, how.second, how.states.numpy())
     entry = network.metadata_props.add()
     entry.key, entry.value = "r2flow", json.dumps(notes)
     network.producer_name, network.producer_version = "r2flow", __version__
