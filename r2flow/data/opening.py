@@ -105,12 +105,13 @@ def open_scans(
     """
     label = str(spec)
     options, file = parse(label)
+    whole = num is None or (hasattr(num, "__index__") and num >= 1)
+    check(whole, f"num must be a whole number of at least 1, or None for all scans; found {num!r}.")
     check(reading is None or (sensor is None and size is None), "give a reading, or a sensor and a size, not both.")
     reading = reading or reading_for([label], sensor=sensor, size=size)
     check(not split or (file is None and options.name != SIMULATED), f"{label} has no split: leave {split!r} out.")
     if file is None:
-        columns = reading.columns and list(reading.columns)
-        options = replace(options, split=split, scenes=num or SCENES, reading={"columns": columns})
+        options = replace(options, split=split, scenes=num or SCENES, reading={"columns": reading.columns})
         seed = int(options.folder) if options.name == SIMULATED else 0
         return ScanSet(label, open_source(options, reading, seed), reading.sensor).limited(num)
     image = read_range_image(file)

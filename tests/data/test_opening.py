@@ -256,6 +256,9 @@ class WallKind(SourceKind):
 @pytest.mark.usefixtures("own_table")
 def test_scans_that_are_no_files_are_a_kind_of_their_own():
     SOURCES.add("walls", WallKind())
+    for wrong in (0, -1, 2.5, "2"):
+        with pytest.raises(InputError, match=f"num must be a whole number of at least 1.* found {wrong!r}"):
+            open_scans("walls:5", READING, num=wrong)
     scans = open_scans("walls:5", READING, num=3)
     assert len(scans) == 3
     assert [tuple(batch.shape) for batch in scans.batches([0, 2], 1)] == [(1, 1, 8, 32)] * 2
