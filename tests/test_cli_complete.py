@@ -178,7 +178,7 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
         (None, ["--mask", "points:0"], "one: the mask keeps nothing that was measured"),
         (None, ["--mask", "points:1"], "one: the mask keeps everything that was measured"),
         (None, ["--mask", "{folder}/mask.npy"], "is of (4, 4), the scans are of (8, 64) rays"),
-        (None, ["--from", "vlp16"], "sensor of 8 rows by --from (vlp16 has 16), or --size 8x64 alone"),
+        (None, ["--from", "vlp16"], "of 8 rows by --from, in Python by sensor (vlp16 has 16), or --size 8x64 alone"),
         (np.full((2, 8, 64), np.nan, np.float32), [], "give 0 for NaN"),
         (np.zeros((0, 8, 64), np.float32), [], "must be a range image of floats (2 or 1, H, W), found float32 (0, 8"),
         (-scans()[0].numpy(), [], "must hold ranges in metres, of 0 or more"),
@@ -366,7 +366,7 @@ def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path,
     for given, found in ((np.zeros(4), "(4,)"), (np.zeros((0, 2, 8, 64)), "(0, 2, 8, 64)"), (["a.bin"], "list")):
         with pytest.raises(InputError, match=rf"points \(N, 3 or 4\); found .*{re.escape(found)}"):
             r2flow.load(run).complete(given)
-    with pytest.raises(InputError, match="^points in memory: .*beams cannot be told apart"):
+    with pytest.raises(InputError, match="^points in memory: .*, in Python by sensor: .*beams cannot be told apart"):
         r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
 
 
@@ -389,7 +389,7 @@ def test_a_wrong_sensor_of_the_scans_is_warned_of(tmp_path: Path, caplog: pytest
     open_partial([str(tmp_path)], Reading(VLP16), VLP16)
     assert not caplog.text
     open_partial([str(tmp_path)], Reading(VLP16), SENSORS["os1_64"])
-    assert all(words in caplog.text for words in ("--from os1_64 does not fit", "they fit --from vlp16"))
+    assert all(words in caplog.text for words in ("sensor os1_64 does not fit", "they fit vlp16"))
 
 
 def test_points_of_a_pitched_vehicle_are_warned_of_and_completed(complete, tmp_path: Path):

@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 
 FEWER = 0.9  # with less than this share of rays per column, pixels between the rays are not measured
 FEW = 4  # default number of simulated scans
+FROM = "--from, in Python by sensor"
 
 Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors
 
@@ -118,10 +119,10 @@ def _files(
         try:
             fired = sensor_of(scans, known)
         except InputError as error:
-            raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
+            raise InputError(f"{spec}: the sensor of the scans is not known, name it by {FROM}: {error}") from None
         if not stored and not warn_of_frame(points[0], scans) and source and doubt and not doubt.finer:
-            fits = f"; they fit --from {doubt.name}" if doubt.name else ""
-            log.warning("%s: --from %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
+            fits = f"; they fit {doubt.name}" if doubt.name else ""
+            log.warning("%s: sensor %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
         of_sensor, options = known.reflectance_scale if known else None, parse(spec)[0]
         usual = scale_of(options, of_sensor) if options.name != FOLDER or of_sensor else 0.0
         full = scale or (1.0 if stored else full_reflectance(scans, usual) or usual) or 1.0
@@ -217,8 +218,7 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
             "what means full reflectance; give 0 for NaN and infinity, and --mask FILE.npy for what was not measured."
         )
     within = not r.any() or ((r >= target.min_range) & (r <= target.max_range)).any()
-    limits = f"{target.min_range:g}-{target.max_range:g} m"
-    check(within, f"{path}: none of its ranges lies within {limits}. Are they metres?")
+    check(within, f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they in m?")
     image = read_range_image(path)
     assert image is not None
     if source is not None and image.shape[1] == source.shape[0]:
@@ -226,7 +226,7 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     if source is not None or image.shape[1:] != target.shape:
         size, model = ("x".join(map(str, shape)) for shape in (image.shape[1:], target.shape))
         found = f" ({source.name} has {source.shape[0]})" if source else ""
-        advice = f"name its sensor of {image.shape[1]} rows by --from{found}, or --size {size} alone with densify"
+        advice = f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone with densify"
         raise InputError(f"{path} is a range image of {size}, those of the model are {model}: {advice}.")
     return image_of_same(image, target)
 
