@@ -1,6 +1,7 @@
 """Error against run time of every solver, on exact problems (smooth, stiff, extreme) and on a trained flow."""
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +23,7 @@ from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.encoding import Encoding
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
+from r2flow.plugins import loaded_plugins
 from r2flow.reports.backbones import timed
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import Row, shown, table
@@ -126,8 +128,7 @@ def measure(
                     solutions[label] += [] if repeat else [solution]
                 if progress is not None and repeat == 0:
                     progress()
-        for label, options in chosen.items():
-            rows.append(_row(subject, label, options, seconds[label], solutions[label]))
+        rows += [_row(subject, label, options, seconds[label], solutions[label]) for label, options in chosen.items()]
     return rows
 
 
@@ -217,10 +218,11 @@ def solvers_page(
 def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> list[str]:
     """Recommended solvers per budget and error on a trained flow."""
     by_budget = [{"budget": budget, **(best_within(rows, budget) or {"label": "none"})} for budget in sorted(budgets)]
+    command = shlex.join(["r2flow", "sample", subject.name, *(f"--plugin={name}" for name in loaded_plugins())])
     by_error = []
     for metres in WANTED:
         row = cheapest(rows, metres) or {}
-        how = f"`r2flow sample {subject.name} {row['options']}`" if row else "none"
+        how = f"`{command} {row['options']}`" if row else "none"
         by_error.append({**row, "how": how, "wanted": f"{metres:g} m"})
     errors = {"error": "RMS error", "range_rms_m": "range, RMS m"}
     return [

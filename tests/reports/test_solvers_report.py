@@ -112,6 +112,7 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):
     quick = partial(checkpoint_subject, steps=16, tolerance=1e-3)
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
+    monkeypatch.setattr("r2flow.plugins._loaded", {"of/mine.py": "of/mine.py"})
     out = tmp_path / "reports"
     said = r2flow.said(
         "report", "solvers", saved[0], "-o", out, "--num", 2, "--samplers", "euler,heun2,dopri5",
@@ -120,6 +121,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):
     figures = {f"{name}.{end}" for name in ("solvers", "solvers_problems") for end in ("png", "pdf")}
     assert {path.name for path in out.iterdir()} == figures | {f"solvers.{end}" for end in ("json", "md")}
     assert f"**{saved[0]}**, 2 scans, against its reference solution" in said
+    assert f"`r2flow sample {saved[0]} --plugin=of/mine.py --sampler " in said
     rows = json.loads((out / "solvers.json").read_text())["rows"]
     assert len(rows) == 3 * 8  # two problems and the checkpoint; two steps of two methods and four tolerances
     for name in ("euler", "heun2", "dopri5"):  # most steps, or the lowest tolerance, are the closest to the reference
