@@ -232,16 +232,17 @@ def paper(
     """Reproduce the paper's tables I and II and figures 3 and 5 to 8, printed numbers next to those of `evaluate`."""
     from r2flow.data.opening import open_scans, reading_for
     from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.reports.compare import labels
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.paper import PaperRun, paper_page, read_results, role_of
 
     where = choose_device(device)
     rows, runs = read_results(results or []), []
-    for text in models:
-        role, _, model = text.partition("=") if "=" in text and not Path(text).exists() else ("", "", text)
+    named = [text.partition("=") if "=" in text and not Path(text).exists() else ("", "", text) for text in models]
+    for (role, _, model), label in zip(named, labels([Path(model) for *_, model in named]), strict=True):
         checkpoint = load_checkpoint(model, where)
         check(checkpoint.generator.draws, f"{model} does not generate scans from noise.")
-        runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
+        runs.append(PaperRun(role or role_of(checkpoint, label), model, checkpoint))
     scans = None if real is None else open_scans(real, reading_for([real], runs[0].checkpoint))
     prepare_folder(out)
     page = paper_page(runs, rows, scans, num, steps, where)

@@ -223,11 +223,11 @@ def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) ->
 
 def scans_figure(runs: Sequence[PaperRun], drawn: Mapping[str, np.ndarray], real: np.ndarray | None) -> Figure:
     """Figure 7: a real scan, and the first sample of each generator."""
-    images = {} if real is None else {"real": real[0]}
+    images, titles = ([], []) if real is None else ([real[0]], ["real"])
     for run in runs:
         generator = run.checkpoint.generator
         count = generator.sampler.evaluations(generator)
-        images[f"{run.role}, {f'NFE {count}' if count else 'adaptive steps'}"] = drawn[run.label][0]
-    channels = min(map(len, images.values()))
-    shown = [image[:channels] for image in images.values()]
-    return contact_sheet(shown, runs[0].checkpoint.sensor.rays(), list(images))
+        images.append(drawn[run.label][0])
+        titles.append(f"{run.role}, {f'NFE {count}' if count else 'adaptive steps'}")
+    channels = min(map(len, images))
+    return contact_sheet([image[:channels] for image in images], runs[0].checkpoint.sensor.rays(), titles)

@@ -10,7 +10,7 @@ import pytest
 from r2flow.metrics import METRICS
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
-from r2flow.reports.paper import marginals_apart, role_of, same_architecture, table_i
+from r2flow.reports.paper import PaperRun, marginals_apart, role_of, same_architecture, scans_figure, table_i
 from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II
 from tests.conftest import write_run
 from tests.test_sampling import network
@@ -64,6 +64,12 @@ def test_marginals_are_sums_over_the_other_axis():
     assert marginals_apart(counts, other) == pytest.approx(js_distance(counts[3], other[3]) / 2)
 
 
+def test_two_models_of_one_role_are_both_drawn(runs):
+    both = [PaperRun("1-RF", role, load_checkpoint(run)) for role, run in runs.items()]
+    figure = scans_figure(both, dict.fromkeys(runs, np.ones((1, 2, 8, 64))), None)
+    assert sum(text.get_text().startswith("1-RF, ") for axes in figure.axes for text in axes.texts) == 3
+
+
 def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     figures = {"speed": {"evaluations": 1.0, "seconds": 0.1}, "jsd": {"jsd": 0.25}, "mmd": {"mmd": 1e-4}}
     metrics = [{"metric": name, "figures": values} for name, values in figures.items()]
@@ -72,11 +78,14 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     metrics[0]["protocol"] = {"name": "r2flow", "image": [8, 64]}
     real = {"set": "held", "scans": 7}
     comparisons = [{"kind": "judged", "real": real, "generated": one, "metrics": metrics} for one in sets]
+    last, stage = "checkpoints/step-00000007.ckpt", {"name": "transfer"}
+    unnamed = [write_run(tmp_path / name, network(), stage, 0.3 + i) / last for i, name in enumerate("ab")]
     results = tmp_path / "e.json"
     results.write_text(json.dumps({"comparisons": comparisons}))
     options = "--results", results, "--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0"
-    command = "report", "paper", f"9-RF={runs['2-RF']}", runs["1-RF"], runs["4-TD"], *options, "-o", tmp_path / "out"
-    assert "(9-RF)" in r2flow.said(*command)
+    command = "report", "paper", f"9-RF={runs['2-RF']}", runs["1-RF"], *unnamed, *options, "-o", tmp_path / "out"
+    said = r2flow.said(*command)
+    assert all(f"({name})" in said for name in ("9-RF", f"a/{last}", f"b/{last}"))
     assert "r2flow, 5 scans of 8x64 against 7 of held" in (tmp_path / "out" / "paper.md").read_text()
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
