@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -73,12 +73,10 @@ class Stopping(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._training = True
-        for number in self.signals:
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                try:
+        with suppress(ValueError):  # only the main thread can set handlers
+            for number in self.signals:
+                if signal.getsignal(number) is not signal.SIG_IGN:
                     signal.signal(number, self.hear)
-                except ValueError:  # only the main thread can set handlers
-                    return
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int

@@ -10,6 +10,7 @@ The same command, or the same config, resumes from the last checkpoint.
 
 import logging
 import re
+import signal
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -43,7 +44,7 @@ from r2flow.reports.training import finish, read_curves
 from r2flow.runs.composing import check_keys, compose
 from r2flow.runs.folder import check_run, open_run, read_config, run_lock
 from r2flow.runs.lineage import Parent, find_parent, inherit
-from r2flow.signals import LATER, Stopped
+from r2flow.signals import LATER, STOPPING, Stopped, listening
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 
@@ -293,7 +294,9 @@ def fit(run: Run) -> Result:
             run.trainer.fit(run.stage, run.data)
             return _result(run, run.trainer.global_step, finished=True)
         with run_lock(run.folder) if run.trainer.is_global_zero else nullcontext():
-            step = _fit_in_folder(run, stopping)
+            # Python hears no signal while it waits for other machines; from its first step on, `Stopping` does.
+            with listening(signal.SIG_DFL, STOPPING if run.trainer.num_nodes > 1 else ()):
+                step = _fit_in_folder(run, stopping)
             if run.trainer.is_global_zero:
                 where, kept = run.trainer.strategy.root_device, bool(run.trainer.checkpoint_callbacks)
                 device = str(where) if where.type == "cuda" else "cpu"

@@ -8,6 +8,7 @@ import socket
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -201,6 +202,15 @@ def test_two_processes_of_which_one_is_told_to_stop_leave_together(scans: Path, 
     assert said.count("stopped at step 6; the same command resumes from the last checkpoint") == 1
     assert "Traceback" not in said
     assert read_checkpoint(checkpoints_of(tmp_path / "runs" / "stopped")[0])["global_step"] == 6
+
+
+@pytest.mark.slow
+def test_a_run_that_waits_for_another_machine_ends_when_told_to(scans: Path, tmp_path: Path):
+    process = start(tmp_path, tiny(scans, "name=waits", "trainer.num_nodes=2", "trainer.strategy=ddp"))
+    wait_for(tmp_path / "runs" / "waits" / "config.yaml", process)
+    time.sleep(5)  # in which it begins to wait
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(20) == -signal.SIGTERM
 
 
 @pytest.mark.parametrize(
