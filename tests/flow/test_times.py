@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
+from r2flow.flow import times
 from r2flow.flow.path import interpolate
-from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped, build_density, golden_sequence
+from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped, build_density
 
 N = 400_000
 U = (torch.arange(N, dtype=torch.float64) + 0.5) / N  # every quantile once: no sampling error
@@ -24,7 +25,7 @@ def u_shaped_cdf(t, a=4.0):
         (Uniform(), lambda t: t),
         (UShaped(), u_shaped_cdf),
         (LogitNormal(), lambda t: torch.special.ndtr(torch.logit(t))),
-        (Late(0.3, 2.0, 1.6), lambda t: 0.7 * t + 0.3 * torch.special.ndtr((torch.logit(t) - 2.0) / 1.6)),
+        (Late(0.3), lambda t: 0.7 * t + 0.3 * torch.special.ndtr((torch.logit(t) - 2.0) / 1.6)),
         (Late(0.0), lambda t: t),
     ],
 )
@@ -47,14 +48,14 @@ def test_the_discrete_density_takes_each_of_its_times_equally_often():
 )
 def test_times_stay_on_the_path_in_float32(options):
     last = torch.tensor([0.0, 0.5, math.nextafter(0.5, 0), 1 - 2**-24], dtype=torch.float32)
-    t = TIMES.build(options)(last)
+    t = build_density(options)(last)
     assert t.dtype == torch.float32
     assert ((t >= 0) & (t <= 1)).all()
     if options["name"] == "discrete":
         assert (t < 1).all()
 
 
-@pytest.mark.parametrize("density", [lambda u: 2 * u, lambda u: u[:1], lambda u: 0.5])
+@pytest.mark.parametrize("density", [lambda u: 1.1 * u, lambda u: u - 0.1, lambda u: u[:1], lambda u: 0.5])
 def test_a_density_that_is_no_inverse_cdf_is_refused(monkeypatch, density):
     monkeypatch.setitem(TIMES._entries, "mine", lambda: density)
     with pytest.raises(InputError, match=r"'mine' must map u in \[0, 1\)"):
@@ -71,16 +72,19 @@ def test_the_reference_densities(shared):
     assert (share[5:-5] / middle - 1).abs().max() < 0.05
 
 
-@pytest.mark.parametrize("first", [0, 10**6, 10**8, 2**40])
-def test_the_golden_sequence_is_exact_and_even_however_late_it_begins(first):
-    getcontext().prec = 60
-    ratio = (Decimal(5).sqrt() - 1) / 2
-    found = golden_sequence(torch.arange(first, first + 64))
-    exact = [float((k + Decimal("0.5")) * ratio % 1) for k in range(first, first + 64)]
-    assert found.tolist() == pytest.approx(exact, abs=2**-22)
+@pytest.mark.parametrize("first", [0, 10**6, 10**8, 2**39])
+def test_the_low_discrepancy_sequences_are_exact_and_even_however_late_they_begin(first):
+    getcontext().prec, p, k = 60, Decimal(1), torch.arange(first, first + 64)
+    for _ in range(100):
+        p = (p + 1) ** (1 / Decimal(3))  # whose fixed point is p^3 = p + 1
+    ratios = (Decimal(5).sqrt() - 1) / 2, 1 / p, 1 / p**2
+    exact = [[float((i + Decimal("0.5")) * ratio % 1) for ratio in ratios] for i in k.tolist()]
+    found = torch.column_stack([times.golden_sequence(k), times.plastic_sequence(k)])
     assert found.dtype == torch.float32
+    # 24 bits, cut off, of a product that is off by half a bit.
+    assert (found.double() - torch.tensor(exact, dtype=torch.float64)).abs().max() < 1.6 * 2**-24
     # By the three-distance theorem 64 points lie at least phi^-9 / sqrt(5) apart.
-    assert found.sort().values.diff().min() > 0.005
+    assert found[:, 0].sort().values.diff().min() > 0.005
 
 
 def test_the_line_ends_in_noise_and_in_data_and_u_is_its_derivative():
