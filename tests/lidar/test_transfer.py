@@ -75,7 +75,7 @@ def test_a_ray_that_did_not_come_back_is_empty_and_one_that_was_not_fired_is_unk
     firing = fired(steps=steps)
     lost = np.zeros((16, steps), bool)
     lost[:, 40:44] = True
-    lost[5, 60] = True
+    lost[10, 60] = lost[12, 83:86] = True  # of beams in the target's view
     lost[8] = True  # a beam without any return
     seen = points_through(Points(np.repeat(wall(firing, lost, jitter=jitter).xyz, returns, 0)), firing, TARGET)
     column = np.floor((1 - azimuths(steps, jitter) / math.pi) / 2 * 256).astype(int) % 256
@@ -125,7 +125,7 @@ def test_beams_and_steps_are_found(named):
 
 
 def test_an_image_of_another_sensor_says_its_empty_rays():
-    source = replace(VLP16, elevations=BEAMS, columns=512)
+    source = replace(VLP16, elevations=tuple(e - 0.2 for e in BEAMS), columns=512)  # one of them in row 0
     image = project(wall(fired()).xyz, None, source)[:1]
     image[:, :, 100:104] = 0
     seen = image_through(image, source, TARGET)
@@ -171,10 +171,10 @@ def test_what_is_behind_a_near_return_of_the_same_sensor_was_not_measured():
 
 
 def test_a_range_image_says_all_its_rays():
-    image = np.array([[[5.0, 0.0, 0.7, 90.0]], [[0.5, 0.0, 0.2, 1.3]]], np.float32)
+    image = np.array([[[5.0, 0.0, 0.7, 90.0]], [[1.2, 0.0, 0.2, 1.3]]], np.float32)
     seen = image_of_same(image, TARGET)
     assert seen.state.tolist() == [[Ray.RETURN, Ray.EMPTY, Ray.UNKNOWN, Ray.EMPTY]]
-    assert seen.image.tolist() == [[[5.0, 0, 0, 0]], [[0.5, 0, 0, 0]]]
+    assert seen.image.tolist() == [[[5.0, 0, 0, 0]], [[1.0, 0, 0, 0]]]
 
 
 def test_one_damaged_row_does_not_make_a_cut_sector_measured():
