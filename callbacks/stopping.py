@@ -92,9 +92,8 @@ class Stopping(L.Callback):
                 if trainer.strategy.reduce_boolean_decision(self.told == number, all=False):
                     self.told = number
         if received and trainer.global_step < trainer.max_steps:
-            kept: list[Any] = trainer.checkpoint_callbacks
-            if kept:  # a plug-in's own callback does not save where the run stops, and its files are its own
-                ours = (callback for callback in kept if isinstance(callback, Checkpoints))
+            if trainer.checkpoint_callbacks:  # a plug-in's own callback does not save where the run stops
+                ours = (callback for callback in trainer.checkpoint_callbacks if isinstance(callback, Checkpoints))
                 next(ours, Checkpoints(self.run_dir, keep=sys.maxsize)).save(trainer)
             self._training = False
             trainer._logger_connector.update_train_step_metrics()  # as Lightning does after the callbacks

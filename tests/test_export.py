@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import ROOT, tiny_options
 
+ONNX = pytest.mark.skipif(not (find_spec("onnxscript") and find_spec("onnxruntime")), reason="the extra 'export'")
+KINDS = ["pt2", pytest.param("onnx", marks=ONNX)]
 SHORT = build_sampler("adams3", steps=3, grid="power:1.5", finish=1 / 32)
 
 
@@ -112,12 +115,9 @@ def test_a_missing_package_names_its_extra_before_the_work_begins(r2flow, saved,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pt2", "onnx"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", BACKBONES)
 def test_an_exported_sampler_gives_the_same_scans(name, kind, tmp_path):
-    if kind == "onnx":
-        pytest.importorskip("onnxscript")
-        pytest.importorskip("onnxruntime")
     checkpoint = flow(name)
     written = export(checkpoint, tmp_path / f"flow.{kind}", SHORT)
     assert written.any_batch
@@ -150,7 +150,7 @@ def test_points_and_notes_come_with_the_scan(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pt2", "onnx"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_network_alone_takes_a_time_for_each_image(kind, tmp_path):
     checkpoint = flow("efficient_unet")
     path = export(checkpoint, tmp_path / f"network.{kind}", network=True).path
@@ -160,16 +160,14 @@ def test_the_network_alone_takes_a_time_for_each_image(kind, tmp_path):
         if kind == "pt2":
             v = torch.export.load(path).module()(t, x)
         else:
-            pytest.importorskip("onnxscript")
             session = pytest.importorskip("onnxruntime").InferenceSession(str(path))
             (v,) = map(torch.from_numpy, session.run(["v"], {"t": t.numpy(), "x": x.numpy()}))
     torch.testing.assert_close(v, expected, rtol=1e-4, atol=1e-5)
 
 
+@ONNX
 @pytest.mark.slow
 def test_a_flow_map_goes_through_the_loop_and_the_page_s_program_runs(tmp_path, monkeypatch):
-    pytest.importorskip("onnxscript")
-    pytest.importorskip("onnxruntime")
     monkeypatch.chdir(tmp_path)
     checkpoint, sampler = flow("efficient_unet", "flow_map"), build_sampler("jump", steps=3)
     apart = compare(checkpoint, export(checkpoint, "street.onnx", sampler), sampler)

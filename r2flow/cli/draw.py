@@ -204,8 +204,7 @@ def complete(
     by_densify = how.given.get("name", "jump") in ("jump", "transport")
     name = str(checkpoint or (DENSIFY if by_densify else DEFAULT))
     loaded, scans, remarks = given.open(name, device, what)
-    free = not (checkpoint or given.to or given.size or how.sampler)
-    if free and name == DENSIFY and lack_sectors(scans, job):
+    if not (checkpoint or given.to or given.size or how.sampler) and name == DENSIFY and lack_sectors(scans, job):
         name = DEFAULT
         loaded, scans, remarks = given.open(name, device, what)
     if checkpoint is None:

@@ -222,8 +222,7 @@ def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> 
     by_error = []
     for metres in WANTED:
         row = cheapest(rows, metres) or {}
-        how = f"`{command} {row['options']}`" if row else "none"
-        by_error.append({**row, "how": how, "wanted": f"{metres:g} m"})
+        by_error.append({**row, "how": f"`{command} {row['options']}`" if row else "none", "wanted": f"{metres:g} m"})
     errors = {"error": "RMS error", "range_rms_m": "range, RMS m"}
     return [
         f"**{subject.name}**, {len(subject.x_0)} scans, against its reference solution. Errors above "

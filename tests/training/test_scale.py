@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -223,13 +224,9 @@ def test_a_run_that_waits_for_another_machine_ends_when_told_to(scans: Path, tmp
         ({"SLURM_JOB_ID": "12", "SLURM_JOB_NAME": "interactive"}, None),
     ],
 )
-def test_what_is_queued_again_is_named_as_scontrol_names_it(monkeypatch, variables: dict[str, str], job: str | None):
-    for name in list(os.environ):
-        if name.startswith("SLURM_"):
-            monkeypatch.delenv(name)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    assert slurm_job() == job
+def test_what_is_queued_again_is_named_as_scontrol_names_it(variables: dict[str, str], job: str | None):
+    with patch.dict(os.environ, variables, clear=True):
+        assert slurm_job() == job
 
 
 def test_a_launcher_that_is_not_installed_says_how_to_get_it(tmp_path: Path):
