@@ -33,7 +33,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.metrics.jsd_mmd import JSD, MMD
 from r2flow.metrics.panel import PANEL, REFLECTANCE
 from r2flow.noise import standard_normal
-from r2flow.reports.evaluation import Comparison, verdict
+from r2flow.reports.evaluation import Comparison, _remarks, verdict
 from r2flow.samplers import build_sampler
 from tests.conftest import SENSOR, folder, images
 from tests.test_sampling import flow
@@ -287,6 +287,15 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
     assert words in first
     ratio = f"{1 + 1 / value:.2f} times the lowest, " if metric == "panel" else ""
     assert second.startswith(f"b: {ratio}{metric} {value + 1:g} ")
+
+
+@pytest.mark.parametrize(
+    ("noise", "said"), [(9.0, ["jsd ranks nothing here: baseline: noise below the real halves."]), (11.0, [])]
+)
+def test_a_figure_by_which_a_baseline_is_nearer_than_real_scans_ranks_nothing(noise, said):
+    cases = ("a", 7.0, "judged"), ("real halves", 10.0, "reference"), ("noise", noise, "baseline")
+    results = [(name, [MetricResult("jsd", {"jsd": value}, {})], kind) for name, value, kind in cases]
+    assert _remarks([Comparison(name, range(9), range(9), one, 0.0, kind) for name, one, kind in results]) == said
 
 
 def test_the_verdict_is_of_the_panel_if_measured():
