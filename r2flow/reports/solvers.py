@@ -138,7 +138,8 @@ def _row(
     x_1 = torch.cat([solution.x for solution in solutions])
     errors = rms(x_1 - subject.x_1)
     method = options["method"]
-    words = {"sampler": method.replace(TORCHDIFFEQ, f"{TORCHDIFFEQ}method="), **options}
+    plain = ":finish=0" if "steps" in options and method in SOLVERS else ""  # the model's own sampler may have one
+    words = {"sampler": method.replace(TORCHDIFFEQ, f"{TORCHDIFFEQ}method=") + plain, **options}
     row = {
         "problem": subject.name, "method": method, "label": label,
         "options": " ".join(f"--{key} {value}" for key, value in words.items() if key != "method"),

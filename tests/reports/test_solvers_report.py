@@ -101,6 +101,7 @@ def test_the_cheapest_solver_within_an_error_of_the_range():
 def test_the_exact_problems_are_reported_with_what_was_not_solved():
     subjects = problem_subjects(["straight", "stiff_1e4"], scans=3, elements=4)
     rows = measure(subjects, configurations(["euler", "midpoint", "torchdiffeq:dopri5"], [4, 8], [1e-3]))
+    assert rows[0]["options"].startswith("--sampler euler:finish=0 --steps 4")  # whatever a flow's own sampler is
     assert rows[-1]["options"] == "--sampler torchdiffeq:method=dopri5 --tolerance 0.001"  # as `r2flow sample` takes it
     straight = {r["label"]: r for r in rows if r["problem"] == "straight"}
     assert straight["euler, 4 steps"]["error"] < 1e-12
