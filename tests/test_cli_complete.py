@@ -125,7 +125,7 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(complet
     first = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")}
     (tmp_path / "out" / "two.npy").unlink()
     stamp = (tmp_path / "out" / "one.npy").stat().st_mtime_ns
-    assert "1 scans written" in (said := complete(*asked)[1])
+    assert "1 scan written" in (said := complete(*asked)[1])
     assert "1 were there already" in said
     assert (tmp_path / "out" / "one.npy").stat().st_mtime_ns == stamp
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")} == first
@@ -232,7 +232,7 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
     assert (tmp_path / "out" / f"one{ending}").read_bytes() == before
     full_scan(tmp_path / "b" / f"two{ending}", 0)
     (tmp_path / "b" / f"one{ending}").unlink()
-    assert "1 scans written" in complete(tmp_path / "b", *asked)[1]
+    assert "1 scan written" in complete(tmp_path / "b", *asked)[1]
     assert complete(tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
 
 
@@ -253,7 +253,7 @@ def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path
     whole = open_scans(given).source
     for number in numbers:
         assert np.array_equal(np.load(tmp_path / "out" / f"prep-{number:06d}.npy")[:, ::2], whole[number][:, ::2])
-    assert "1 scans written" in (said := complete(*asked, 4)[1])
+    assert "1 scan written" in (said := complete(*asked, 4)[1])
     assert "3 were there already" in said
 
 
@@ -264,7 +264,7 @@ def test_a_bad_scan_may_be_mended_and_the_command_given_again(complete, tmp_path
     asked = tmp_path / "in", "--mask", "rows:2"
     assert complete(*asked)[0] == 2
     np.save(tmp_path / "in" / "b.npy", image)
-    assert "1 scans written" in success(complete(*asked))
+    assert "1 scan written" in success(complete(*asked))
     full_scan(tmp_path / "in" / "b.npy", 0)
     assert "another scan of the name b" in complete(*asked)[2]
 
@@ -338,7 +338,7 @@ def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_pa
     file = shared / "real" / "other_sensors" / scan
     said = success(complete(file))
     assert beams in said
-    assert "1 scans written" in said
+    assert "1 scan written" in said
     used, kept = (int(number.replace(",", "")) for number in re.findall(r"([\d,]+) (?:measured|are kept)", said))
     flow, (written,) = r2flow.load(run), (file for file in (tmp_path / "out").iterdir() if file.suffix != ".json")
     answer, points, given = flow.complete(file), read_points(file), read_points(written)
@@ -397,7 +397,7 @@ def test_points_of_a_pitched_vehicle_are_warned_of_and_completed(complete, tmp_p
     assert complete(tmp_path / "0.ply", "--from", "vlp16")[::2] == (0, "")
     write_points(tmp_path / "1.ply", xyz @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]))
     code, said, error = complete(tmp_path / "1.ply", "--from", "vlp16", out=tmp_path / "pitched")
-    assert (code, error.count("\n"), "1 scans written" in said) == (0, 1, True), error
+    assert (code, error.count("\n"), "1 scan written" in said) == (0, 1, True), error
     assert "are the points in one sensor's own frame" in error
 
 

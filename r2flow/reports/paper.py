@@ -78,7 +78,7 @@ def paper_page(
     check(evaluated or not rows, f"the results are of other models or checkpoints than {names}: evaluate these.")
     architectures = architecture_rows(runs, evaluated, device)
     protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
-    text = [f"{len(runs)} generators: {names}.", "## Table I: methods and metrics", table_i(evaluated)]
+    text = [f"Generators: {names}.", "## Table I: methods and metrics", table_i(evaluated)]
     if protocols:
         text.append(f"Evaluated rows: {protocols}. Printed rows: paper, 10000 scans of 64x1024 against KITTI-360. Only "
                     "equal protocols and numbers of scans are comparable.")  # fmt: skip
