@@ -92,9 +92,9 @@ def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
     for options in (*run.sets, *([run.held_out] if run.held_out else [])):
         lacking = SOURCES[options.name].lacks_reflectance(options, options.on_bad_scan)
         if lacking:
-            log.info("encoding.reflectance=auto is false here, a flow of range alone: %s", lacking)
+            log.info("range alone is learned (encoding.reflectance=auto): %s", lacking)
             return False
-    log.info("encoding.reflectance=auto is true here: the scans have it")
+    log.info("the scans have reflectance, which is learned too (encoding.reflectance=auto)")
     return True
 
 
