@@ -217,7 +217,7 @@ class Store:
             with out_of_reach():
                 for _ in range(min(workers, len(items))):
                     end, other = context.Pipe()
-                    process = context.Process(target=_serve, args=(other,), daemon=True)
+                    process = context.Process(target=_serve, args=(other,))
                     process.start()
                     processes[end] = process
                     other.close()  # so that the end of the process is heard
@@ -264,11 +264,12 @@ class Store:
         path = self.folder / f".{self.kind}-{item:06d}.lock"
         lock = FileLock(path, timeout=0)
         try:
-            lock.acquire()
+            try:
+                lock.acquire()
+            except Timeout:
+                return False
             if not self.has(item):
                 work(item)
-        except Timeout:
-            return False
         finally:
             if lock.is_locked:
                 path.unlink(missing_ok=True)
@@ -292,34 +293,39 @@ class FileStore(Store):
 
 def _serve(end: connection.Connection) -> None:
     """Make items for the parent process until SIGTERM, or the end of the parent, which logs what this one would."""
+    told = working = False
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        nonlocal told, working
+        told = True
+        if working:  # elsewhere an exception leaves a lock, or ends in `FileLock.__del__`
+            working = False
+            raise SystemExit(code_of(number))
+
+    def interruptible(item: int) -> None:
+        nonlocal working
+        working = True
+        try:
+            if not told:
+                work(item)
+        finally:
+            working = False
+
     end_with_parent(end=lambda: os.kill(os.getpid(), signal.SIGTERM))
     logging.getLogger().handlers = [QueueHandler(SimpleNamespace(put_nowait=end.send))]
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     with suppress(EOFError, OSError):  # the parent is gone
         try:
-            with _within_reach():
-                store, work = end.recv()  # imports modules, and SIGTERM ends it at once
-            signal.signal(signal.SIGTERM, _leave)
-            work = _within_reach()(work)
-            while True:
-                end.send(store.attempt(end.recv(), work))
+            store, work = end.recv()  # imports modules, and SIGTERM ends it at once
+            signal.signal(signal.SIGTERM, hear)
+            while not told:
+                end.send(store.attempt(end.recv(), interruptible))
         except Exception as error:
             error.add_note(traceback.format_exc())
-            end.send(error)
-
-
-@contextmanager
-def _within_reach() -> Iterator[None]:
-    """Hear SIGTERM in the block, and not where an exception leaves a lock, or ends in `FileLock.__del__`."""
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_IGN)
-    raise SystemExit(code_of(number))  # removes the files of an item that is half made
+            try:
+                end.send(error)
+            except Exception:  # it cannot be pickled
+                end.send(RuntimeError(f"{type(error).__name__}: {error}"))
 
 
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:

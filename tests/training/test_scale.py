@@ -208,10 +208,13 @@ def test_two_processes_of_which_one_is_told_to_stop_leave_together(scans: Path, 
 @pytest.mark.slow
 def test_a_run_that_waits_for_another_machine_ends_when_told_to(scans: Path, tmp_path: Path):
     process = start(tmp_path, tiny(scans, "name=waits", "trainer.num_nodes=2", "trainer.strategy=ddp"))
-    wait_for(tmp_path / "runs" / "waits" / "config.yaml", process)
-    time.sleep(5)  # in which it begins to wait
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(20) == -signal.SIGTERM
+    try:
+        wait_for(tmp_path / "runs" / "waits" / "config.yaml", process)
+        time.sleep(5)  # in which it begins to wait
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == -signal.SIGTERM
+    finally:
+        process.kill()
 
 
 @pytest.mark.parametrize(
