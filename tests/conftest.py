@@ -1,13 +1,13 @@
 """Shared by all tests: where reference tensors and real scans lie, and small sensors."""
 
 import contextlib
+import io
 import os
 import resource
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import lightning as L
 import numpy as np
@@ -138,49 +138,45 @@ def saved(tmp_path: Path) -> tuple[Path, dict]:
     return path, averaged
 
 
-@dataclass(frozen=True)
-class Command:
-    """Runs a verb in this process: (exit code, standard output, standard error)."""
+class Done(NamedTuple):
+    """How a command ended."""
 
-    monkeypatch: pytest.MonkeyPatch
-    capsys: pytest.CaptureFixture[str]
+    returncode: int
+    stdout: str
+    stderr: str
 
-    def __call__(self, *arguments: object) -> tuple[int, str, str]:
-        self.monkeypatch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as exit:
-            code = exit.code if isinstance(exit.code, int) else 1
-        captured = self.capsys.readouterr()
-        return code, captured.out, captured.err
+    @property
+    def said(self) -> str:
+        """The output of a command that succeeds."""
+        assert self.returncode == 0, self.stderr
+        return self.stdout
 
-    def said(self, *arguments: object) -> str:
-        """The standard output of a verb that succeeds."""
-        return success(self(*arguments))
-
-    def refusal(self, *arguments: object) -> str:
-        """The one line that refuses a verb."""
-        return refusal(self(*arguments))
+    @property
+    def refusal(self) -> str:
+        """The one line of an error of the user's, without a warning."""
+        assert self.returncode == 2, self.stderr
+        (line,) = self.stderr.splitlines()
+        return line
 
 
-def success(answer: tuple[int, str, str]) -> str:
-    code, said, error = answer
-    assert code == 0, error
-    return said
-
-
-def refusal(answer: tuple[int, str, str]) -> str:
-    """The one line of an error, before which warnings may stand."""
-    code, _, error = answer
-    assert code == 2, error
-    (line,) = (line for line in error.splitlines() if not line.startswith("WARNING"))
-    return line
+def captured(run: Callable[[], int | None]) -> Done:
+    """A command in this process, which costs no import of torch."""
+    said, complained = io.StringIO(), io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
+            code = run() or 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    return Done(code, said.getvalue(), complained.getvalue())
 
 
 @pytest.fixture
-def r2flow(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    return Command(monkeypatch, capsys)
+def r2flow(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
+    def typed(*arguments: object) -> Done:
+        monkeypatch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
+        return captured(cli.main)
+
+    return typed
 
 
 def draw_quickly(patch: pytest.MonkeyPatch) -> None:

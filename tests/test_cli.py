@@ -22,7 +22,7 @@ from tests.test_sampling import network, scans
 
 def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path):
     path, _ = saved
-    out = r2flow.said("sample", path, "--num", 3, "--steps", 2, "--seed", 5, "--out", tmp_path / "a")
+    out = r2flow("sample", path, "--num", 3, "--steps", 2, "--seed", 5, "--out", tmp_path / "a").said
     assert str(tmp_path / "a" / "samples.png") in out
     r2flow("sample", path.parent.parent, "--num", 1, "--steps", 2, "--seed", 5, "-o", tmp_path / "b", "--pictures", 0)
     r2flow("sample", path, "--num", 3, "--steps", 2, "--seed", 6, "-o", tmp_path / "c", "--format", "npy")
@@ -37,7 +37,7 @@ def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path)
 
 def test_show_writes_range_images(r2flow, scan, tmp_path):
     more = ("--projection", "unfolding", "--size", "64x1024", "--format", "npy", "--out", tmp_path)
-    said = r2flow.said("show", scan, *more)
+    said = r2flow("show", scan, *more).said
     image = np.load(tmp_path / f"{scan.stem}.npy")
     assert (image.shape, image.dtype) == ((2, 64, 1024), np.float32)
     e = SENSORS["hdl64e"].rays()[0].numpy()
@@ -50,22 +50,22 @@ def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path)
     files = [tmp_path / drive / "velodyne_points" / "data" / "000000.bin" for drive in ("d1", "d2", "d3")]
     for file in files:
         write_scan(file, 3)
-    said = r2flow.said("show", *files, "--size", "32x256", "--out", tmp_path / "views")
+    said = r2flow("show", *files, "--size", "32x256", "--out", tmp_path / "views").said
     names = ["000000.png", "000000_2.png", "000000_3.png"]
     assert said.splitlines() == [str(tmp_path / "views" / name) for name in names]
 
 
 def test_info_says_what_is_in_a_checkpoint(r2flow, saved):
-    said = r2flow.said("info", saved[0])
+    said = r2flow("info", saved[0]).said
     for words in ("hdit", "2 x 8 x 64", "hdl64e", "logscale", "backbone.base_channels"):
         assert words in said
-    assert json.loads(r2flow.said("info", saved[0], "--json"))["step"] == 7
+    assert json.loads(r2flow("info", saved[0], "--json").said)["step"] == 7
 
 
 def test_export_writes_the_averaged_weights(r2flow, saved, tmp_path):
     path, averaged = saved
     out = tmp_path / "a.safetensors"
-    said = r2flow.said("export", path.parent.parent, "--to", "safetensors", "--out", out)
+    said = r2flow("export", path.parent.parent, "--to", "safetensors", "--out", out).said
     assert hashlib.sha256(out.read_bytes()).hexdigest() in said
     for name, value in load_checkpoint(out).generator.state_dict().items():
         assert torch.equal(value, averaged[f"generator.{name}"])
@@ -102,7 +102,7 @@ def verbs() -> list[str]:
 
 @pytest.mark.parametrize("verb", verbs())
 def test_every_verb_has_help_with_an_example(r2flow, verb):
-    said = r2flow.said(*verb.split(), "--help")
+    said = r2flow(*verb.split(), "--help").said
     assert f" {verb} " in " ".join(said.split()).partition("Example: ")[2]
 
 
@@ -118,7 +118,7 @@ def test_every_verb_has_help_with_an_example(r2flow, verb):
 def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, words):
     monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", Mock(side_effect=error))
     for more, instead in ((("--batch-size", 4), "a smaller --batch-size"), ((), "smaller batches or images")):
-        said = r2flow.refusal("sample", "-o", tmp_path, *more)
+        said = r2flow("sample", "-o", tmp_path, *more).refusal
         assert words in said
         assert instead in said
 
@@ -173,7 +173,7 @@ def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
     out, files = tmp_path / "between", [tmp_path / "scans" / "one.bin", tmp_path / "scans" / "two.ply"]
     for path, image in zip(files, scans(2).numpy(), strict=True):
         write_points(path, *image_to_points(image, SENSOR.rays()))
-    said = r2flow.said("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8)
+    said = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8).said
     assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [f"{i:03d}.ply" for i in range(4)]
     for index in range(4):
         image = np.load(out / "frames" / f"{index:03d}.npy")
@@ -182,20 +182,20 @@ def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
     assert [row["weight"] for row in rows] == pytest.approx([0, 1 / 3, 2 / 3, 1])
     assert [row["evaluations"] for row in rows] == [64, 32, 32, 64]  # the ends go there and back
     assert "4 scans" in said
-    r2flow.said("interpolate", *files, "-c", run, "-o", out, "--frames", 3, "--steps", 5)
+    assert r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 3, "--steps", 5).said
     rows = json.loads((out / "interpolation.json").read_text())["rows"]
     assert [row["evaluations"] for row in rows] == [10, 5, 10]  # of adams3, one a step
 
 
 def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):
     part = tmp_path / "part"
-    said = r2flow.said("sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", part)
+    said = r2flow("sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", part).said
     # 11.25 degrees are 2 columns, and the network's unit is 8.
     assert "generating rows 0-3, columns 16-47, for rows 0-2, columns 24-39: 25% of the image" in said
     image = np.load(part / "000000.npy")
     assert image.shape == (2, 8, 64)
     for judged in (("evaluate", part, "simulated:0"), ("evaluate", "simulated:0", part)):
-        assert f"{part} holds a part of each scan alone" in r2flow.refusal(*judged)
+        assert f"{part} holds a part of each scan alone" in r2flow(*judged).refusal
     inside = np.zeros((8, 64), bool)
     inside[:3, 24:40] = True
     assert (image[0][inside] > 0).any()

@@ -23,7 +23,7 @@ from r2flow.model.completion import Completed
 from r2flow.noise import generator
 from r2flow.reports.completed import hidden_errors
 from r2flow.simulator import simulate
-from tests.conftest import SENSOR, prepare_folder, refusal, success, write_run
+from tests.conftest import SENSOR, Done, prepare_folder, write_run
 from tests.test_completion import network
 from tests.test_sampling import scans
 
@@ -40,17 +40,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def complete(r2flow, run, tmp_path):
     """`r2flow complete`, by the run and into the folder `out` if not told otherwise."""
 
-    def typed(*arguments: object, model: Path | None = run, out: Path = tmp_path / "out") -> tuple[int, str, str]:
+    def typed(*arguments: object, model: Path | None = run, out: Path = tmp_path / "out") -> Done:
         by = () if model is None else ("-c", model)
         return r2flow("complete", "--pictures", 0, *arguments, *by, "--out", out)
 
     return typed
 
 
-def assert_refused(answer: tuple[int, str, str], message: str, out: Path) -> None:
+def assert_refused(answer: Done, message: str, out: Path) -> None:
     """With nothing written."""
-    assert message in refusal(answer)
-    assert answer[2].count("\n") == 1  # and no warning
+    assert message in answer.refusal
     assert not out.exists()
 
 
@@ -101,7 +100,7 @@ def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, end
 
 def test_a_sparser_sensor_is_found_and_its_points_come_back(complete, tmp_path):
     xyz = sparse_scan(tmp_path / "in" / "room.pcd")
-    said = success(complete(tmp_path / "in", "--num", 2))
+    said = complete(tmp_path / "in", "--num", 2).said
     for words in ("vlp16 with 16 beams from +15.1 to -14.9", "6 of the 8 rows", "7 of its 16 beams look past"):
         assert words in said
     answers = [read_points(tmp_path / "out" / f"room_{a}.pcd") for a in range(2)]
@@ -129,7 +128,7 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(complet
     assert "1 were there already" in said
     assert (tmp_path / "out" / "one.npy").stat().st_mtime_ns == stamp
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")} == first
-    assert "holds other answers: " in refusal(complete(*asked, "--num", 3))
+    assert "holds other answers: " in complete(*asked, "--num", 3).refusal
     kept = parse_mask("points:0.3")(np.ones((8, 64), bool), generator(3, "condition", 1))
     image, answer = np.load(tmp_path / "in" / "two.npy"), np.load(tmp_path / "out" / "two.npy")
     assert np.array_equal(image[:, kept], answer[:, kept])
@@ -145,11 +144,11 @@ def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(complete, tmp_path):
     there = image[0] > 0
     assert np.array_equal(filled[:, there], image[:, there])
     assert (filled[0][~there] > 0).any()
-    assert "fill_gaps" in refusal(complete(tmp_path / "one.npy"))
+    assert "fill_gaps" in complete(tmp_path / "one.npy").refusal
 
 
 def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):
-    said = success(complete("simulated:3", "--from", "vlp16", "--scans", 1, "--steps", 1))
+    said = complete("simulated:3", "--from", "vlp16", "--scans", 1, "--steps", 1).said
     assert "simulated:3: vlp16 with 16 beams" in said
     assert np.load(tmp_path / "out" / "simulated-3-000000.npy").shape == (2, 8, 64)
 
@@ -157,7 +156,7 @@ def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):
 def test_a_model_of_range_alone_leaves_reflectance_out(complete, tmp_path):
     path = write_run(tmp_path / "run", network(reflectance=False), TRANSFER)
     full_scan(tmp_path / "one.bin")
-    said = success(complete(tmp_path / "one.bin", "--mask", "rows:2", model=path))
+    said = complete(tmp_path / "one.bin", "--mask", "rows:2", model=path).said
     assert "answers have no reflectance" in said
     assert read_points(tmp_path / "out" / "one.ply").reflectance is None
 
@@ -214,7 +213,7 @@ def test_the_folder_of_the_scans_is_not_written_into(complete, tmp_path):
     sparse_scan(tmp_path / "in" / "room.pcd")
     for what in (tmp_path / "in" / "room.pcd", tmp_path / "in", tmp_path):
         out = tmp_path if what == tmp_path else tmp_path / "in"
-        assert f"{out} is the folder of the scans" in refusal(complete(what, "--num", 2, out=out))
+        assert f"{out} is the folder of the scans" in complete(what, "--num", 2, out=out).refusal
     assert [path.name for path in (tmp_path / "in").iterdir()] == ["room.pcd"]
 
 
@@ -228,7 +227,7 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
     (tmp_path / "out" / f"one{ending}").unlink()
     assert complete(tmp_path / "a", *asked)[0] == 0
     before = (tmp_path / "out" / f"one{ending}").read_bytes()
-    assert "another scan of the name one" in refusal(complete(tmp_path / "b", *asked))
+    assert "another scan of the name one" in complete(tmp_path / "b", *asked).refusal
     assert (tmp_path / "out" / f"one{ending}").read_bytes() == before
     full_scan(tmp_path / "b" / f"two{ending}", 0)
     (tmp_path / "b" / f"one{ending}").unlink()
@@ -264,7 +263,7 @@ def test_a_bad_scan_may_be_mended_and_the_command_given_again(complete, tmp_path
     asked = tmp_path / "in", "--mask", "rows:2"
     assert complete(*asked)[0] == 2
     np.save(tmp_path / "in" / "b.npy", image)
-    assert "1 scan written" in success(complete(*asked))
+    assert "1 scan written" in complete(*asked).said
     full_scan(tmp_path / "in" / "b.npy", 0)
     assert "another scan of the name b" in complete(*asked)[2]
 
@@ -321,7 +320,7 @@ def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):
     assert "1 were there already" in complete(*asked)[1]
     assert "reflectance_scale=None there, 2.0 here" in complete(*asked, "--reflectance-scale", 2)[2]
     np.save(tmp_path / "mask.npy", ~mask)
-    assert "mask=" in refusal(complete(*asked))
+    assert "mask=" in complete(*asked).refusal
 
 
 @pytest.mark.slow
@@ -336,7 +335,7 @@ def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):
 )
 def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_path, scan, beams):
     file = shared / "real" / "other_sensors" / scan
-    said = success(complete(file))
+    said = complete(file).said
     assert beams in said
     assert "1 scan written" in said
     used, kept = (int(number.replace(",", "")) for number in re.findall(r"([\d,]+) (?:measured|are kept)", said))
@@ -353,8 +352,8 @@ def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_p
     sparse_scan(tmp_path / "room.pcd")
     write_sensor(replace(VLP16, name="mine"), tmp_path / "mine.yaml", "")
     asked = tmp_path / "room.pcd", "--to", tmp_path / "mine.yaml", "--size", "32x128"
-    assert "16 of the 32 rows of mine are measured" in success(complete(*asked, model=None))
-    said = success(complete(*asked[:1], "--from", tmp_path / "mine.yaml", out=tmp_path / "other"))
+    assert "16 of the 32 rows of mine are measured" in complete(*asked, model=None).said
+    said = complete(*asked[:1], "--from", tmp_path / "mine.yaml", out=tmp_path / "other").said
     assert "6 of its 16 beams look past" in said
     assert "--to FILE (r2flow sensor) --size 16x900 uses them" in said
 
@@ -403,11 +402,11 @@ def test_points_of_a_pitched_vehicle_are_warned_of_and_completed(complete, tmp_p
 
 def test_points_next_to_range_images_are_completed(complete, r2flow, tmp_path: Path):
     folder = tmp_path / "in"
-    r2flow.said("simulate", "--num", 1, "--sensor", "vlp16", "--format", "bin,npy", "--labels", "--out", folder)
+    assert r2flow("simulate", "--num", 1, "--sensor", "vlp16", "--format", "bin,npy", "--labels", "--out", folder).said
     assert len(open_scans(folder)) == 1
-    assert "16: ring after ring" in r2flow.said("sensor", folder)
+    assert "16: ring after ring" in r2flow("sensor", folder).said
     assert r2flow("show", folder, "--out", tmp_path / "seen")[::2] == (0, "")
-    success(complete(folder))
+    assert complete(folder).said
     xyz, answer = (read_points(path / "000000.bin").xyz for path in (folder, tmp_path / "out"))
     inside = np.linalg.norm(xyz, axis=1)
     kept = xyz[(inside >= SENSOR.min_range) & (inside <= SENSOR.max_range)]
@@ -416,16 +415,16 @@ def test_points_next_to_range_images_are_completed(complete, r2flow, tmp_path: P
 
 def test_points_outside_the_limits_and_sectors_never_scanned_are_told(complete, tmp_path: Path):
     xyz, asked = sparse_scan(tmp_path / "whole.ply"), ("--to", "vlp16", "--size", "32x360")
-    assert "no ray is known" not in success(complete(tmp_path / "whole.ply", *asked))
+    assert "no ray is known" not in complete(tmp_path / "whole.ply", *asked).said
     hidden = complete(tmp_path / "whole.ply", *asked, "--mask", "sector:-30,30", out=tmp_path / "hidden")
-    assert "up to 60 degrees of a scan, and this model fills no whole sectors: --checkpoint street" in success(hidden)
+    assert "up to 60 degrees of a scan, and this model fills no whole sectors: --checkpoint street" in hidden.said
     write_points(tmp_path / "front.ply", xyz[np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 3])
-    assert re.search("no ray .* up to (239|240) degrees", success(complete(tmp_path / "front.ply", *asked)))
+    assert re.search("no ray .* up to (239|240) degrees", complete(tmp_path / "front.ply", *asked).said)
     xyz[:300] /= 100  # 0.1 m away
     xyz[300] = 0  # a ray without return
     write_points(tmp_path / "some.ply", xyz)
     kept = f"; {len(xyz) - 301:,} are kept, 300 outside 0.5-100 m are left out"
-    assert kept in success(complete(tmp_path / "some.ply", *asked))
+    assert kept in complete(tmp_path / "some.ply", *asked).said
 
 
 @pytest.mark.parametrize(("rows", "columns", "named"), [(4, 64, True), (8, 32, True), (4, 32, True), (8, 32, False)])
@@ -460,7 +459,7 @@ def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(
 def test_the_model_is_chosen_by_what_is_missing(complete, tmp_path, mask, more, model, size):
     image = simulate(SENSORS["hdl64e"].resized(64, 512), 5, 0).image
     write_points(tmp_path / "one.ply", *image_to_points(image, SENSORS["hdl64e"].resized(64, 512).rays()))
-    said = success(complete(tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, model=None))
+    said = complete(tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, model=None).said
     assert f"the model {model}: " in said
     assert f"in each pixel of {size}" in said
     assert len(read_points(tmp_path / "out" / "one.ply").xyz) > 1000

@@ -39,7 +39,7 @@ def _own_cache(monkeypatch, tmp_path: Path) -> None:
 
 
 def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_path):
-    said = r2flow.said("evaluate", real, generated, *QUICK, "--json", tmp_path / "e.json")
+    said = r2flow("evaluate", real, generated, *QUICK, "--json", tmp_path / "e.json").said
     content = json.loads((tmp_path / "e.json").read_text(), parse_constant=pytest.fail)
     found = {one["comparison"]: (one["kind"], one["generated"]["scans"]) for one in content["comparisons"]}
     baselines = dict.fromkeys(("noise", "flat ground", "mean scan", "shuffled pixels"), ("baseline", 10))
@@ -66,7 +66,7 @@ def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_
             write_points(tmp_path / name / f"{number}.ply", xyz, scale * reflectance)
     assert r2flow("evaluate", real, tmp_path / "g", *QUICK)[0] == 0
     options = ("--metrics", "frechet_handcrafted", *QUICK[2:], "--json", tmp_path / "e.json")
-    assert "--reflectance-scale 255" in r2flow.refusal("evaluate", real, tmp_path / "g", *options)
+    assert "--reflectance-scale 255" in r2flow("evaluate", real, tmp_path / "g", *options).refusal
     assert r2flow("evaluate", real, tmp_path / "g", *options, "--generated-scale", 255)[0] == 0
     for sets in ((tmp_path / "g", tmp_path / "one"), (tmp_path / "one", tmp_path / "g")):  # the same scans
         assert r2flow("evaluate", *sets, *options, "--reflectance-scale", 255)[0] == 0
@@ -77,7 +77,7 @@ def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_
 def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):
     empty = folder(tmp_path / "empty", np.zeros((2, 2, 8, 64), np.float32))
     options = ("--metrics", "mmd", *QUICK[2:], "--json", tmp_path / "e.json", "--out", tmp_path / "page")
-    said = r2flow.said("evaluate", real, empty, *options)
+    said = r2flow("evaluate", real, empty, *options).said
     (metric,) = json.loads((tmp_path / "e.json").read_text(), parse_constant=pytest.fail)["comparisons"][0]["metrics"]
     assert metric["figures"] == {"mmd": None}
     assert any("no figure for mmd" in remark for remark in metric["remarks"])
@@ -91,15 +91,12 @@ def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):
 def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     run = saved[0].parent.parent
     options = ("--metrics", "jsd", "--num", 3, "--steps", 2, "--workers", 0, "--json", tmp_path / "e.json")
-    r2flow.said("evaluate", real, run, *options)
+    assert r2flow("evaluate", real, run, *options).said
     about = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["generated"]
     assert (about["kind"], about["num"], about["sampler"]["steps"], about["noise"]) == ("sampled", 3, 2, "evaluation")
-    assert "8x64, not of hdl64e 16x64" in r2flow.refusal(
-        "evaluate", real, run, *QUICK[:2], "--size", "16x64", "--num", 3
-    )
-    assert "not of vlp16 8x64" in r2flow.refusal(
-        "evaluate", real, run, *QUICK[:2], "--sensor", "vlp16", "--size", "8x64", "--num", 3
-    )
+    asked = "evaluate", real, run, *QUICK[:2], "--num", 3, "--size"
+    assert "8x64, not of hdl64e 16x64" in r2flow(*asked, "16x64").refusal
+    assert "not of vlp16 8x64" in r2flow(*asked, "8x64", "--sensor", "vlp16").refusal
 
 
 def test_the_order_of_models_changes_no_figure(r2flow, real, tmp_path):
@@ -112,7 +109,7 @@ def test_the_order_of_models_changes_no_figure(r2flow, real, tmp_path):
     figures = []
     for scans, *names in (("real", "a"), ("points", "a", "b"), ("points", "b", "a")):
         quick = ("--metrics", "jsd", "--num", 2, "--steps", 1, "--workers", 0, "--json", tmp_path / "e.json")
-        r2flow.said("evaluate", tmp_path / scans, *(tmp_path / f"{name}.safetensors" for name in names), *quick)
+        assert r2flow("evaluate", tmp_path / scans, *(tmp_path / f"{name}.safetensors" for name in names), *quick).said
         content = json.loads((tmp_path / "e.json").read_text())["comparisons"]
         figures.append({one["comparison"]: one["metrics"][0]["figures"]["jsd"] for one in content})
     assert figures[1] == figures[2]
@@ -125,7 +122,7 @@ def points(r2flow, real, tmp_path):
 
     def measure(*arguments: object) -> tuple[list[dict[str, Any]], str]:
         options = ("--metrics", "jsd", "--num", 4, "--workers", 0, "--no-reference", "--no-baselines")
-        r2flow.said("evaluate", real, *arguments, *options, "--out", tmp_path)
+        assert r2flow("evaluate", real, *arguments, *options, "--out", tmp_path).said
         return read_results([tmp_path / "evaluation.json"]), (tmp_path / "evaluation.md").read_text()
 
     return measure
@@ -168,7 +165,7 @@ def test_a_distilled_model_keeps_its_steps(points, r2flow, real, tmp_path):
     quick = ("evaluate", real, tmp_path / "td.safetensors", "--num", 2, *QUICK, "--sampler")
     assert "td.safetensors is distilled for euler, 2 steps alone" in r2flow(*quick, "heun2")[2]
     curvature = ("report", "curvature", tmp_path / "td.safetensors", "--out", tmp_path / "report")
-    assert "it has learned no other times" in r2flow.refusal(*curvature)
+    assert "it has learned no other times" in r2flow(*curvature).refusal
 
 
 def test_an_adaptive_solver_is_one_set(points, saved):
@@ -211,7 +208,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
     METRICS.add("mine", MeanRange)
     EXTRACTORS.add("means", SimpleNamespace(trained=partial(Summary, "means")))
     options = ("--metrics", "mine,frechet_means,kid_means,panel", *QUICK[2:])
-    said = r2flow.said("evaluate", real, generated, *options, "--json", tmp_path / "e.json")
+    said = r2flow("evaluate", real, generated, *options, "--json", tmp_path / "e.json").said
     ranges = [scans[:, 0][(scans[:, 0] > 0) & (scans[:, 0] < 63)].mean() for scans in (images(12, 1), images(10, 2))]
     both = (Scans(torch.from_numpy(scans), SENSOR) for scans in (images(12, 1), images(10, 2)))
     rows = [Summary().features(scans).double().numpy() for scans in both]
@@ -226,7 +223,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
 def test_a_scan_is_no_place_for_figures(r2flow, real, generated):
     scan = min(real.iterdir())
     before = scan.read_bytes()
-    assert "--json must be a file" in r2flow.refusal("evaluate", real, generated, *QUICK, "--json", scan)
+    assert "--json must be a file" in r2flow("evaluate", real, generated, *QUICK, "--json", scan).refusal
     assert scan.read_bytes() == before
 
 
@@ -252,7 +249,7 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
 def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):
     run = saved[0].parent.parent
     assert r2flow("sample", run, "--num", 2, "--steps", 2, "-o", run / "samples", "--pictures", 0)[0] == 0
-    assert "(2 : 12)" in r2flow.said("evaluate", real, run / "samples", "--metrics", "jsd", "--workers", 0)
+    assert "(2 : 12)" in r2flow("evaluate", real, run / "samples", "--metrics", "jsd", "--workers", 0).said
     assert r2flow("show", run, "--out", tmp_path / "views")[0] == 0
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["000000.png", "000001.png"]
 
@@ -260,7 +257,7 @@ def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):
 def test_a_judged_set_may_have_the_name_of_a_baseline(r2flow, real, generated, tmp_path):
     shutil.copytree(generated, tmp_path / "noise")
     sets = real, tmp_path / "noise", generated
-    said = r2flow.said("evaluate", *sets, *QUICK, "--no-reference", "--json", tmp_path / "e.json")
+    said = r2flow("evaluate", *sets, *QUICK, "--no-reference", "--json", tmp_path / "e.json").said
     of = {}
     for one in json.loads((tmp_path / "e.json").read_text())["comparisons"]:
         (jsd,) = (metric["printed"]["JSD x 10^2"] for metric in one["metrics"] if metric["metric"] == "jsd")

@@ -51,10 +51,10 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     assert sorted(path.name for path in out.parent.iterdir()) == ["mine.yaml"]
 
     npy, image = ("--format", "npy", "-o", tmp_path / "image"), tmp_path / "image" / "000000.npy"
-    printed = r2flow.said("show", scans / "000000.bin", "--sensor", out, *npy)
+    printed = r2flow("show", scans / "000000.bin", "--sensor", out, *npy).said
     assert "8 x 128" in printed
     assert (np.load(image)[0] > 0).mean() == pytest.approx(0.9, abs=0.03)
-    r2flow.said("show", scans / "000000.bin", "--sensor", out, "--size", "4x64", *npy)
+    assert r2flow("show", scans / "000000.bin", "--sensor", out, "--size", "4x64", *npy).said
     assert np.load(image).shape == (2, 4, 64)
 
 
@@ -146,7 +146,7 @@ def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, f
 def test_a_sensor_s_file_is_replaced_only_when_asked(r2flow, scans: Path, tmp_path: Path):
     out = tmp_path / "mine.yaml"
     out.write_text("mine by hand")
-    assert "--overwrite" in r2flow.refusal("sensor", scans, "--out", out)
+    assert "--overwrite" in r2flow("sensor", scans, "--out", out).refusal
     assert out.read_text() == "mine by hand"
     assert r2flow("sensor", scans, "--out", out, "--overwrite")[0] == 0
     assert read_sensor(out).reflectance_scale == 255

@@ -140,7 +140,7 @@ def test_spread_is_over_the_answers_with_a_return():
 
 @pytest.mark.parametrize(("sensor", "size", "other"), [("hdl64e", "32x256", False), ("vlp16", "16x256", True)])
 def test_coarser_images_of_the_own_sensor_are_not_of_another(r2flow, tmp_path, sensor, size, other):
-    r2flow.said("simulate", "--num", 1, "--sensor", sensor, "--size", size, "--format", "npy", "--out", tmp_path)
+    assert r2flow("simulate", "--num", 1, "--sensor", sensor, "--size", size, "--format", "npy", "--out", tmp_path).said
     found, (scan,), _ = load_checkpoint("densify").open_partial([str(tmp_path)])
     rows, columns = scan.read().state.nonzero()
     assert found.generator.foreign == other

@@ -30,14 +30,14 @@ def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, mon
         ("prepare", folder, "-o", "prepared", "--size", "16x64", "--workers", 1),
         ("evaluate", folder, folder, "--metrics", "jsd", "--out", "page", "--size", "16x64", "--workers", 0),
     ):
-        r2flow.said(*[f"./{one}" if one is folder else one for one in arguments])
+        assert r2flow(*[f"./{one}" if one is folder else one for one in arguments]).said
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     Path(f"./{name}.bin").write_bytes(b"\0" * 30)
-    line = r2flow.refusal("show", f"./{name}.bin", "-o", "out")
+    line = r2flow("show", f"./{name}.bin", "-o", "out").refusal
     assert "14 bytes" in line
     assert name.partition("\n")[0].encode("utf-8", "backslashreplace").decode() in line
 
@@ -46,8 +46,8 @@ def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypat
 def test_models_of_any_name_sample(r2flow, saved, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(saved[0].parents[1], f"./{name}")
-    r2flow.said("sample", f"./{name}", "-o", f"./{name}/s", "--num", 1, "--steps", 1)
-    r2flow.said("report", "curvature", f"./{name}", "-o", "page", "--num", 1, "--steps", 2)
+    assert r2flow("sample", f"./{name}", "-o", f"./{name}/s", "--num", 1, "--steps", 1).said
+    assert r2flow("report", "curvature", f"./{name}", "-o", "page", "--num", 1, "--steps", 2).said
 
 
 def test_a_dollar_in_a_text_is_drawn_as_one():

@@ -150,4 +150,4 @@ def test_a_scan_of_another_scale_is_named_in_one_line(r2flow, measured, generate
     change(scan)
     np.save(generated / "000004.npy", scan)
     options = ("--metrics", "frechet_handcrafted", "--size", "8x64", "--workers", 0, "--no-cache")
-    assert re.search(said, r2flow.refusal("evaluate", measured[0], generated, *options))
+    assert re.search(said, r2flow("evaluate", measured[0], generated, *options).refusal)

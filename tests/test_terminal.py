@@ -56,7 +56,7 @@ def test_a_name_is_read_as_utf_8_in_every_locale(tmp_path: Path):
 
 def test_a_name_does_not_control_the_terminal(r2flow, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    error = r2flow.refusal("info", "a\033[31mb")
+    error = r2flow("info", "a\033[31mb").refusal
     assert "\033" not in error
     assert r"a\x1b[31mb" in error
 

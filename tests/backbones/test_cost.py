@@ -101,7 +101,7 @@ def test_a_network_that_cannot_run_on_the_meta_device_has_no_gmac(monkeypatch):
 
 def test_the_verb_measures_what_it_is_asked_for(r2flow):
     options = ("--only", "hdit_tiny,adm_unet_large", "--size", "16x64", "--repeats", 0, "--device", "cpu")
-    out = r2flow.said("report", "backbones", *options)
+    out = r2flow("report", "backbones", *options).said
     assert [line.split()[0] for line in out.splitlines()[2:4]] == ["hdit_tiny", "adm_unet_large"]
 
 

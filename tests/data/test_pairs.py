@@ -219,7 +219,7 @@ QUICK = ("--sampler", "euler", "--steps", 2, "--batch-size", 4, "--num", 10)
 
 def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     path, _ = saved
-    said = r2flow.said("pairs", path, *QUICK)
+    said = r2flow("pairs", path, *QUICK).said
     folder = path.parent.parent / "pairs"
     assert default_folder(Path("models/flow.pth")) == Path("models/flow-pairs")
     for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
@@ -228,7 +228,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
     chosen = PairOptions(**pairs_of(flow, options, weights_hash(flow)))
     assert len(PairSource(PairStore(folder, chosen, flow.encoding.shape))) == 10
-    assert "pairs/s" not in r2flow.said("pairs", path, *QUICK)  # nothing was left to make
+    assert "pairs/s" not in r2flow("pairs", path, *QUICK).said  # nothing was left to make
 
 
 @pytest.mark.slow

@@ -367,11 +367,11 @@ def test_a_manifest_that_is_damaged_or_missing_is_named(clouds: Path, tmp_path: 
 def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
     out = tmp_path / "out"
     typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 4)
-    said = r2flow.said(*typed, "--workers", 1)
+    said = r2flow(*typed, "--workers", 1).said
     assert f"{out}: 6 scans in 2 shards, 0.0 MiB; range within" in said
     assert "reflectance as n/256, exactly" in said
     (out / "scans-000001.safetensors").unlink()
-    assert "6 scans in 2 shards (1 were there already), 0.0 MiB" in r2flow.said(*typed, "--workers", 1)
+    assert "6 scans in 2 shards (1 were there already), 0.0 MiB" in r2flow(*typed, "--workers", 1).said
     source = prepared_in(out)
     assert len(source) == 6
     raw = read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))
@@ -415,7 +415,7 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
     for one, two in zip(prepared_in(tmp_path / "one"), prepared_in(tmp_path / "two"), strict=False):
         assert np.array_equal(one, two)
     other = "prepare", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two"
-    assert "reading.columns=" in r2flow.refusal(*other)
+    assert "reading.columns=" in r2flow(*other).refusal
     scan = wide / "000000.npy"
     assert r2flow("show", scan, *columns, "--size", "4x16", "--format", "npy", "-o", tmp_path / "image")[0] == 0
     expected = read_image(numbered / "000000.bin", Reading(SMALL, reflectance=True))

@@ -17,7 +17,8 @@ from r2flow.generators import GENERATORS
 from r2flow.runs.composing import REGISTRIES
 from r2flow.samplers import SAMPLERS
 from r2flow.stages import STAGES
-from tests.training.conftest import Done, captured
+from tests.conftest import Done
+from tests.training.conftest import quickly
 
 FAMILIES = Path(__file__).parent / "families"
 
@@ -75,7 +76,7 @@ def r2flow(*arguments: object) -> Done:
     """`r2flow ARGUMENTS` in this process; no plug-in that it loads is there afterwards."""
     with loaded(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
-        return captured(cli.main)
+        return quickly(cli.main)
 
 
 def train(run: Path, family: Family, *more: str) -> Done:

@@ -69,7 +69,7 @@ def test_real_scans_that_are_training_scans_are_left_out_of_the_test(r2flow, tmp
     for name, real in {"mixed": np.concatenate([made["held"], own]), "held": made["held"], "own": own}.items():
         options = "--size", "8x64", "--metrics", "jsd", "--workers", 0, "--json", tmp_path / "e.json"
         place = folder(tmp_path / f"real_{name}", real)
-        said = r2flow.said("evaluate", place, tmp_path / "generated", "--train", tmp_path / "training", *options)
+        said = r2flow("evaluate", place, tmp_path / "generated", "--train", tmp_path / "training", *options).said
         assert ("2 of 9 real scans are training scans" in said) == (name == "mixed")
         found[name] = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"][-1]["figures"]
     assert found["mixed"] == found["held"]
@@ -88,10 +88,10 @@ def test_scans_without_a_return_have_no_neighbour(sets, tmp_path):
 
 @pytest.mark.usefixtures("quick_pictures")
 def test_evaluate_has_the_copies_as_lines_and_a_picture(r2flow, sets, tmp_path):
-    out = r2flow.said(
+    out = r2flow(
         "evaluate", tmp_path / "held", tmp_path / "generated", "--train", tmp_path / "training", "--size", "8x64",
         "--metrics", "jsd", "--workers", 0, "--json", tmp_path / "e.json", "--out", tmp_path / "page",
-    )  # fmt: skip
+    ).said  # fmt: skip
     assert "scans lie nearer to a training scan than any of 7 real ones" in out
     found = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work())
     figures = {

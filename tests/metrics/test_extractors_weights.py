@@ -200,7 +200,7 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path):
 def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):
     def here() -> set[str]:
         """Which networks have their weights, by the table."""
-        said = r2flow.said("weights")
+        said = r2flow("weights").said
         for words in ("FRD", "FRID", "FPD", "FSVD", "FPVD", "darknet53-1024.tar.gz", f"Looked for in {folder}"):
             assert words in said
         rows = [line.split() for line in said.splitlines() if line.split(" ")[0] in SOURCES]
@@ -210,7 +210,7 @@ def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):
     assert here() == set()
     path = tmp_path / "mine.pth"
     torch.save(untrained(PointNet).state_dict(), path)
-    said = r2flow.said("weights", "--add", "pointnet", path)
+    said = r2flow("weights", "--add", "pointnet", path).said
     assert said.startswith(f"{folder / 'pointnet.safetensors'}: weights ")
     assert said.endswith("of mine.pth\n")
     assert here() == {"pointnet"}

@@ -237,6 +237,6 @@ def test_losses_have_a_logarithmic_axis_where_it_has_labels(values, scale):
 def test_the_verb_tells_runs_of_different_lengths_losses_and_data(r2flow, tmp_path, steps, roots, loss):
     for name, step, root, one in zip("ab", steps, roots, ("mse", loss), strict=True):
         make_run(tmp_path / name, {"data.root": root, "stage.loss": one}, checkpoint=step)
-    said = r2flow.said("compare", tmp_path / "a", tmp_path / "b")
+    said = r2flow("compare", tmp_path / "a", tmp_path / "b").said
     assert ("different numbers of images" in said) == (steps[0] != steps[1])
     assert ("different stages, losses or data" in said) == (roots[0] != roots[1] or loss != "mse")

@@ -88,10 +88,10 @@ def test_a_task_that_is_none_is_one_line(checkpoint, task):
 
 def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: Path):
     checkpoint.save(tmp_path / "model.safetensors")
-    said = r2flow.said(
+    said = r2flow(
         "report", "completion", "simulated:3", tmp_path / "model.safetensors", "--num", 2, "--answers", 2,
         "--samplers", "euler,jump", "--steps", 1, "--tasks", "rows:4,rows:2", "--out", (out := tmp_path / "out"),
-    )  # fmt: skip
+    ).said  # fmt: skip
     assert said.startswith("2 scans of simulated:3 (at most 2, --num), 2 completions per scan.\n")
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
@@ -106,7 +106,8 @@ def test_a_densifier_takes_a_flow_s_size_and_range_alone_has_no_reflectance(r2fl
     checkpoint.save(models[0])
     flow.save(models[1])
     np.save(tmp_path / "scan.npy", simulate(flow.sensor, 3, 0).image[:1])
-    r2flow.said("report", "completion", tmp_path / "scan.npy", *models, "--tasks", "rows:2", "--out", tmp_path / "out")
+    asked = tmp_path / "scan.npy", *models, "--tasks", "rows:2", "--out", tmp_path / "out"
+    assert r2flow("report", "completion", *asked).said
     rows = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
     assert [row["method"][:5] for row in rows[-2:]] == ["dense", "flow/"]
     assert [row["evaluations"] for row in rows[-2:]] == [1, 30]
@@ -121,10 +122,10 @@ def test_a_densifier_is_measured_on_the_sensor_of_the_scans(r2flow, checkpoint, 
     truth = simulate(sensor, 3, 500 if given else 0).image  # the middle of 1000 scenes
     if not given:
         write_folder(SimulatedFolder(tmp_path / "scans", sensor, 3, ["npy"]), range(1), workers=1)
-    r2flow.said(
+    assert r2flow(
         "report", "completion", "simulated:3" if given else tmp_path / "scans", tmp_path / "model.safetensors",
         "--num", 1, "--tasks", "rows:2", "--out", tmp_path / "out", *given,
-    )  # fmt: skip
+    ).said  # fmt: skip
     *_, row = json.loads((tmp_path / "out" / "completion.json").read_text())["rows"]
     ways = {"model": (checkpoint.through(sensor), checkpoint.generator.sampler)}
     *_, (expected, _) = completion_rows([truth], sensor, ways, ["rows:2"], 1)

@@ -97,7 +97,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):
     copy = path.with_name("step-00000009.ckpt")
     copy.write_bytes(path.read_bytes())
     how = ("-o", out, "--steps", 4, "--num", 2)
-    said = r2flow.said("report", "curvature", path, copy, *how)
+    said = r2flow("report", "curvature", path, copy, *how).said
     figures = {f"{name}.{end}" for name in ("curvature", "trajectories") for end in ("png", "pdf")}
     names = figures | {"curvature.json", "curvature.md"}
     assert {file.name for file in out.iterdir()} == names

@@ -84,7 +84,7 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     results.write_text(json.dumps({"comparisons": comparisons}))
     options = "--results", results, "--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0"
     command = "report", "paper", f"9-RF={runs['2-RF']}", runs["1-RF"], *unnamed, *options, "-o", tmp_path / "out"
-    said = r2flow.said(*command)
+    said = r2flow(*command).said
     assert all(f"({name})" in said for name in ("9-RF", f"a/{last}", f"b/{last}"))
     assert "r2flow, 5 scans of 8x64 against 7 of held" in (tmp_path / "out" / "paper.md").read_text()
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
@@ -94,4 +94,4 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     written = {path.stem for path in (tmp_path / "out").glob("*.png")}
     assert written == {"figure_3", "figure_5", "figure_6", "figure_7", "figure_8a", "figure_8b"}
     results.write_text(json.dumps({"comparisons": comparisons[1:]}))
-    assert "the results are of other models" in r2flow.refusal(*command)
+    assert "the results are of other models" in r2flow(*command).refusal

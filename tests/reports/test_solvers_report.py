@@ -115,10 +115,10 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     monkeypatch.setattr("r2flow.plugins._loaded", {"of/mine.py": "of/mine.py"})
     out = tmp_path / "reports"
-    said = r2flow.said(
+    said = r2flow(
         "report", "solvers", saved[0], "-o", out, "--num", 2, "--samplers", "euler,heun2,dopri5",
         "--budgets", "2,4", "--problems", "gaussian,rotating",
-    )  # fmt: skip
+    ).said  # fmt: skip
     figures = {f"{name}.{end}" for name in ("solvers", "solvers_problems") for end in ("png", "pdf")}
     assert {path.name for path in out.iterdir()} == figures | {f"solvers.{end}" for end in ("json", "md")}
     assert f"**{saved[0]}**, 2 scans, against its reference solution" in said

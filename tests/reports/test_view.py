@@ -162,7 +162,7 @@ class TestTheVerb:
         many.mkdir()
         for number, image in enumerate(images(5)):
             np.save(many / f"{number}{ATTACK.replace('/', '')}.npy", image)
-        said = r2flow.said("view", scan, many, "--num", 3, "--out", tmp_path / "a.html")
+        said = r2flow("view", scan, many, "--num", 3, "--out", tmp_path / "a.html").said
         assert said == f"{many}: 3 of its 5 scans, evenly spread (--num)\n{tmp_path / 'a.html'}\n"
         data = Parsed((tmp_path / "a.html").read_text()).data
         assert [one["caption"][:1] for one in data["scans"]] == ["g", "0", "2", "4"]
@@ -219,7 +219,7 @@ class TestTheVerb:
         monkeypatch.setattr("sys.platform", "linux")
         monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
         monkeypatch.setenv("DISPLAY", ":0") if screen else monkeypatch.delenv("DISPLAY", raising=False)
-        said = r2flow.said("view", tmp_path / "a.npy")
+        said = r2flow("view", tmp_path / "a.npy").said
         assert opened == ([f"file://{said.strip()}"] if screen else [])
 
 

@@ -76,10 +76,10 @@ def test_a_published_file_is_sampled_and_evaluated(r2flow, shared, tmp_path: Pat
         pytest.skip("the reference checkpoint is not here")
     options, evaluations = FILES[name]
     out = tmp_path / "scans"
-    r2flow.said("sample", path, *options, "--num", 2, "--pictures", 0, "--device", "cpu", "--out", out)
+    assert r2flow("sample", path, *options, "--num", 2, "--pictures", 0, "--device", "cpu", "--out", out).said
     assert (out / "000001.npy").is_file()
     alone = ["--num", 2, "--metrics", "jsd", "--no-reference", "--no-baselines", "--workers", 0, "--device", "cpu"]
-    r2flow.said("evaluate", out, path, *options, *alone, "--json", tmp_path / "e.json")
+    assert r2flow("evaluate", out, path, *options, *alone, "--json", tmp_path / "e.json").said
     (found,) = json.loads((tmp_path / "e.json").read_text())["comparisons"]
     assert found["generated"]["num"] == 2
     # The same sampler and seed, but the noise of evaluation, which no sample has.

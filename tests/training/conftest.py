@@ -2,14 +2,12 @@
 
 import contextlib
 import functools
-import io
 import os
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.runs.launch import main
 from r2flow.signals import LATER
 from r2flow.training import build, compose, fit
-from tests.conftest import ROOT, draw_quickly, refusal, success
+from tests.conftest import ROOT, Done, captured, draw_quickly
 from tests.killing import wait_until
 
 HOLDING = Path(__file__).with_name("holding.py")
@@ -73,26 +71,6 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@dataclass(frozen=True)
-class Done:
-    """How a command ended."""
-
-    returncode: int
-    stdout: str
-    stderr: str
-
-    @property
-    def said(self) -> str:
-        """The output of a command that succeeds."""
-        return success((self.returncode, self.stdout, self.stderr))
-
-    @property
-    def refusal(self) -> str:
-        """The one line of an error of the user's, without a warning."""
-        assert len(self.stderr.splitlines()) == 1, self.stderr
-        return refusal((self.returncode, self.stdout, self.stderr))
-
-
 Run = Callable[..., Done]
 
 
@@ -100,28 +78,22 @@ def tiny(scans: Path, *overrides: str) -> list[str]:
     return [*TINY, f"data.root={scans}", *overrides]
 
 
-def captured(run: Callable[[], int | None]) -> Done:
-    """A command in this process, which costs no import of torch; its pictures are drawn quickly."""
-    threads, said, complained = torch.get_num_threads(), io.StringIO(), io.StringIO()
+def quickly(run: Callable[[], int | None]) -> Done:
+    """A command in this process; its pictures are drawn quickly."""
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the processes of `start`, which are to end with the same bits
     try:
-        with (
-            pytest.MonkeyPatch.context() as patch,
-            contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained),
-        ):  # fmt: skip
+        with pytest.MonkeyPatch.context() as patch:
             draw_quickly(patch)
-            code = run() or 0
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else 1
+            return captured(run)
     finally:
         torch.set_num_threads(threads)
-    return Done(code, said.getvalue(), complained.getvalue())
 
 
 def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
     """`train.py ARGUMENTS` from a folder, in this process."""
     with contextlib.chdir(cwd):
-        done = captured(lambda: main(arguments, COMMAND))
+        done = quickly(lambda: main(arguments, COMMAND))
     if check and done.returncode:
         raise AssertionError(f"{' '.join(arguments)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
     return done

@@ -16,8 +16,8 @@ from r2flow.runs import launch
 from r2flow.runs.chain import Link, is_finished, links_of
 from r2flow.runs.composing import compose
 from r2flow.training import build
-from tests.conftest import CONFIG, write_checkpoint
-from tests.training.conftest import TINY, Done, hold_at, in_process, let_go, run_train, start, tiny, wait_for
+from tests.conftest import CONFIG, Done, write_checkpoint
+from tests.training.conftest import TINY, hold_at, in_process, let_go, run_train, start, tiny, wait_for
 
 HELD = Path("held")  # in the folder that a chain is started from
 CHAIN = ["experiment=demo", "preview=null", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8",
