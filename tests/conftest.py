@@ -152,6 +152,12 @@ class Done(NamedTuple):
         return self.stdout
 
     @property
+    def quiet(self) -> str:
+        """The output of a command that succeeds without a warning."""
+        assert not self.stderr
+        return self.said
+
+    @property
     def refusal(self) -> str:
         """The one line of an error of the user's, without a warning."""
         assert self.returncode == 2, self.stderr

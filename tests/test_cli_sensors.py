@@ -39,9 +39,7 @@ def scans(tmp_path: Path) -> Path:
 
 def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: Path, tmp_path: Path):
     out = tmp_path / "conf" / "mine.yaml"
-    code, printed, error = r2flow("sensor", scans, "--out", out)
-    assert (code, error) == (0, "")
-    printed = " ".join(printed.split())
+    printed = " ".join(r2flow("sensor", scans, "--out", out).quiet.split())
     for words in ("beams 8:", "128 steps a turn", "scale=255", "lie 0.00 from", "1.50 m above", "ring after ring"):
         assert words in printed
     options = yaml.safe_load(out.read_text())
@@ -84,7 +82,7 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
     assert read_manifest(out / "prepare")["recipe"]["reading"]["sensor"]["name"] == "pandar64"
     images = [np.load(out / f"show{forced}" / "000000.npy") for forced in ("", "--sensorhdl64e")]
     assert (images[0][0] > 0).sum() > 1.1 * (images[1][0] > 0).sum()  # hdl64e sees 92 % of the returns
-    assert r2flow("show", given, "--sensor", "pandar64", "--format", "npy", "--out", out)[::2] == (0, "")
+    assert r2flow("show", given, "--sensor", "pandar64", "--format", "npy", "--out", out).quiet
     (given / "answers").mkdir()  # of `complete`, next to the scans: no scans, and the scans stay the sensor's own
     shutil.copy(out / "prepare" / "manifest.json", given / "answers")
     shutil.copy(given / "000000.bin", given / "answers")
@@ -121,16 +119,14 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     expected = np.unique(raw / np.float32(255))
     assert set(np.unique(np.load(image)[1])) <= {0, *expected}
     assert np.load(image)[1].max() > 0.95
-    code, _, error = r2flow("prepare", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1)
-    assert (code, error) == (0, "")
+    assert r2flow("prepare", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1).quiet
     assert read_manifest(tmp_path / "prepared")["recipe"]["reading"]["reflectance_scale"] == 255
     given = (scans, scans / "000000.bin", "--sensor", out, "--metrics", "jsd,sensor", "--workers", 0)
     assert "reflectance" not in r2flow("evaluate", *given, "--json", tmp_path / "e.json")[2]
-    r2flow("show", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 510, *npy)
+    shown = "show", scans / "000000.bin", "--sensor", out, *npy, "--reflectance-scale"
+    r2flow(*shown, 510)
     assert np.load(image)[1].max() == pytest.approx(raw.max() / 510, abs=0.01)  # what is given comes first
-    assert (
-        "below a tenth" in r2flow("show", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 5100, *npy)[2]
-    )
+    assert "below a tenth" in r2flow(*shown, 5100).stderr
 
 
 @pytest.mark.parametrize(("file", "name"), [
@@ -138,8 +134,7 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     ("Größe.yaml", "Gr__e"), ("_.yml", "my__"),
 ])  # fmt: skip
 def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, file: str, name: str):
-    code, _, error = r2flow("sensor", scans, "--out", tmp_path / file, "--num", 1)
-    assert (code, error) == (0, "")
+    assert r2flow("sensor", scans, "--out", tmp_path / file, "--num", 1).quiet
     assert read_sensor(tmp_path / file).name == name
 
 
@@ -167,11 +162,9 @@ SCALES = {
 def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: Path, tmp_path: Path, folder):
     data, prepared = shared / "real" / "other_sensors" / folder, tmp_path / "my" / "prepared"
     mine = tmp_path / "my sensor.yaml"
-    code, _, error = r2flow("sensor", data, "--out", mine)
-    assert (code, error) == (0, "")
+    assert r2flow("sensor", data, "--out", mine).quiet
     assert read_sensor(mine).reflectance_scale == SCALES[folder]
-    code, _, error = r2flow("prepare", data, "--sensor", mine, "--out", prepared, "--workers", 1)
-    assert (code, error) == (0, "")
+    assert r2flow("prepare", data, "--sensor", mine, "--out", prepared, "--workers", 1).quiet
     small = [part for part in TINY if not part.startswith(("data", "sensor."))]
     for given in (["data=prepared", f"data.root={prepared}"], ["data=folder", f"data.root={data}"]):
         own = [*given, f"sensor='{mine}'", "data.batch_size=1"]

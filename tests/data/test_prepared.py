@@ -410,8 +410,7 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
     """One option names them for every verb that reads scans."""
     columns, small = ("--columns", "time,z,y,x,intensity,_"), ("--size", "4x16", "--workers", 1)
     for out, given in (("one", (numbered,)), ("two", (wide, *columns))):
-        code, _, error = r2flow("prepare", *given, *small, "--out", tmp_path / out)
-        assert (code, error) == (0, "")
+        assert r2flow("prepare", *given, *small, "--out", tmp_path / out).quiet
     for one, two in zip(prepared_in(tmp_path / "one"), prepared_in(tmp_path / "two"), strict=False):
         assert np.array_equal(one, two)
     other = "prepare", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two"
