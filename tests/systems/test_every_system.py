@@ -1,7 +1,6 @@
 """Every system: scan i is a function of its number alone, and published files are taken by the verbs as they are."""
 
 import json
-import os
 import signal
 from collections.abc import Callable
 from functools import partial
@@ -16,7 +15,7 @@ from r2flow.generators import build_generator
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
-from tests.training.conftest import hold_at, in_process, let_go, start, wait_for
+from tests.training.conftest import hold_at, in_process, stop_held
 
 SENSOR = {"name": "hdl64e", "rows": 8, "columns": 32}
 GAN = {"latent": 8, "base_channels": 4, "doublings": 2}
@@ -122,13 +121,9 @@ def test_a_killed_system_ends_as_the_one_left_alone(tmp_path: Path, family: str)
     options, held = FAMILIES[family], tmp_path / "held"
     in_process(tmp_path, [*options, "run_dir=alone"])
     killed = [*options, "run_dir=killed", *hold_at(5, held)]
-    process = start(tmp_path, killed)
-    wait_for(held, process)
-    os.killpg(process.pid, signal.SIGKILL)
-    said, _ = process.communicate(timeout=100)
-    assert process.returncode == -signal.SIGKILL, said
+    code, said = stop_held(held, signal.SIGKILL, killed)
+    assert code == -signal.SIGKILL, said
     assert checkpoints_of(tmp_path / "killed")[0].name == "step-00000004.ckpt"
-    let_go(held)
     done = in_process(tmp_path, killed)
     assert "resuming from" in done.stdout
     one, other = (read_checkpoint(checkpoints_of(tmp_path / name)[0]) for name in ("alone", "killed"))

@@ -141,6 +141,16 @@ def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = 200.0)
     assert path.exists(), process.communicate()[0]
 
 
+def stop_held(held: Path, by: int, command: list[str]) -> tuple[int, str]:
+    """Start a run that waits (`hold_at`) and send its process group a signal there: (exit code, output)."""
+    process = start(held.parent, command)
+    wait_for(held, process)
+    os.killpg(process.pid, by)
+    said, _ = process.communicate(timeout=100)
+    let_go(held)
+    return process.returncode, said
+
+
 @pytest.fixture
 def train(scans: Path, tmp_path: Path) -> Run:
     return functools.partial(run_train, tmp_path, scans)

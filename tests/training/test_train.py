@@ -25,7 +25,7 @@ from r2flow.reports.training import read_curves
 from r2flow.runs.folder import read_config
 from r2flow.signals import LATER
 from tests.killing import wait_until
-from tests.training.conftest import TINY, Run, hold_at, in_process, let_go, start, tiny, wait_for
+from tests.training.conftest import TINY, Run, hold_at, in_process, start, stop_held, tiny, wait_for
 
 
 def weights(run: Path) -> tuple[dict, dict]:
@@ -79,16 +79,6 @@ def test_a_run_from_weights_begins_with_their_validation_loss(train: Run, alone:
     before, after = (read_curves(run)["val/loss"][1] for run in (alone[0], tmp_path / "runs" / "more"))
     assert len(after) == 2
     assert after[0] == pytest.approx(before[-1], rel=1e-5)
-
-
-def stop_held(held: Path, by: int, command: list[str]) -> tuple[int, str]:
-    """Start a run that waits (`hold_at`) and send its process group a signal there: (exit code, output)."""
-    process = start(held.parent, command)
-    wait_for(held, process)
-    os.killpg(process.pid, by)
-    said, _ = process.communicate(timeout=100)
-    let_go(held)
-    return process.returncode, said
 
 
 def lines_of(said: str) -> list[str]:
