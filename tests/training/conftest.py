@@ -116,10 +116,12 @@ def run_train(cwd: Path, scans: Path, *overrides: str, check: bool = True, flags
         return in_process(cwd, [*flags, *tiny(scans, *overrides)], check)
 
 
-def start(cwd: Path, arguments: Sequence[object], command: Sequence[str] = COMMAND) -> subprocess.Popen[str]:
+def start(
+    cwd: Path, arguments: Sequence[object], command: Sequence[str] = COMMAND, **environment: str
+) -> subprocess.Popen[str]:
     """`train.py ARGUMENTS` or another command from a folder, as a process group of its own."""
     return subprocess.Popen(
-        [*command, *map(str, arguments)], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1"},
+        [*command, *map(str, arguments)], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
         start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         # A shell's background job is started with Ctrl-C ignored, and hands that on.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),

@@ -20,7 +20,7 @@ import torch
 from r2flow.callbacks.stopping import slurm_job
 from r2flow.model.checkpoint import checkpoints_of, read_checkpoint
 from r2flow.signals import LATER
-from tests.training.conftest import ROOT, TINY, Run, hold_at, in_process, start, tiny, wait_for
+from tests.training.conftest import TINY, Run, hold_at, in_process, start, tiny, wait_for
 from tests.training.test_train import assert_bit_equal, weights
 
 STEPS = 20
@@ -136,22 +136,18 @@ def srun(
         free.bind(("", 0))
         port = free.getsockname()[1]
     environment = {
-        **os.environ, "OMP_NUM_THREADS": "1", "PATH": f"{cwd}/bin:{os.environ['PATH']}", "MASTER_PORT": str(port),
+        "PATH": f"{cwd}/bin:{os.environ['PATH']}", "MASTER_PORT": str(port),
         "SLURM_JOB_ID": "4711", "SLURM_JOB_NAME": "flow", "SLURM_NODEID": "0", "SLURM_NNODES": "1",
         "SLURM_NODELIST": "localhost", "SLURM_NTASKS": str(tasks), "SLURM_NTASKS_PER_NODE": str(tasks),
     }  # fmt: skip
-    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *overrides]
     started = [
-        subprocess.Popen(
-            command, cwd=cwd, env={**environment, "SLURM_PROCID": str(task), "SLURM_LOCALID": str(task)},
-            start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        )
+        start(cwd, tiny(scans, *overrides), **environment, SLURM_PROCID=str(task), SLURM_LOCALID=str(task))
         for task in range(tasks)
-    ]  # fmt: skip
+    ]
     if leave_after:
         wait_for(leave_after, started[-1])
         os.killpg(started[-1].pid, signal.SIGUSR1)  # its loader's workers get it too, as from SLURM
-    said = [process.communicate(timeout=200)[0].decode() for process in started]
+    said = [process.communicate(timeout=200)[0] for process in started]
     return [(process.returncode, words) for process, words in zip(started, said, strict=True)]
 
 
