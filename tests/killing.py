@@ -42,12 +42,6 @@ def in_child(work: Callable[[], object]) -> int:
     return child
 
 
-def was_killed(child: int) -> bool:
-    """Whether a child process has died by SIGKILL; waits for its end."""
-    _, status = os.waitpid(child, 0)
-    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
-
-
 def wait_until(there: Callable[[], bool], seconds: float = 60.0) -> None:
     """Wait for another process; the test fails when it takes longer."""
     begin = time.monotonic()

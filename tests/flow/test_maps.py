@@ -20,18 +20,13 @@ def paths_of(function, times: Tensor = TIMES) -> Paths:
     return Paths(times, torch.stack([function(X_0, t) for t in times], 1))
 
 
-def starts(problem, t: Tensor, x: Tensor) -> Tensor:
-    """x_0 of the paths x_t = m_t + c_t x_0 that pass through x at t."""
-    shift = problem.solution(torch.zeros_like(x), t)
-    return (x - shift) / (problem.solution(torch.ones_like(x), t) - shift)
-
-
 def exact_map(problem):
     """u(t, x, s) of a problem whose paths are known."""
 
     def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-        length = expand_time(s - t, x)
-        moved = problem.solution(starts(problem, t, x), s) - x
+        length, shift = expand_time(s - t, x), problem.solution(torch.zeros_like(x), t)
+        x_0 = (x - shift) / (problem.solution(torch.ones_like(x), t) - shift)  # x_t = m_t + c_t x_0
+        moved = problem.solution(x_0, s) - x
         return torch.where(length == 0, problem(t, x), moved / torch.where(length == 0, 1.0, length))
 
     return u

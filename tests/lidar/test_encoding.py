@@ -11,18 +11,12 @@ from r2flow.lidar.sensors import SENSORS, Sensor
 HDL64E = SENSORS["hdl64e"]
 
 
-def ramp(sensor, reflectance=True):
-    """Ranges over the whole of the sensor's, its limits included, and some dropped rays."""
-    height, width = sensor.shape
-    r = torch.linspace(sensor.min_range, sensor.max_range, height * width).view(1, height, width)
-    r[:, ::5, ::7] = 0
-    return torch.cat([r, torch.rand(1, height, width) * (r > 0)]) if reflectance else r
-
-
 @pytest.mark.parametrize("format", list(FORMATS))
 @pytest.mark.parametrize("reflectance", [True, False])
 def test_encode_then_decode_is_exact_to_a_millimetre_or_to_float32(sensor, format, reflectance):
-    image = ramp(sensor, reflectance)
+    r = torch.linspace(sensor.min_range, sensor.max_range, math.prod(sensor.shape)).view(1, *sensor.shape)
+    r[:, ::5, ::7] = 0
+    image = torch.cat([r, torch.rand(r.shape) * (r > 0)]) if reflectance else r
     if format == "inverse_depth":  # which has no tolerance at the limits, where float32 may lose a range
         image[0][image[0] > 0] = image[0][image[0] > 0].clamp(
             sensor.min_range * (1 + 2e-5), sensor.max_range * (1 - 2e-5)

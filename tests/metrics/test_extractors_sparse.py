@@ -20,12 +20,6 @@ def to_dense(features: torch.Tensor, coords: torch.Tensor, shape: tuple[int, ...
     return dense
 
 
-def dense_kernel(kernel: torch.Tensor, size: int) -> torch.Tensor:
-    """(C_out, C_in, x, y, z) of (K, C_in, C_out): torchsparse counts x fastest in odd kernels, z in even ones."""
-    cube = kernel.view(size, size, size, *kernel.shape[1:])
-    return cube.permute(4, 3, 2, 1, 0) if size % 2 else cube.permute(4, 3, 0, 1, 2)
-
-
 def at(dense: torch.Tensor, coords: torch.Tensor) -> torch.Tensor:
     x, y, z = coords.T
     return dense[0, :, x, y, z].T
@@ -43,7 +37,9 @@ class Dense:
             if isinstance(module, SparseConv3d) and module.size == 1:
                 x = torch.einsum("bcxyz,co->boxyz", x, module.kernel)
             elif isinstance(module, SparseConv3d):
-                weight = dense_kernel(module.kernel, module.size)
+                # (C_out, C_in, x, y, z) of (K, C_in, C_out): torchsparse counts x fastest in odd kernels, z in even
+                cube = module.kernel.view(*[module.size] * 3, *module.kernel.shape[1:])
+                weight = cube.permute((4, 3, 2, 1, 0) if module.size % 2 else (4, 3, 0, 1, 2))
                 if module.transposed:
                     x = F.conv_transpose3d(x, weight.transpose(0, 1), stride=2)
                 else:

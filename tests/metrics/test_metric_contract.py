@@ -45,15 +45,6 @@ def give(metric, sets, size=4, order=1):
     return metric
 
 
-def shared_by(metrics):
-    """The states of several processes, put together as torchmetrics does it, in the first one."""
-    for name, reduce in metrics[0]._reductions.items():
-        values = [getattr(one, name) for one in metrics]
-        joined = [*chain(*values)] if isinstance(values[0], list) else reduce(torch.stack(values))
-        setattr(metrics[0], name, joined)
-    return metrics[0]
-
-
 def test_every_name_is_that_of_its_protocol_and_of_one_figure_only(summary, sets):
     figures: list[str] = []
     for name, build in METRICS.items():
@@ -75,9 +66,12 @@ def test_figures_do_not_depend_on_processes_or_the_order_of_scans(build, sets, p
     for side, scans in sets.items():
         for k, first in enumerate(range(0, len(scans), 2)):
             ranks[k % processes].update(part(scans, slice(first, first + 2)), side == "real", first)
+    for name, reduce in ranks[0]._reductions.items():  # put together as torchmetrics does it, in the first one
+        values = [getattr(one, name) for one in ranks]
+        setattr(ranks[0], name, [*chain(*values)] if isinstance(values[0], list) else reduce(torch.stack(values)))
     shuffled = {s: part(scans, torch.randperm(len(scans))) for s, scans in sets.items()}
     orders = [] if build().name in ORDERED else [give(build(), shuffled).compute()]
-    for values in (backwards, shared_by(ranks).compute(), *orders):
+    for values in (backwards, ranks[0].compute(), *orders):
         assert values == pytest.approx(expected, rel=1e-10, abs=1e-13)
 
 

@@ -54,15 +54,6 @@ def generator_of(cfg: Mapping[str, Any]) -> nn.Module:
     return (DustyV1 if "raydrop_logit" in out else VanillaGan)(given, **widths).network
 
 
-def discriminator_of(cfg: Mapping[str, Any]) -> nn.Module:
-    layer = cfg["layer_kwargs"]
-    common = {
-        "shape": tuple(layer["resolution"]), "channels": layer["in_ch"],
-        "base_channels": layer["ch_base"], "max_channels": layer["ch_max"],
-    }  # fmt: skip
-    return (style_gan if cfg["arch"] == "dusty_v2" else dcgan).Discriminator(**common)
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_generator_is_the_published_one(shared: Path, name: str):
     case, tolerance = load_case(shared, f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
@@ -83,7 +74,9 @@ def test_a_generator_is_the_published_one(shared: Path, name: str):
 @pytest.mark.parametrize("name", ["vanilla_d_32x64", "dusty2_d_64x64"])
 def test_a_discriminator_is_the_published_one_with_its_penalty(shared: Path, name: str):
     case, tolerance = load_case(shared, f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
-    network = discriminator_of(case["cfg"])
+    layer, module = case["cfg"]["layer_kwargs"], style_gan if case["cfg"]["arch"] == "dusty_v2" else dcgan
+    widths = {"base_channels": layer["ch_base"], "max_channels": layer["ch_max"]}
+    network = module.Discriminator(tuple(layer["resolution"]), layer["in_ch"], **widths)
     assert list(network.state_dict()) == list(case["state_dict"])
     network.load_state_dict(case["state_dict"])
     assert_published(network, case, tolerance, lambda given: network(given["x"]))

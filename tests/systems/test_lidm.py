@@ -77,10 +77,8 @@ def within(state: dict[str, Any], prefix: str) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def diffusion(shared: Path) -> dict[str, Any]:
     case = load_case(shared, "lidm_diffusion.pt")
-    case["unet"], case["autoencoder"] = (
-        unet_of(case["unet_cfg"]),
-        autoencoder_of(case["cfg"]["first_stage_config"]["params"]),
-    )
+    case["unet"] = unet_of(case["unet_cfg"])
+    case["autoencoder"] = autoencoder_of(case["cfg"]["first_stage_config"]["params"])
     case["unet"].load_state_dict(within(case["state_dict"], "model.diffusion_model."))
     case["autoencoder"].load_state_dict(within(case["state_dict"], "first_stage_model."))
     case["log_snr"] = square_root_linear(0.0015, 0.0195, 1000)
@@ -188,13 +186,9 @@ def ddim(
 @pytest.mark.parametrize("name", ["ddim_10_eta0", "ddim_10_eta1"])
 def test_ddim_is_the_published(diffusion: dict[str, Any], name: str):
     case, autoencoder = diffusion["cases"][name], diffusion["autoencoder"]
-    noise = case["noise"]
+    how = diffusion["log_snr"], case["steps"], case["eta"], lambda k: case["noise"][k - 1]
     with torch.no_grad():
-        path = list(
-            ddim(
-                diffusion["unet"], case["x_T"], diffusion["log_snr"], case["steps"], case["eta"], lambda k: noise[k - 1]
-            )
-        )  # fmt: skip
+        path = list(ddim(diffusion["unet"], case["x_T"], *how))
         decoded = autoencoder.decode(path[-1][0]), autoencoder.decode(path[-1][0], False)
     for k, (z, x) in enumerate(path):
         assert_near(z, case["x_trajectory"][k + 1], 1e-4)
