@@ -5,6 +5,7 @@ import io
 import os
 import resource
 import sys
+import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,6 +96,17 @@ def small_disk(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@contextlib.contextmanager
+def memory_below(size: int) -> Iterator[None]:
+    """What is allocated while the block runs is at no time more than a number of bytes."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < size
+    finally:
+        tracemalloc.stop()
 
 
 def quiet_trainer(folder: Path, **options: Any) -> L.Trainer:

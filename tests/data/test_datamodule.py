@@ -1,5 +1,4 @@
 import shutil
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from tests.conftest import folder_of, numbers, prepare_folder, write_scan
+from tests.conftest import folder_of, memory_below, numbers, prepare_folder, write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 
@@ -246,13 +245,9 @@ def test_the_index_of_a_whole_data_set_is_small(tmp_path: Path, monkeypatch):
         (tmp_path / f"data_3d_raw/2013_05_28_drive_{drive:04d}_sync/velodyne_points/data").mkdir(parents=True)
     frames = [f"{frame:010d}.bin" for frame in range(81_106 // 9)]
     monkeypatch.setattr("os.listdir", lambda folder: frames)
-    tracemalloc.start()
-    try:
+    with memory_below(100 << 20):
         data = module(name="kitti_360", root=str(tmp_path), memory_gib=0)
         assert len(data.names) == 9 * len(frames)
-        assert tracemalloc.get_traced_memory()[1] < 100 << 20
-    finally:
-        tracemalloc.stop()
 
 
 def test_scenes_are_held_out_behind_those_that_are_trained_on():

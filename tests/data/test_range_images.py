@@ -1,6 +1,5 @@
 """Range images in .npy files; test_scan_files_damage.py has damaged ones."""
 
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS
+from tests.conftest import memory_below
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
 READING = Reading(SENSOR, reflectance=True, on_bad_scan="error")
@@ -36,12 +36,8 @@ def test_range_images_are_read_as_they_were(tmp_path: Path):
 def test_no_more_memory_is_taken_than_a_few_times_the_file(tmp_path: Path):
     path = tmp_path / "large.npy"
     np.save(path, np.ones((2, 512, 2048), np.float32))
-    tracemalloc.start()
-    try:
+    with memory_below(4 * path.stat().st_size):
         read_range_image(path)
-        assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size
-    finally:
-        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("absurd", [-5.0, 500.0, 1e30])
