@@ -308,13 +308,8 @@ def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
 def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path: Path):
     flow = flow_map()
     keys = {"name": "pairs", "root": str(tmp_path), "batch_size": 4, "scans": {"name": "simulated", "scenes": 5}}
-    data = ScanDataModule(
-        flow.space.sensor,
-        flow.space.encoding,
-        3,
-        pairs={"sampler": {"name": "adams3", "steps": 1}, "num": 10, "batch_size": 2, "parent": "a"},
-        **keys,
-    )
+    pairs = {"sampler": {"name": "adams3", "steps": 1}, "num": 10, "batch_size": 2, "parent": "a"}
+    data = ScanDataModule(flow.space.sensor, flow.space.encoding, 3, pairs=pairs, **keys)
     make_pairs(data.pair_store, Field(lambda t, x: x, flow.noise_shape))
     data.setup()
     data._ready()

@@ -330,11 +330,8 @@ def without_beams(pattern: str) -> Points:
         azimuth = np.radians(19.2) * (np.cos(turn * 1215.7 * t) + np.cos(-turn * 777.3 * t))
         elevation = np.radians(19.2) * (np.sin(turn * 1215.7 * t) + np.sin(-turn * 777.3 * t))
     else:
-        azimuth, elevation = (
-            np.pi * (1 - 2 * np.random.default_rng(0).random(t.size)),
-            0.4 * np.cos(turn * np.sqrt(2) * t),
-        )
-        elevation = np.random.default_rng(1).permutation(elevation)
+        azimuth = np.pi * (1 - 2 * np.random.default_rng(0).random(t.size))
+        elevation = np.random.default_rng(1).permutation(0.4 * np.cos(turn * np.sqrt(2) * t))
     r = np.minimum(np.where(elevation < 0, 1.7 / np.sin(np.maximum(-elevation, 1e-9)), np.inf), 25 / np.cos(elevation))
     direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     return Points((r * direction).T.astype(np.float32))

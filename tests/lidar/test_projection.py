@@ -1,5 +1,6 @@
 import math
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -115,9 +116,7 @@ def test_the_reference_s_unfolding_on_real_scans(shared):
         quadrant = np.select([(x >= 0) & (y >= 0), (x < 0) & (y >= 0), (x < 0) & (y < 0)], [0, 1, 2], 3)
         starts = [i for i in range(len(x)) if quadrant[i] == 0 and quadrant[i - 1] == 3]
         h = np.zeros(len(x), int)
-        for row, (start, end) in zip(
-            range(63, -1, -1), zip(starts[::-1], [*starts[1:], len(x)][::-1], strict=True), strict=True
-        ):
+        for row, (end, start) in zip(range(63, -1, -1), pairwise([len(x), *starts[::-1]]), strict=True):
             h[start:end] = row
         expected = np.zeros((64, 1024), np.float32)
         order = np.argsort(-d)

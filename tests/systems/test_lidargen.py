@@ -85,13 +85,9 @@ def test_the_score_of_a_gaussian_has_the_least_loss():
 def test_annealed_langevin_is_the_published(shared: Path):
     case = load_case(shared, "lidargen_sampling.pt")
     network, own = network_of(case), case["annealed"]
+    how = own["sigmas"], lambda k: own["noise"][k - 1], own["step_lr"], own["n_steps_each"]
     with torch.no_grad():
-        path = list(
-            annealed_langevin(
-                network, own["start"], own["sigmas"], lambda k: own["noise"][k - 1], own["step_lr"],
-                own["n_steps_each"],
-            )
-        )  # fmt: skip
+        path = list(annealed_langevin(network, own["start"], *how))
     assert len(path) == 10 * 5 + 1
     for level, expected in enumerate(own["after_each_level"]):
         assert_near(path[5 * level + 4], expected, 5e-6)

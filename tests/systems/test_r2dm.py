@@ -149,9 +149,8 @@ def test_repaint_draws_as_often_as_its_steps_parts_and_repeats_say():
     log_snrs = Cosine()(torch.linspace(1, 0, 13, dtype=torch.float64))
     states = list(repaint(lambda z, _: torch.zeros_like(z), known, known, mask, log_snrs, noise, 2, 4))
     assert len(states) == 2 + 2 + 1  # the last step is not repeated
-    assert drawn == list(
-        range(1, 1 + 5 * 4 * 2 + 2 * 4)
-    )  # known pixels and ancestral step on the way down, one on the way up
+    # Known pixels and ancestral step on the way down, one on the way up.
+    assert drawn == list(range(1, 1 + 5 * 4 * 2 + 2 * 4))
     torch.testing.assert_close(states[-1][0, 0], mask, rtol=0, atol=1e-6)
 
 
@@ -220,11 +219,8 @@ def test_the_weight_turns_a_prediction_s_error_into_that_of_the_data(name):
     prediction = PREDICTIONS[name]
     x, z = torch.zeros(9, 1, dtype=torch.float64), torch.randn(9, 1, dtype=torch.float64)
     alpha, sigma = (part[:, None] for part in alpha_sigma(log_snr))
-    wrong = x + 0.1
-    error = prediction.target(wrong, (z - alpha * wrong) / sigma, log_snr) - prediction.target(
-        x, (z - alpha * x) / sigma, log_snr
-    )
-    weighted = prediction.weight(log_snr, 5.0) * error.square()[:, 0]
+    right, wrong = (prediction.target(one, (z - alpha * one) / sigma, log_snr) for one in (x, x + 0.1))
+    weighted = prediction.weight(log_snr, 5.0) * (wrong - right).square()[:, 0]
     torch.testing.assert_close(weighted, 0.01 * log_snr.exp().clamp(max=5.0))
 
 
