@@ -120,6 +120,13 @@ def test_an_experiment_of_chosen_drives_takes_other_scans(experiment: str):
     check(compose([f"experiment={experiment}", "data=simulated"]))
 
 
+@pytest.mark.parametrize(("choice", "roots"), [((), ["my/scans", None]), (["data=folder"], [])])
+def test_fine_tuning_mixes_simulated_scans_in_unless_told(choice, roots):
+    data = compose(["experiment=finetune", "data.root=my/scans", *choice])["data"]
+    assert data["root"] == "my/scans"
+    assert [part.get("root") for part in data["parts"] or ()] == roots
+
+
 @pytest.mark.parametrize("plus", ["", "+", "++"])
 def test_a_generator_is_named_by_its_key(plus: str):
     assert compose([f"{plus}generator.name=diffusion"])["generator"] == {"name": "diffusion"}

@@ -127,16 +127,26 @@ def refuse(item: int) -> None:
     raise InputError("a worker refuses it")
 
 
+def fail(item: int) -> None:
+    error = ValueError("of the work")
+    error.of = lambda: item  # type: ignore[attr-defined]  which cannot be pickled
+    raise error
+
+
 class Unreadable:
     def __reduce__(self):
         return refuse, (0,)  # when it is unpickled
 
 
 @pytest.mark.parametrize(
-    ("work", "message"), [(be_killed, "killed.* memory for 2"), (refuse, "refuses"), (Unreadable(), "refuses")]
-)
+    ("work", "message"),
+    [
+        (be_killed, "killed.* memory for 2"), (refuse, "refuses"), (Unreadable(), "refuses"),
+        (fail, "ValueError: of the work"),
+    ],
+)  # fmt: skip
 def test_an_error_of_a_worker(tmp_path: Path, work: Callable[[int], None], message: str):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises((InputError, RuntimeError), match=message):
         Store(tmp_path, "scans", {}).make(range(3), work, 2)
 
 
