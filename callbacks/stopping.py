@@ -29,7 +29,7 @@ class Stopping(L.Callback):
     """On SIGTERM, Ctrl-C and, in a SLURM job, SIGUSR1: writes a checkpoint after the step and raises `Stopped`.
 
     SLURM sends SIGUSR1 before a time limit: the job is requeued by `scontrol requeue`. Until training starts, a run
-    stops at once, without a checkpoint; on several machines it ends, since Python hears nothing while it waits for them.
+    stops at once without a checkpoint; on several machines it ends, since Python hears nothing while it waits for them.
 
     Lightning's handlers exit with code 0, or save from within the signal handler, in the middle of a step, to a file
     that a resumed run ignores; they are therefore replaced when training starts. A validation due at the step of the
