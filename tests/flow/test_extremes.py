@@ -275,7 +275,7 @@ def verdict(name: str, method: str, tolerance: float, state=torch.float64, netwo
     """'silent': more than ten tolerances off, not flagged, and an estimate more than a factor of five off."""
     problem, x_0 = PROBLEMS[name](), Draws(0, range(4)).start((32,)).to(state)
     velocity = problem if network is None else lambda t, x: problem(t, x.to(network).to(x.dtype)).to(network)
-    found = solve(velocity, x_0, method=method, tolerance=tolerance, global_error=True, max_evaluations=1000)
+    found = solve(velocity, x_0, method=method, tolerance=tolerance, global_error=True, max_evaluations=4000)
     difference = (found.x.double() - problem.solution(x_0, 1.0).double()).flatten(1)
     largest = difference.abs().amax(1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
     errors = largest[:, 0] * (difference / largest).square().mean(1).sqrt()  # squares of stiff problems' overflow
