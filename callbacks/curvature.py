@@ -13,8 +13,8 @@ from .periodic import Periodic
 class Curvature(Periodic):
     """Logs int s(t) dt (paper, eq. 6) of a few scans from fixed noise; of flows alone, and not of distilled ones.
 
-    The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/s_normalised`: an untrained
-    flow is straight because its paths have almost no length. One measurement is one pass of `steps` Euler steps;
+    The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/bend`: an untrained flow
+    is straight because its paths have almost no length. One measurement is one pass of `steps` Euler steps;
     `r2flow report curvature` computes s(t) itself, in two passes.
 
     Args:
@@ -33,7 +33,7 @@ class Curvature(Periodic):
             return
         x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
         result = curvature(flow.velocity, x_0, self.steps)
-        values = {"s": result.total.mean().item(), "s_normalised": result.normalised.mean().item()}
+        values = {"s": result.total.mean().item(), "bend": result.normalised.mean().item()}
         for logger in trainer.loggers:
             # Lightning logs with the step before the one just finished
             logger.log_metrics({f"curvature/{name}": value for name, value in values.items()}, trainer.global_step - 1)

@@ -257,7 +257,7 @@ def compare(
         bool, typer.Option("--group", help="Aggregate seeds of one configuration: mean ± spread.")
     ] = False,
 ) -> None:
-    """Compare runs: loss, straightness, parameters, cost."""
+    """Compare runs: loss, bend, parameters, cost."""
     from r2flow.reports.compare import compare_page, group_runs, read_runs, tables
     from r2flow.reports.pages import prepare_folder, write_page
     from r2flow.reports.tables import print_table

@@ -1,4 +1,4 @@
-"""Comparison of runs: settings, losses, straightness and cost."""
+"""Comparison of runs: settings, losses, bend and cost."""
 
 import json
 import logging
@@ -29,7 +29,7 @@ FIXED = {
 }  # fmt: skip
 MEASURED = {
     "train_loss": "train loss, last tenth", "val_best": "val loss, best", "val_last": "val loss, last",
-    "straightness": "bend",
+    "bend": "bend",
 }  # fmt: skip
 
 # Keys that are equal for all seeds, though a run may resume with another value: they change a column.
@@ -97,7 +97,7 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
 
 def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Curve]) -> dict[str, Any]:
     """Columns of a run that do not depend on its network."""
-    train, validation, straightness = (curves[name][1].tolist() if name in curves else [] for name in CURVES)
+    train, validation, bend = (curves[name][1].tolist() if name in curves else [] for name in CURVES)
     checkpoints = checkpoints_of(path)
     logged = [int(steps[-1]) for name, (steps, _) in curves.items() if name.endswith("loss")]
     step = step_of(checkpoints[0]) if checkpoints else max(logged, default=None)
@@ -112,7 +112,7 @@ def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Cur
         "train_loss": fmean(train[-max(len(train) // 10, 1) :]) if train else None,
         "val_best": min(validation, default=None),
         "val_last": validation[-1] if validation else None,
-        "straightness": straightness[-1] if straightness else None,
+        "bend": bend[-1] if bend else None,
     }
 
 
@@ -202,7 +202,7 @@ def tables(groups: Groups) -> dict[str, tuple[list[list[str]], list[str]]]:
 
 NOTES = (
     "Losses are those that were logged: of validation, with the averaged weights; compare them only between runs with "
-    "the same loss and the same data. Bend is the last `curvature/s_normalised`, s(t) over the squared path length; an "
+    "the same loss and the same data. Bend is the last `curvature/bend`, s(t) over the squared path length; an "
     "untrained flow is straight too. Several seeds: mean ± standard deviation, `of` those with a value."
 )
 

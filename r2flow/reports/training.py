@@ -20,7 +20,7 @@ Curve = tuple[np.ndarray, np.ndarray]
 
 # Logged names and panel titles.
 CURVES = {
-    "train/loss": "training loss", "val/loss": "validation loss", "curvature/s_normalised": "bend, s / length²",
+    "train/loss": "training loss", "val/loss": "validation loss", "curvature/bend": "bend, s / length²",
 }  # fmt: skip
 
 

@@ -85,13 +85,13 @@ def exact(a: float, n: int) -> tuple[float, float]:
 def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
     ema = EMA(decay=0.5, every=1, warmup_steps=0)
     fit(tmp_path, [ema, Curvature(seed=7, every=2, num=2, steps=4)], steps=3)
-    curves = read_curves(tmp_path, ("curvature/s", "curvature/s_normalised", "train/loss"))
+    curves = read_curves(tmp_path, ("curvature/s", "curvature/bend", "train/loss"))
     assert curves["curvature/s"][0].tolist() == [2, 3]  # every second step, and the last
     assert curves["train/loss"][0].tolist() == [1, 2, 3]
     for index, a in enumerate(AVERAGES):
         s, normalised = exact(a, 4)
         assert curves["curvature/s"][1][index] == pytest.approx(s, rel=1e-4)
-        assert curves["curvature/s_normalised"][1][index] == pytest.approx(normalised, rel=1e-4)
+        assert curves["curvature/bend"][1][index] == pytest.approx(normalised, rel=1e-4)
 
 
 def test_training_does_not_notice(tmp_path):

@@ -50,13 +50,13 @@ def make_run(
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     rows = [{"step": i, "train/loss": v} for i, v in enumerate(train or [])]
     rows += [{"step": 10 * i + 9, "val/loss": v} for i, v in enumerate(val or [])]
-    rows += [{"step": 20 * i + 19, "curvature/s_normalised": v, "curvature/s": 2 * v} for i, v in
+    rows += [{"step": 20 * i + 19, "curvature/bend": v, "curvature/s": 2 * v} for i, v in
              enumerate(curvature or [])]  # fmt: skip
     if rows:
         logs = folder / "metrics" / "version_0" / "metrics.csv"
         logs.parent.mkdir(parents=True)
         with logs.open("w", newline="") as file:
-            writer = csv.DictWriter(file, ["step", "train/loss", "val/loss", "curvature/s", "curvature/s_normalised"])
+            writer = csv.DictWriter(file, ["step", "train/loss", "val/loss", "curvature/s", "curvature/bend"])
             writer.writeheader()
             writer.writerows(rows)
     if checkpoint is not None:
@@ -79,7 +79,7 @@ def test_every_number_is_the_folder_s(tmp_path):
     assert found["train_loss"] == pytest.approx((0.5 + 0.3 + 0.2 + 0.2) / 4)  # the last tenth of 40
     assert found["val_best"] == 0.4
     assert found["val_last"] == 0.6
-    assert found["straightness"] == 0.05
+    assert found["bend"] == 0.05
     assert run.label == "run"
 
 
@@ -198,7 +198,7 @@ def test_the_page_is_written_with_its_picture(tmp_path):
         assert words in said, words
     rows = json.loads(written["compare.json"].read_text())["rows"]
     assert [row["name"] for row in rows] == ["bare", "full"]
-    unsaid = ("steps", "images", "train_loss", "val_best", "val_last", "straightness")
+    unsaid = ("steps", "images", "train_loss", "val_best", "val_last", "bend")
     assert [rows[0][column] for column in unsaid] == [None] * len(unsaid)
     assert rows[1]["val_best"] == 0.4
     assert Image.open(written["compare.png"]).size[0] > 900
