@@ -198,8 +198,8 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     for metric in (m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)):
         first = [(next(iter(m.figures.values())), c) for c in comparisons for m in c.measured if m.metric == metric]
         reference = next((value for value, c in first if (c.kind, c.name) == ("reference", HALVES)), -math.inf)
-        if below := [c.title for value, c in first if c.kind == "baseline" and value < reference]:
-            lines.append(f"{metric} ranks nothing here: {', '.join(below)} below the real halves.")
+        if below := [c.name for value, c in first if c.kind == "baseline" and value < reference]:
+            lines.append(f"{metric} ranks nothing here, with baselines below the real halves: {', '.join(below)}.")
     remarks: dict[str, dict[str, list[str]]] = {}  # remark -> comparison -> metrics
     for comparison in comparisons:
         for result in comparison.measured:
