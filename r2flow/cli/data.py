@@ -49,7 +49,7 @@ def simulate(
     missing = folder.missing(range(num))
     with Bar("simulating", len(missing), "scans") as advance:
         folder.make(missing, folder.simulate, workers or cores(), lambda scan: advance())
-    kept = f", {num - len(missing)} were there already" if len(missing) < num else ""
+    kept = f", {num - len(missing)} there already" if len(missing) < num else ""
     print(f"{len(missing)} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")
 
 
@@ -95,7 +95,7 @@ def prepare(
     skipped = f"; {left_out} scans left out" if left_out else ""
     there = shards - round(made.tasks[0].completed)
     of = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"
-    of += f" ({there} were there already)" if there else ""
+    of += f" ({there} there already)" if there else ""
     print(f"{out}: {of}, {size / 2**20:.1f} MiB; range within {range_error * 1e3:.2f} mm, {kept}{skipped}")
 
 

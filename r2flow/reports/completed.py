@@ -160,7 +160,7 @@ def hidden_errors(whole: Partial, given: Partial, completed: Completed) -> np.nd
 
 def print_completed(done: Mapping[str, np.ndarray | None], out: Path, scans: int) -> None:
     """Print how many of the scans were completed, and the mean errors of hidden rays."""
-    skipped = f", {scans - len(done)} were there already" if len(done) < scans else ""
+    skipped = f", {scans - len(done)} there already" if len(done) < scans else ""
     print(f"{len(done)} scan{'s' * (len(done) != 1)} written to {out}{skipped}")
     if errors := [error for error in done.values() if error is not None]:
         (mae, linear), (wrong, wrong_linear) = np.ma.masked_invalid(errors).mean(0).filled(np.nan)
