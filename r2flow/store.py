@@ -296,18 +296,18 @@ def _serve(end: connection.Connection) -> None:
     told = working = False
 
     def hear(number: int, frame: FrameType | None) -> None:
-        nonlocal told, working
-        told = True
-        if working:  # elsewhere an exception leaves a lock, or ends in `FileLock.__del__`
-            working = False
+        nonlocal told
+        first, told = not told, True
+        if first and working:  # elsewhere an exception leaves a lock, or ends in `FileLock.__del__`
             raise SystemExit(code_of(number))
 
     def interruptible(item: int) -> None:
         nonlocal working
         working = True
         try:
-            if not told:
-                work(item)
+            if told:
+                raise SystemExit(code_of(signal.SIGTERM))
+            work(item)
         finally:
             working = False
 
@@ -318,7 +318,7 @@ def _serve(end: connection.Connection) -> None:
         try:
             store, work = end.recv()  # imports modules, and SIGTERM ends it at once
             signal.signal(signal.SIGTERM, hear)
-            while not told:
+            while True:
                 end.send(store.attempt(end.recv(), interruptible))
         except Exception as error:
             error.add_note(traceback.format_exc())
