@@ -228,8 +228,7 @@ class Store:
                     end.send((self, work))
                     end.send(item)
             while doing:
-                ready = connection.wait(doing)
-                for end in [end for end in doing if end in ready]:
+                for end in doing.keys() & connection.wait(doing):
                     try:
                         result = end.recv()
                     except (EOFError, OSError):
@@ -293,11 +292,11 @@ class FileStore(Store):
 
 def _serve(end: connection.Connection) -> None:
     """Make items for the parent process until SIGTERM, or the end of the parent, which logs what this one would."""
-    told = working = False
+    stopped = working = False
 
     def hear(number: int, frame: FrameType | None) -> None:
-        nonlocal told
-        first, told = not told, True
+        nonlocal stopped
+        first, stopped = not stopped, True
         if first and working:  # elsewhere an exception leaves a lock, or ends in `FileLock.__del__`
             raise SystemExit(code_of(number))
 
@@ -305,7 +304,7 @@ def _serve(end: connection.Connection) -> None:
         nonlocal working
         working = True
         try:
-            if told:
+            if stopped:
                 raise SystemExit(code_of(signal.SIGTERM))
             work(item)
         finally:

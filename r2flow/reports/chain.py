@@ -96,7 +96,7 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 
 def bend(flow: Checkpoint, num: int) -> float:
-    """int s(t) dt over |x_1 - x_0|^2, mean over scans: 0 is straight; NaN for a distilled flow."""
+    """int s(t) dt over |x_1 - x_0|^2, mean over scans: 0 is straight; NaN without paths, or distilled."""
     generator = flow.generator
     if not isinstance(generator, Flow) or generator.fixed:  # a distilled network knows the times of its steps
         return math.nan

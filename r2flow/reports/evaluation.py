@@ -72,8 +72,7 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     """
     distances = [m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)]
     metric = HEADLINE if HEADLINE in distances else next(iter(distances), "")
-    first = [(next(iter(m.figures.values())), c) for c in comparisons for m in c.measured if m.metric == metric]
-    near = sorted((pair for pair in first if math.isfinite(pair[0])), key=lambda pair: pair[0])
+    near = sorted((pair for pair in _first(comparisons, metric) if math.isfinite(pair[0])), key=lambda pair: pair[0])
     judged, baselines = ([pair for pair in near if pair[1].kind == kind] for kind in ("judged", "baseline"))
     references = {c.name: (value, c) for value, c in near if c.kind == "reference"}
     if HALVES not in references:
@@ -189,6 +188,11 @@ def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]
     return columns, lines
 
 
+def _first(comparisons: Sequence[Comparison], metric: str) -> list[tuple[float, Comparison]]:
+    """The first figure of a metric, with its comparison."""
+    return [(next(iter(m.figures.values())), c) for c in comparisons for m in c.measured if m.metric == metric]
+
+
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     """Distinct remarks, with their metrics and comparisons."""
     lines = []
@@ -196,7 +200,7 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     if biased and len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:
         lines.append("Distances of fewer scans are larger: compare only sets of equal sizes.")
     for metric in (m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)):
-        first = [(next(iter(m.figures.values())), c) for c in comparisons for m in c.measured if m.metric == metric]
+        first = _first(comparisons, metric)
         reference = next((value for value, c in first if (c.kind, c.name) == ("reference", HALVES)), -math.inf)
         if below := [c.name for value, c in first if c.kind == "baseline" and value < reference]:
             lines.append(f"{metric} ranks nothing here, with baselines below the real halves: {', '.join(below)}.")

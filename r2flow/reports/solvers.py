@@ -202,8 +202,7 @@ def solvers_page(
         lines = []
         for name, group in groups.items():
             best = [best_within(group, budget) for budget in sorted(budgets)]
-            found = ("none" if row is None else f"{row['method']} {shown(reached(row))}" for row in best)
-            lines.append([name, *found])
+            lines.append([name, *("none" if row is None else f"{row['method']} {shown(reached(row))}" for row in best)])
         text += [
             "## Exact problems",
             f"{rows[0]['scans']} scans each, in float64: the most accurate solver within a number of evaluations and "

@@ -52,12 +52,10 @@ class Rectify(SingleLoss):
         return self.mean_loss(self.generator.velocity(t, x_t, self.condition(batch)), u_t)
 
     def mean_loss(self, v_t: Tensor, u_t: Tensor) -> Tensor:
-        """Mean of the loss over a batch."""
+        """Mean of the loss over a batch, (); InputError: a loss of another shape than (B,)."""
         each = self.loss(v_t, u_t)
         if each.shape != v_t.shape[:1]:
-            raise InputError(
-                f"a loss gives a value for each of the {len(v_t)} scans of a batch, found shape {(*each.shape,)}."
-            )
+            raise InputError(f"a loss must give one value a scan, ({len(v_t)},), found {tuple(each.shape)}.")
         return each.mean()
 
 
