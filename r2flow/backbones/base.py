@@ -84,7 +84,7 @@ class Backbone(ExactBuffers):
         if x.shape[1:] != expected:
             raise InputError(f"this backbone was built for images of {expected}, found {tuple(x.shape[1:])}.")
         assert s is None or self.second_time, "this backbone was built for one time and takes no s"
-        t, s = _times("t", t, x), None if s is None else _times("s", s, x)
+        t, s = _times("t", t, x), _times("s", t if s is None else s, x)
         if self.data_std is None:
             return self._velocity(t, x, s).to(x.dtype)
         image, rest = at_least_float32(x[:, : self.out_channels]), x[:, self.out_channels :]
@@ -92,9 +92,9 @@ class Backbone(ExactBuffers):
         inner = torch.cat([into * image, rest], dim=1) if rest.shape[1] else into * image
         return (skip * image + out * self._velocity(t, inner, s)).to(x.dtype)
 
-    def _velocity(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
-        y = x.to(next(self.parameters()).dtype)
-        v = self.velocity(t, y, t if s is None else s) if self.second_time else self.velocity(t, y)
+    def _velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+        y = x.to(next(self.parameters()).dtype, copy=True)  # copies: a plug-in may edit them in place
+        v = self.velocity(t.clone(), y, s.clone()) if self.second_time else self.velocity(t.clone(), y)
         expected = x.shape[0], self.out_channels, *x.shape[2:]
         found = tuple(v.shape) if isinstance(v, Tensor) else type(v).__name__
         if found != expected:  # one channel or one image would broadcast in the loss

@@ -119,6 +119,12 @@ def test_forward_leaves_no_trace_in_the_module(name):
         assert all(vars(module)[key] is value for key, value in before[path].items()), path
 
 
+def test_a_plug_in_may_edit_its_time_and_image_in_place(monkeypatch):
+    model, t, x = tiny("plain"), torch.tensor([0.1, 0.7]), image()
+    monkeypatch.setattr(model, "velocity", lambda t, x: x.mul_(t.mul_(2).reshape(-1, 1, 1, 1)))
+    assert torch.equal(model(t, x), 2 * t.reshape(-1, 1, 1, 1) * x)
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("dimension", [0, 1])
 def test_a_shape_that_is_not_whole_units_names_the_nearest_that_are(name, dimension):

@@ -89,7 +89,7 @@ class Evaluations:
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         self.counts[self.scenes] += 1
-        v = self._velocity(t, x)
+        v = self._velocity(t.clone(), x.clone())  # it may edit them in place
         if v.shape != x.shape:
             raise InputError(f"a velocity must have the state's shape {tuple(x.shape)}, found {tuple(v.shape)}.")
         self.precision = self.coarsest(v, x)
