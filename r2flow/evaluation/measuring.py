@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from r2flow.data.sets import ScanSet
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.evaluation.protocols import R2FLOW, WORDS, Rules
 from r2flow.evaluation.sets import SampledScans
 from r2flow.files import cache_folder
@@ -163,8 +163,7 @@ def measure(
         metric.reset()
         metric.load_real_state(real[name].states)
     empty = _update(metrics, generated, range(len(generated)), 0, False, work, protocol)
-    unsolved = generated.source.unsolved if isinstance(generated.source, SampledScans) else 0
-    unsolved = int(summed(torch.tensor(unsolved)))
+    unsolved = int(summed(torch.tensor(getattr(generated.source, "unsolved", 0))))
     elevations = generated.sensor.elevations
     described: dict[str, Any] = {
         "name": protocol.name, "points": {"real": WORDS[protocol.real], "generated": WORDS[protocol.generated]},
@@ -230,8 +229,9 @@ def _update(
             labels = [f"{names[number]} of {scans.label}" for number in numbers[start : start + work.batch_size]]
             batch = Scans(images.to(device), scans.sensor, protocol.rays(real), points, labels)
             empty += int((~batch.returned.flatten(1).any(1)).sum())
-            for metric in metrics.values():
+            for name, metric in metrics.items():
                 metric.update(batch, real=real, first=first + start)
+                check(batch.images._version == 0, f"metric {name} edits the scans of all metrics: edit a copy.")
             advance(len(batch))
     return int(summed(torch.tensor(empty)))
 
