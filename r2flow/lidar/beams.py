@@ -54,7 +54,7 @@ def find_beams(*scans: Points) -> Beams:
 def _beams(scans: Sequence[Points]) -> Beams:
     """`find_beams` for all rows of the files, with lost rays at the origin."""
     elevations = [elevations_of(scan.xyz) for scan in scans]
-    if all(scan.ring is not None for scan in scans):
+    if all(scan.ring is not None and scan.ring.any() for scan in scans):  # drivers without ring numbers write 0
         by_ring = _by_laser(elevations, [np.asarray(scan.ring, dtype=np.int64) for scan in scans], RINGS)
         if np.mean(by_ring.off(scans) ** 2) < RINGLESS * np.nanvar(np.concatenate(elevations)):
             return by_ring

@@ -49,7 +49,7 @@ def scan(sensor: Sensor, how: str, seed: int = 0) -> Points:
     kept = np.flatnonzero(xyz.any(axis=1))
     if how in (RINGS, UNORDERED):
         kept = np.random.default_rng(seed).permutation(kept)
-    return Points(xyz[kept], reflectance[kept], ring[kept].astype(np.uint16) if how == RINGS else None)
+    return Points(xyz[kept], reflectance[kept], ring[kept].astype(np.uint16) * (how == RINGS))  # 0: as not numbered
 
 
 MINE = Sensor("mine", (21.0, 12.5, 3.0, 2.0, 1.25, -0.5, -4.0, -9.0, -17.5))
@@ -61,7 +61,6 @@ def test_a_sensor_is_found_again(name, how):
     sensor = (MINE if name == "mine" else SENSORS[name]).resized(columns=192)
     found = estimate_sensor([scan(sensor, how, seed) for seed in range(2)])
     assert found.beams.order == how
-    assert len(found.beams.elevations) == len(sensor.elevations)
     np.testing.assert_allclose(found.beams.elevations, sensor.elevations, atol=1e-3)
     assert found.steps == pytest.approx(192, rel=1e-4)
     assert found.sensor.columns == 192
