@@ -149,13 +149,12 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
         return
     seen, name, hopeless = mismatch[:3]
     check(not (hopeless and reading.within_limits), f"{root}: {seen}.")
-    edges = sensor.row_edges
-    advice = f"give the right one, or estimate it: r2flow sensor {shlex.quote(str(root))} --out mine.yaml"
+    advice = f"; give the right one, or estimate it: r2flow sensor {shlex.quote(str(root))} --out mine.yaml"
     if name is not None and name != sensor.name:
-        advice = f"they fit '{name}': sensor={name} in training, --sensor {name} in verbs that have it"
+        advice = f"; they fit '{name}': sensor={name} in training, --sensor {name} in verbs that have it"
     log.warning(
-        "%s: read as scans of sensor '%s', which sees %+.1f to %+.1f degrees, but %s; %s",
-        root, sensor.name, edges[0], edges[-1], seen, advice,
+        "%s: read as scans of sensor '%s', which sees %+.1f to %+.1f degrees, but %s%s",
+        root, sensor.name, *sensor.row_edges[[0, -1]], seen, "" if hopeless else advice,
     )  # fmt: skip
 
 
