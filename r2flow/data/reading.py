@@ -180,8 +180,7 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
         )
     if len(image) < channels:
         raise _no_reflectance(path)
-    image = image[:channels]
-    return _within_limits(path, image, reading) if reading.within_limits else image
+    return _within_limits(path, image[:channels], reading) if reading.within_limits else image[:channels]
 
 
 def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarray:
@@ -193,11 +192,10 @@ def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarra
         raise NoPointsError(f"{path} has no return from {nearest:g} to {farthest:g} m{ranges}.")
     image = np.where(seen, image, np.float32(0))
     highest = image[1:].max(initial=0)
-    if highest > 1 + 1e-3:
-        raise InputError(
-            f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide it by the value "
-            "of full reflectance."
-        )
+    check(
+        highest <= 1 + 1e-3,
+        f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide by full reflectance.",
+    )
     image[1:] = image[1:].clip(0, 1)
     return image
 

@@ -112,7 +112,10 @@ def is_tilted(scans: Sequence[Points]) -> bool:
 
 
 def is_unclear(scans: Sequence[Points]) -> bool:
-    """Whether points lie far from their beams, as of two sensors in one file, or `is_tilted`."""
+    """Whether scans are of two sensors, or points lie far from their beams, as of two in one file, or `is_tilted`."""
+    with suppress(InputError):
+        if len({nearest_sensor(find_beams(scan).elevations)[0] for scan in scans} - {None}) > 1:
+            return True
     with suppress(InputError):
         if np.median(find_beams(*scans).off(scans)) > MOST_OFF:
             return True

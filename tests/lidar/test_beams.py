@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from r2flow.data.reading import Reading, scaled_reflectance
-from r2flow.data.sources import warn_of_other_sensor
+from r2flow.data.sources import warn_of_frame, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_beams
 from r2flow.lidar.estimation import estimate_sensor, full_reflectance, is_tilted, nearest_sensor, other_sensor
@@ -262,7 +262,7 @@ def test_two_sensors_in_one_file_are_warned_of(tmp_path: Path, caplog, ringed: b
     rings = np.concatenate([one.ring, other.ring]) if ringed else None
     write_points(tmp_path / "0.ply", np.concatenate(xyz), ring=rings)
     warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["vlp16"]), tmp_path)
-    assert ("are the points in one sensor's own frame" if ringed else "degrees off its beams") in caplog.text
+    assert ("are all scans in one sensor's own frame" if ringed else "degrees off its beams") in caplog.text
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -270,6 +270,8 @@ def test_points_in_the_frame_of_a_pitched_vehicle_are_found(name: str):
     level = scan(SENSORS[name].resized(columns=384), UNORDERED)
     for degrees, tilted in ((0, False), (0.5, False), (2, True), (-5, True)):
         assert is_tilted([pitched(level, degrees)]) == tilted, degrees
+    other = scan(SENSORS["os1_64" if name == "vlp16" else "vlp16"].resized(columns=384), UNORDERED)
+    assert [warn_of_frame(name, [level, second]) for second in (level, other)] == [False, True]
 
 
 def test_real_scans_are_tilted_only_in_another_frame(shared: Path):
@@ -344,8 +346,7 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
     write_points(tmp_path / "0.ply", scan.xyz)
     with pytest.raises(InputError, match="lie on no beams"):
         warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["hdl64e"], within_limits=True), tmp_path)
-    for name in SENSORS:
-        assert other_sensor([scan], SENSORS[name]).hopeless
+    assert all(other_sensor([scan], sensor).hopeless for sensor in SENSORS.values())
     with pytest.raises(InputError, match="lie on no beams"):  # the number of one of its lasers is no ring
         find_beams(Points(scan.xyz, ring=np.arange(len(scan.xyz)) % 6))
 
