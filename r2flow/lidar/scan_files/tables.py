@@ -30,7 +30,7 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> list[np.ndarray]:
     other = next((f", but of {words}" for count, words in known.items() if len(content) % (4 * count) == 0), "")
     check(rest == 0, f"it is not made of rows of {width} float32{other}: {rest} bytes are left. Is it cut short?")
     table = np.frombuffer(content, "<f4").reshape(rows, width)
-    memory = columns is None and rows > 4 and table[1::2, 0].any() and not table[1::2, 1:3].any()
+    memory = columns is None and rows > 4 and not table.view("<u4")[1::2, 1:3].any() and table[1::2, 0].any()
     check(not memory, "every second row has y = z = 0, as 8 floats a point: give --columns x,y,z,_,intensity,_,_,_.")
     return list(table.T)
 
