@@ -111,7 +111,7 @@ def sensor(
 
     Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py (sensor=mine).
     """
-    from r2flow.data.sources import spread, warn_of_frame
+    from r2flow.data.sources import warn_of_frame
     from r2flow.lidar.estimation import estimate_sensor, nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
     from r2flow.lidar.sensors import ENDINGS, SENSORS, write_sensor
@@ -124,7 +124,7 @@ def sensor(
     check(overwrite or not (out and out.exists()), f"{out} exists; give another --out, or --overwrite to replace it.")
     name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
     name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
-    paths = [points_beside(folder[index]) for folder in map(scans_of, scans) for index in spread(len(folder), most)]
+    paths = [points_beside(path) for scan in scans for path in scans_of(scan, most)[0]]
     points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
     mine, beams, steps, off, ground = estimate_sensor(points, name)
     e, middle = mine.elevations, len(mine.elevations) // 2

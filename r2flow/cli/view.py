@@ -33,12 +33,12 @@ def show(
     """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write range images."""
     from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure
-    from r2flow.reports.view.panels import scan_panels
+    from r2flow.reports.view.panels import one_scale, scan_panels
 
     check(out.suffix.lower() not in (".png", ".pdf", ".npy"), f"--out is a folder, for a file per scan; found {out}.")
     names: list[str] = []
-    readings = ((spec, how.reading([spec], estimate_scale=True)) for spec in scans)
-    panels = (panel for spec, reading in readings for panel in scan_panels(spec, reading, most, labelled=False))
+    readings = one_scale({spec: how.reading([spec], estimate_scale=True) for spec in scans}, most)
+    panels = (panel for spec in scans for panel in scan_panels(spec, readings[spec], most, labelled=False))
     for caption, (image,), rays, *_ in panels:
         file = Path(caption)
         names.append(next(s for n in count(1) if (s := file.stem if n == 1 else f"{file.stem}_{n}") not in names))
@@ -86,14 +86,15 @@ def view(
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.view import Panel, write_page
-    from r2flow.reports.view.panels import in_turn, sample_panels, scan_panels, way_panels
+    from r2flow.reports.view.panels import in_turn, one_scale, sample_panels, scan_panels, way_panels
 
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out must be a file that ends in .html, found {out}.")
     models = [spec for spec in what if is_checkpoint(spec)]
+    scans = [spec for spec in what if spec not in models]
     if not models and (steps or times or seed or device != "auto"):
         raise InputError("--steps, --times, --seed and --device are of a run, a checkpoint or a model; found none.")
-    if len(models) == len(what) and (sequence or how != ReadingOptions()):
+    if not scans and (sequence or how != ReadingOptions()):
         names = "--sensor, --size, --projection, --convention, --reflectance-scale and --columns"
         raise InputError(f"--sequence, {names} are of scans; found none.")
     check(not (sequence and times), "--sequence and --times both use the slider; give one of them.")
@@ -102,10 +103,11 @@ def view(
     panels: list[Panel] = []
     loaded = {spec: load_checkpoint(spec, choose_device(device)) for spec in models}
     first = None if how.sensor or how.size else next(iter(loaded.values()), None)
+    each = [how.reading([spec], None if own_reading(spec) else first, estimate_scale=True) for spec in scans]
+    readings = one_scale(dict(zip(scans, each, strict=True)), num or SCANS)
     for spec in what:
-        if spec not in loaded:
-            reading = how.reading([spec], None if own_reading(spec) else first, estimate_scale=True)
-            new = list(scan_panels(spec, reading, num or SCANS))
+        if spec in readings:
+            new = list(scan_panels(spec, readings[spec], num or SCANS))
             new = [in_turn(new, spec)] if sequence and len(new) > 1 else new
         elif times:
             new = way_panels(loaded[spec], spec, num or SAMPLES, seed, counts[0] if counts else None, times)

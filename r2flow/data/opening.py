@@ -192,7 +192,7 @@ def reading_for(
 
     The default sensor is hdl64e, or the built-in sensor whose beams plain scan files have. Scans have names as for
     `open_scans`; None is skipped. `model` is the checkpoint that they are for: another sensor or size than its own is
-    refused. `estimate_scale` estimates full reflectance from each plain scan file, if the sensor does not tell it.
+    refused. `estimate_scale` leaves None for plain scan files whose sensor does not tell it: an estimate.
     """
     specs = [str(spec) for spec in scans if spec is not None]
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)

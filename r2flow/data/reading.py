@@ -129,8 +129,8 @@ def _no_reflectance(path: str | Path) -> InputError:
 
 
 def estimated_scale(path: str | Path, scans: Iterable[Points]) -> float:
-    """Full reflectance estimated from scans, 1 without any; warns of a value that other scans may exceed."""
-    scale = full_reflectance(scans) or 1.0
+    """The largest estimate of full reflectance of scans, 1 without any; warns of a value that others may exceed."""
+    scale = max((full_reflectance([points]) or 0.0 for points in scans), default=0.0) or 1.0
     if scale not in SURE:
         warn_odd(Path(path), DIVIDED % scale)
     return scale

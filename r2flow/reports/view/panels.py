@@ -28,11 +28,19 @@ from r2flow.samplers import OnGrid
 from r2flow.simulator import simulate
 
 
-def scans_of(path: Path) -> list[Path]:
-    """A scan file, or the scans of a folder."""
-    if not path.is_dir():
-        return [path]
-    return [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
+def scans_of(path: Path, most: int) -> tuple[list[Path], int]:
+    """A scan file, or up to `most` scans of a folder, evenly spread; and the number of all."""
+    paths = [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans] if path.is_dir() else [path]
+    return [paths[index] for index in spread(len(paths), most)], len(paths)
+
+
+def one_scale(readings: Mapping[str, Reading], most: int) -> dict[str, Reading]:
+    """Readings of sets shown together: those that do not know full reflectance take one estimate from all of them."""
+    unknown = [spec for spec, reading in readings.items() if reading.reflectance_scale is None]
+    sets = [scans_of(file or Path(options.folder), most)[0] for options, file in map(parse, unknown)]
+    paths = [path for chosen in sets for path in chosen]
+    scale = estimated_scale(paths[0], readable(paths, readings[unknown[0]].columns)) if paths else None
+    return {**readings, **{spec: replace(readings[spec], reflectance_scale=scale) for spec in unknown}}
 
 
 def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -> Iterator[Panel]:
@@ -45,12 +53,8 @@ def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -
     options, file = parse(spec)
     views: list[tuple[Path, ScanSet, int]]
     if own_reading(spec) is None and options.name == FOLDER:
-        paths = scans_of(file or Path(options.folder))
-        count, chosen = len(paths), [paths[index] for index in spread(len(paths), most)]
+        chosen, count = scans_of(file or Path(options.folder), most)
         warn_of_other_sensor(chosen, reading, spec)
-        if reading.reflectance_scale is None:
-            scale = estimated_scale(chosen[0], readable(chosen, reading.columns))
-            reading = replace(reading, reflectance_scale=scale)
         views = [(path, open_scans(path, reading, own_size=True), 0) for path in chosen]
     else:
         opened = open_scans(spec, reading)
@@ -131,8 +135,7 @@ def way_panels(
             bar.set(len(decoded) - 1)
     images = torch.stack(decoded, 1).nan_to_num(0.0).numpy()
     rays, frames = flow.sensor.rays(), [f"t = {t:.3g}" for t in grid]
-    captions = [f"{label}, seed {seed}, sample {number}" for number in range(num)]
-    return [Panel(caption, image, rays, None, frames) for caption, image in zip(captions, images, strict=True)]
+    return [Panel(f"{label}, seed {seed}, sample {n}", image, rays, None, frames) for n, image in enumerate(images)]
 
 
 def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, title: str = "r2flow") -> Path:
