@@ -352,7 +352,7 @@ def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_p
     assert "16 of the 32 rows of mine are measured" in complete(*asked, model=None).said
     said = complete(*asked[:1], "--from", tmp_path / "mine.yaml", out=tmp_path / "other").said
     assert "6 of its 16 beams look past" in said
-    assert "--to FILE (r2flow sensor) --size 16x900 uses them" in said
+    assert "--to FILE (r2flow sensor) --size 16x900, in Python Checkpoint.through of such a sensor, uses" in said
 
 
 def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path, caplog):

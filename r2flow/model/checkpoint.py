@@ -140,7 +140,7 @@ class Checkpoint:
     def through(self, sensor: Sensor | str, numbered: bool = True) -> "Checkpoint":
         """This transfer flow for images of another sensor, by name, YAML file or `Sensor`; the weights are shared."""
         if not isinstance(self.generator, TransferFlow):
-            raise InputError(f"{self.path} is a model of one sensor: leave --to, --sensor and --size out.")
+            raise InputError(f"{self.path} is a model of one sensor: leave --to, --sensor and --size, or through, out.")
         return replace(self, generator=self.generator.at(self.generator.space.through(named_sensor(sensor)), numbered))
 
     def points(self, images: Tensor) -> list[np.ndarray]:
