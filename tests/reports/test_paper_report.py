@@ -43,18 +43,19 @@ def test_the_printed_rows_have_a_figure_for_each_column():
     assert same_architecture(50_000_000) is None
 
 
-def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations():
+def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations_and_a_star_tells_another_protocol():
     rows = [
-        {"role": "1-RF", "flow": "ours", "evaluations": n, "jsd/jsd": d, "weights": "w"}
-        for n, d in ((1, 0.5), (4, 0.4), (64, 0.03))
-    ]
+        {"role": "1-RF", "flow": "ours", "evaluations": n, "jsd/jsd": d, "weights": "w", "protocol":
+         f"paper, {scans} scans of 64x1024 against 7 of {real}"}
+        for n, d, scans, real in ((1, 0.5, 10000, "kitti_360:x"), (4, 0.4, 10000, "x"), (64, 0.03, 99, "kitti_360:x"))
+    ]  # fmt: skip
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in table_i(rows).splitlines()[2:]]
     below = {tuple(a[:3]): b for a, b in itertools.pairwise(lines) if b[1] == "ours"}
     jsd = 3 + list(COLUMNS).index("jsd")
     assert {key: (line[2], line[jsd]) for key, line in below.items()} == {
-        ("1-RF", "paper", "256"): ("64", "3"),
+        ("1-RF", "paper", "256"): ("64", "3*"),
         ("1-RF", "paper", "1"): ("1", "50"),
-        ("4-TD", "paper", "4"): ("4", "40"),  # the last printed row: no 1-RF is printed at 4
+        ("4-TD", "paper", "4"): ("4", "40*"),  # the last printed row: no 1-RF is printed at 4
     }
 
 
