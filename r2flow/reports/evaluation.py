@@ -274,7 +274,8 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
         axes.grid(True, which="major", color="0.88", lw=0.6)
         axes.tick_params(labelsize=8)
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(flows), 4), fontsize=8, frameon=False)
+    columns = min(len(flows), 4, max(1, int(16 * figure.get_figwidth() / (8 + max(map(len, flows))))))  # by letters
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8, frameon=False)
     return figure
 
 
