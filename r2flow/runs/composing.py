@@ -152,6 +152,9 @@ def with_choices(compose: Callable[[], T]) -> T:
 
 
 def choices(group: str) -> list[str]:
+    """The choices of a group, also of `--config-dir` and of plug-ins."""
+    if GlobalHydra.instance().is_initialized():
+        return [name for name in GlobalHydra.instance().config_loader().get_group_options(group) if name != "base"]
     files = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
     stored = ConfigStore.instance().repo.get(group, {})
     return sorted(files | {name.removesuffix(".yaml") for name in stored})

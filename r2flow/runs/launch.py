@@ -33,6 +33,7 @@ from r2flow.runs.composing import (
     add_choices,
     as_hydra_takes,
     check_keys,
+    choices,
     compose,
     explain,
     plain,
@@ -155,6 +156,7 @@ def _run_hydra(arguments: Sequence[str], job: Callable[[DictConfig], None]) -> N
 
     decorated = hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(task)
     OmegaConf.register_new_resolver("job_folder", functools.partial(job_folder, arguments), replace=True)
+    OmegaConf.register_new_resolver("choices", lambda group: ", ".join(choices(group)), replace=True)
 
     def composed() -> None:
         sys.argv = [original[0], *arguments]
