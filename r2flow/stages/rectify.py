@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from r2flow.errors import InputError, check
-from r2flow.flow.losses import LOSSES
+from r2flow.flow.losses import LOSSES, loss_of_each
 from r2flow.flow.path import interpolate
 from r2flow.flow.times import build_density
 from r2flow.generators import Condition, Flow, Generator
@@ -49,14 +49,7 @@ class Rectify(SingleLoss):
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         t = self.time(u)
         x_t, u_t = interpolate(batch["x_0"], batch["x_1"], t)
-        return self.mean_loss(self.generator.velocity(t, x_t, self.condition(batch)), u_t)
-
-    def mean_loss(self, v_t: Tensor, u_t: Tensor) -> Tensor:
-        """Mean of the loss over a batch, (); InputError: a loss of another shape than (B,)."""
-        each = self.loss(v_t, u_t)
-        if each.shape != v_t.shape[:1]:
-            raise InputError(f"a loss must give one value a scan, ({len(v_t)},), found {tuple(each.shape)}.")
-        return each.mean()
+        return loss_of_each(self.loss, self.generator.velocity(t, x_t, self.condition(batch)), u_t).mean()
 
 
 class Reflow(Rectify):
