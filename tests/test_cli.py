@@ -110,6 +110,7 @@ def test_every_verb_has_help_with_an_example(r2flow, verb):
     ("error", "words"),
     [
         (MemoryError(), "has no room;"),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "has no room;"),
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"), "for 20.00 GiB more;"),
         (RuntimeError("can't allocate memory: you tried to allocate 96 bytes.\nx"), "96 bytes more"),
         (RuntimeError("not enough memory: you tried to allocate 96 bytes."), "for 96 bytes more;"),

@@ -33,7 +33,7 @@ for verb in app.registered_commands:
 app.registered_groups[0].rich_help_panel = "Measure"
 app.registered_commands.sort(key=lambda verb: list(GROUPS).index(str(verb.rich_help_panel)))
 
-FULL = ("can't allocate memory", "not enough memory", "out of memory")  # in messages of torch RuntimeErrors
+FULL = ("can't allocate memory", "not enough memory", "out of memory", "failed to map segment")  # errors of torch
 
 
 def run() -> None:
@@ -66,14 +66,14 @@ def _run() -> None:
         code = app(arguments, prog_name="r2flow", standalone_mode=False)
     except (InputError, OSError) as error:
         message = explain_mistake(error)
-    except (MemoryError, RuntimeError) as error:
+    except (ImportError, MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not any(words in str(error) for words in FULL):
             raise
         size = re.search(r"allocate ([\d.]+ \w+)", str(error))
         more = f" for {size[1]} more" if size else ""
         batched = any(word.startswith("--batch-size") for word in sys.argv)
         less = "a smaller --batch-size" if batched else "smaller batches or images"
-        message = f"the memory has no room{more}; give {less}."
+        message = f"the memory has no room{more}; give {less}, or more memory."
     except USAGE_ERROR as error:
         message = f"{_usage(error.format_message())} See --help."
     else:
