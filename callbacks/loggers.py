@@ -41,7 +41,10 @@ def _mlflow(run_dir: Path) -> Logger:
         _STORES.add(uri)  # MLflow writes it into the environment, which the next run of this process reads
         files = sorted(store.glob("*/*/meta.yaml"), key=lambda file: file.stat().st_mtime)
         run_id = files[-1].parent.name if files else None
-    return MLFlowLogger(PROJECT, run_dir.name, uri, run_id=run_id)
+    try:
+        return MLFlowLogger(PROJECT, run_dir.name, uri, run_id=run_id)
+    except Exception as error:  # as of a scheme that it does not know
+        raise InputError(f"loggers=[mlflow]: {' '.join(str(error).split())[:300]}") from error
 
 
 _STORES: set[str] = set()
