@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.flow.losses import LOSSES, absolute, loss_of_each
+from r2flow.flow.losses import LOSSES, absolute
 from r2flow.flow.maps import Aim
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
@@ -67,7 +67,7 @@ class LearnStreetMap(LearnFlowMap):
         x_t, target = torch.where(here, x_t, aim.x_t), torch.where(here, v, aim.target)
         estimate = self.generator.map()(t, x_t, s)  # type: ignore[operator]
         ends = (s == 1) & (t < s)
-        of_ends, others = (loss_of_each(loss, estimate, target) for loss in (self.end_loss, self.loss))
+        of_ends, others = (self.loss_of_each(loss, estimate, target) for loss in (self.end_loss, self.loss))
         return torch.where(ends, of_ends, others).mean()
 
 

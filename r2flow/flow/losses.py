@@ -6,20 +6,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from r2flow.errors import check
 from r2flow.registry import Registry
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 
 HUGE = 1e15  # its square is finite in float32
 PSEUDO_HUBER_SCALE = 0.00054  # c = 0.00054 sqrt(d), paper, below eq. 3
-
-
-def loss_of_each(loss: Loss, v_t: Tensor, u_t: Tensor) -> Tensor:
-    """The loss of each sample, (B,); InputError: a loss of another shape."""
-    each = loss(v_t, u_t)
-    check(each.shape == v_t.shape[:1], f"a loss must give one value a scan, ({len(v_t)},), found {tuple(each.shape)}.")
-    return each
 
 
 def mse(v_t: Tensor, u_t: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.losses import loss_of_each
 from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
@@ -86,7 +85,7 @@ class LearnFlowMap(Reflow):
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
             mask = expand_time(diagonal, x_t)
             aim = Aim(torch.where(mask, x_t, aim.x_t), torch.where(mask, v, aim.target))
-        return loss_of_each(self.loss, u_ts(t, aim.x_t, s), aim.target).mean()
+        return self.loss_of_each(self.loss, u_ts(t, aim.x_t, s), aim.target).mean()
 
 
 def paths_of(batch: Batch) -> Paths:

@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from r2flow.errors import InputError, check
-from r2flow.flow.losses import LOSSES, loss_of_each
+from r2flow.errors import check
+from r2flow.flow.losses import LOSSES, Loss
 from r2flow.flow.path import interpolate
 from r2flow.flow.times import build_density
 from r2flow.generators import Condition, Flow, Generator
@@ -34,11 +34,8 @@ class Rectify(SingleLoss):
         self, generator: Generator, loss: str = "mse", time: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
         super().__init__(generator, **options)
-        if generator.told and type(self).condition is Rectify.condition:
-            raise InputError(
-                f"a {type(generator).__name__} needs a condition, and this stage gives none: give "
-                "stage=transfer, or the stage that it was trained with."
-            )
+        given = not generator.told or type(self).condition is not Rectify.condition
+        check(given, f"a {type(generator).__name__} needs a condition: give stage=transfer, or its own stage.")
         self.loss = LOSSES[loss]
         self.time = build_density(time or {"name": "uniform"})
 
@@ -49,7 +46,13 @@ class Rectify(SingleLoss):
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         t = self.time(u)
         x_t, u_t = interpolate(batch["x_0"], batch["x_1"], t)
-        return loss_of_each(self.loss, self.generator.velocity(t, x_t, self.condition(batch)), u_t).mean()
+        return self.loss_of_each(self.loss, self.generator.velocity(t, x_t, self.condition(batch)), u_t).mean()
+
+    def loss_of_each(self, loss: Loss, v_t: Tensor, u_t: Tensor) -> Tensor:
+        """The loss of each scan of a batch, (B,); InputError: a loss of another shape."""
+        each, b = loss(v_t, u_t), len(v_t)
+        check(each.shape == (b,), f"a loss must give one value a scan, ({b},), found {tuple(each.shape)}.")
+        return each
 
 
 class Reflow(Rectify):
