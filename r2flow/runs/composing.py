@@ -152,12 +152,10 @@ def with_choices(compose: Callable[[], T]) -> T:
 
 
 def choices(group: str) -> list[str]:
-    """The choices of a group, also of `--config-dir` and of plug-ins."""
-    if GlobalHydra.instance().is_initialized():
+    if GlobalHydra.instance().is_initialized():  # knows `--config-dir`, too
         return [name for name in GlobalHydra.instance().config_loader().get_group_options(group) if name != "base"]
     files = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
-    stored = ConfigStore.instance().repo.get(group, {})
-    return sorted(files | {name.removesuffix(".yaml") for name in stored})
+    return sorted(files | {name.removesuffix(".yaml") for name in ConfigStore.instance().repo.get(group, {})})
 
 
 MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~KEY may delete from

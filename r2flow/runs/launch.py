@@ -85,21 +85,20 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         jobs = ended or [error.args]  # a remote launcher raises the first only
         failed = [folder for code, folder in jobs if code != LATER]
         number, names = (len(failed or jobs) if ended else "some"), "; ".join(failed or [folder for _, folder in jobs])
-        if failed:
-            print(f"error: {number} of the sweep's jobs failed: {names}", file=sys.stderr)
-            return 2
-        print(f"{number} of the sweep's jobs resume with the same command: {names}")
-        return LATER
+        if not failed:
+            print(f"{number} of the sweep's jobs resume with the same command: {names}")
+            return LATER
+        message = f"{number} of the sweep's jobs failed: {names}"
     except (HydraException, OmegaConfBaseException) as error:
-        print(f"error: {one_line(explain(error))}{_forgotten_plugins(arguments)}", file=sys.stderr)
-        return 2
+        message = f"{one_line(explain(error))}{_forgotten_plugins(arguments)}"
     except RecursionError:
-        print("error: a config contains itself, or is nested too deeply.", file=sys.stderr)
-        return 2
+        message = "a config contains itself, or is nested too deeply."
     except (InputError, OSError) as error:
-        print(f"error: {explain_mistake(error)}", file=sys.stderr)
-        return 2
-    return 0
+        message = explain_mistake(error)
+    else:
+        return 0
+    print(f"error: {message}", file=sys.stderr)
+    return 2
 
 
 def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:

@@ -136,10 +136,8 @@ def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
 
 
 def test_a_named_choice_has_options_of_its_own():
-    assert compose(["stage.time={name: logit_normal, mean: 2.0}"])["stage"]["time"] == {
-        "name": "logit_normal",
-        "mean": 2.0,
-    }
+    time = compose(["stage.time={name: logit_normal, mean: 2.0}"])["stage"]["time"]
+    assert time == {"name": "logit_normal", "mean": 2.0}
     reflow = ["stage=reflow", "stage.time={name: uniform}"]  # whose default density has an option a
     assert compose(reflow)["stage"]["time"] == {"name": "uniform"}
 
