@@ -88,8 +88,7 @@ def view(
     from r2flow.reports.view import Panel, write_page
     from r2flow.reports.view.panels import in_turn, one_scale, sample_panels, scan_panels, way_panels
 
-    if out is not None and out.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"--out must be a file that ends in .html, found {out}.")
+    check(out is None or out.suffix.lower() in (".html", ".htm"), f"--out is a file that ends in .html; found {out}.")
     models = [spec for spec in what if is_checkpoint(spec)]
     scans = [spec for spec in what if spec not in models]
     if not models and (steps or times or seed or device != "auto"):

@@ -129,8 +129,7 @@ class Generator(nn.Module):
         how.check(self)
         if condition is not None and not (self.told or how.completes):
             raise InputError(f"this {type(self).__name__} takes no condition; complete scans with --sampler mmps.")
-        if how.draws and draws is None:
-            raise InputError(f"sampler {how.name} is stochastic: give draws.")
+        check(draws is not None or not how.draws, f"sampler {how.name} is stochastic: give draws.")
         x = wide(noise.to(self.device))
         conditions = condition and {name: value.to(self.device) for name, value in condition.items()}
         noise_of_step = None if draws is None else lambda j: self.further_noise(draws, j).to(x)

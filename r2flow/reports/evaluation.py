@@ -268,9 +268,8 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
             axes.plot(at, [row.get(name, math.nan) * factor for row in line_rows], **style, ms=5, lw=1.2, label=flow)
         positive = all(row[name] > 0 for row in rows if name in row)
         axes.set(xscale="log", yscale="log" if positive else "linear", xlabel=label, ylabel=title)
-        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))  # labels of 1, 2 and 5 alone: nine would overlap
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}")
+        # Labels of 1, 2 and 5 alone: nine would overlap.
+        axes.xaxis.set(minor_locator=LogLocator(subs=(2, 5)), major_formatter="{x:g}", minor_formatter="{x:g}")
         axes.grid(True, which="major", color="0.88", lw=0.6)
         axes.tick_params(labelsize=8)
     handles, labels = figure.axes[0].get_legend_handles_labels()

@@ -137,9 +137,8 @@ def _draw_row(
 def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Draw range on a logarithmic colour scale, dropped rays black."""
     shown = np.ma.masked_where(image[0] <= 0, np.log(np.maximum(image[0], 1e-3)))
-    _show(
-        axes, shown, "range, m" if label else "", colours("range"), {r: np.log(r) for r in (RANGES[0], 10, RANGES[1])}
-    )
+    ticks = {r: np.log(r) for r in (RANGES[0], 10, RANGES[1])}
+    _show(axes, shown, "range, m" if label else "", colours("range"), ticks)
 
 
 def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:

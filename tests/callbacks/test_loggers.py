@@ -52,10 +52,8 @@ def test_mlflow_keeps_curves_pictures_and_the_config_in_the_run(tmp_path, monkey
     (experiment,) = client.search_experiments(filter_string="name = 'r2flow'")
     (run,) = client.search_runs([experiment.experiment_id])
     assert run.data.params["stage/name"] == "rectify"
-    assert [(m.step, m.value) for m in client.get_metric_history(run.info.run_id, "train/loss")] == [
-        (4, 0.5),
-        (8, 0.25),
-    ]
+    history = client.get_metric_history(run.info.run_id, "train/loss")
+    assert [(m.step, m.value) for m in history] == [(4, 0.5), (8, 0.25)]
     pictures = sorted((tmp_path / "mlruns").rglob("images/*.png"))
     assert {re.split("[+%]", path.name)[0] for path in pictures} == {"samples", "loss"}
     np.testing.assert_array_equal(np.round(255 * imread(pictures[0])[..., :3]), PIXELS)

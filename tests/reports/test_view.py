@@ -174,13 +174,9 @@ class TestTheVerb:
     def test_what_is_shown_together_has_one_scale_of_reflectance(self, r2flow, tmp_path, given):
         for name, highest in (("a", 80), ("b", 204)):
             write_points(tmp_path / "in" / f"{name}.ply", np.array([[10.0, 0, 0]]), np.array([highest]))
-        sets = [tmp_path / "in" / name for name in given]
-        assert r2flow("show", *sets, "--format", "npy", "--out", tmp_path / "out")[0] == 0
+        assert r2flow("show", *(tmp_path / "in" / n for n in given), "--format", "npy", "-o", tmp_path / "out")[0] == 0
         found = [np.load(tmp_path / "out" / f"{name}.npy")[1].max() for name in "ab"]
         assert found == pytest.approx([80 / 255, 0.8])
-        assert r2flow("view", *sets, "--out", tmp_path / "a.html")[0] == 0
-        data = Parsed((tmp_path / "a.html").read_text()).data
-        assert [unpacked(data, number)[1].max() for number in range(2)] == [80, 204]
 
     def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path):
         for name, image in zip("ab", images(2), strict=True):
