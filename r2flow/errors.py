@@ -32,8 +32,7 @@ def check(holds: object, message: str) -> None:
 def require(what: str, extra: str, *packages: str) -> None:
     """Raise InputError with the extra to install if a package is missing."""
     for package in packages:
-        if find_spec(package) is None:
-            raise InputError(f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.")
+        check(find_spec(package), f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.")
 
 
 # System errors that a user can fix; others (a lost connection, a broken pipe) keep their traceback.

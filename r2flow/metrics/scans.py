@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Rays, Sensor
 from r2flow.metrics.birds_eye import birds_eye_histogram
@@ -39,11 +39,9 @@ class Scans:
         xyz: Tensor | None = None,
         names: Sequence[object] | None = None,
     ) -> None:
-        if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != sensor.shape:
-            h, w = sensor.shape
-            raise InputError(
-                f"images of {sensor.name} have the shape (B, 2 or 1, {h}, {w}), not {tuple(images.shape)}."
-            )
+        (h, w), found = sensor.shape, tuple(images.shape)
+        fits = found[1:] in ((1, h, w), (2, h, w))
+        check(fits, f"images of {sensor.name} have the shape (B, 2 or 1, {h}, {w}), not {found}.")
         images = images.float()
         for number, image in enumerate(images):
             if wrong := _wrong_with(image):
