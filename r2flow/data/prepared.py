@@ -23,7 +23,7 @@ from safetensors import safe_open
 
 from r2flow.config import at_most_three, differences
 from r2flow.data.layouts import Drive
-from r2flow.data.quantise import OTHER_LEVELS, find_levels, fits, range_codes, reflectance_codes
+from r2flow.data.quantise import OTHER_LEVELS, find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, lacks_reflectance, scale_within, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError, check
@@ -102,7 +102,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
     """Levels of reflectance; None if the scans lack reflectance."""
     if lacks_reflectance(paths, "skip", reading.columns) is not None:
         return None
-    samples, scale, images = [], reading.reflectance_scale or 1.0, False
+    samples, scale = [], reading.reflectance_scale or 1.0
     for index in spread(len(paths), PROBED):
         with suppress(InputError):  # reported when the scan is prepared
             reflectance = stored_reflectance(paths[index], reading.columns)
@@ -110,17 +110,8 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
                 is_image = read_range_image(paths[index]) is not None  # with reflectance in [0, 1]
                 own = 1.0 if is_image else scale_within(paths[index], reflectance, scale)
                 samples.append(reflectance / np.float32(own))
-                images |= is_image
     values = np.concatenate(samples) if samples else np.zeros(0)
-    if not values.any():
-        return OTHER_LEVELS
-    levels, highest = find_levels(values), float(values.max())
-    if not images and highest < 0.25 and not fits(values, levels):
-        log.warning(
-            "reflectance goes up to %.3g of 1 alone and is kept in steps of 1/%d: --reflectance-scale %.3g spreads it",
-            highest, levels, highest * scale,
-        )  # fmt: skip
-    return levels
+    return find_levels(values) if values.any() else OTHER_LEVELS
 
 
 def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
