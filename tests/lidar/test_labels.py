@@ -102,27 +102,6 @@ def test_a_cut_or_a_longer_file_is_refused(scan: Path, label: Path):
             read_labels(label, scan, points)
 
 
-FOREIGN = {
-    "big-endian": (IDS | INSTANCES << 16).astype(">u4").tobytes(),
-    "uint16": IDS.astype("<u2").tobytes(),
-    "int64": IDS.astype("<i8").tobytes(),
-    "float32": np.maximum(IDS, 1).astype("<f4").tobytes(),
-    "float64": IDS.astype("<f8").tobytes(),
-    "NaN": np.full(COUNT, np.nan, "<f4").tobytes(),
-    "text": (b"40 10\n70\n" * COUNT)[: 4 * COUNT],
-    "noise": RNG.bytes(4 * COUNT),
-    "ones": b"\xff" * (4 * COUNT),
-    "the scan": XYZ.tobytes()[: 4 * COUNT],
-    "empty": b"",
-}
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_other_content_is_refused_as_labels(scan: Path, label: Path, name: str):
-    label.write_bytes(FOREIGN[name])
-    refused(label, scan)
-
-
 def test_ids_are_those_of_semantickitti():
     ids = {"unlabeled": 0, "car": 10, "other-vehicle": 20, "lane-marking": 60, "other-object": 99, "moving-truck": 258}
     assert {name: LABELS[name] for name in ids} == ids
