@@ -3,15 +3,13 @@
 import logging
 import os
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import yaml
 from filelock import FileLock, Timeout
-from torch import Tensor
 
 from r2flow.config import at_most_three, check_tree, differences, flatten, rule
 from r2flow.errors import InputError, check
@@ -72,19 +70,14 @@ def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
     write_file(Path(run, CONFIG), yaml.safe_dump(dict(config), sort_keys=False))
 
 
-def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor] | None = None) -> Path | None:
-    """Open a run folder: returns the newest checkpoint to resume from, or None for a new run.
-
-    Checkpoints with other names or shapes than the stage's state_dict, `state`, are skipped.
-    """
+def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
+    """Open a run folder: returns the newest readable checkpoint to resume from, or None for a new run."""
     for leftover in Path(run, FOLDER).glob(".*.part"):  # of killed writers
         leftover.unlink(missing_ok=True)
-    old, resumable, last = read_config(run), _readable(run, RESUMED), None
-    newest = next(resumable, None) if old else None
-    if old and newest:
+    old, last = read_config(run), None
+    if old and (last := next((path for path, _ in _readable(run, RESUMED)), None)):
         if differing := contradictions(old, config):
             raise InputError(_another_config(run, differing))
-        last = _fitting(run, chain([newest], resumable), state)
         samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]
         if samplers and step_of(last) >= config["trainer"]["max_steps"]:
             raise InputError(
@@ -133,13 +126,3 @@ def _readable(run: str | Path, needed: Sequence[str] = ()) -> Iterator[tuple[Pat
             log.warning("%s Passing it over.", error)
         else:
             yield path, content
-
-
-def _fitting(run: str | Path, saved: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None) -> Path:
-    """The first checkpoint whose weights have the names and shapes of `state`."""
-    shapes = None if state is None else {name: value.shape for name, value in state.items()}
-    for path, content in saved:
-        if shapes is None or shapes == {n: getattr(v, "shape", None) for n, v in content["state_dict"].items()}:
-            return path
-        log.warning("%s does not have the weights of this run's config. Passing it over.", path)
-    raise InputError(f"no checkpoint in {run} has the weights of its config; give name=OTHER for a new run.")
