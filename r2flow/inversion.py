@@ -112,22 +112,15 @@ def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     """Spherical linear interpolation, (sin((1 - w) a) x + sin(w a) y) / sin a, with a the angle between x and y.
 
     Unlike linear interpolation, it keeps the norm of noise, since independent samples are nearly orthogonal (Shoemake
-    1985, "Animating rotation with quaternion curves"). For a vanishing angle it is linear. Ends are (...), weights w
-    (N,), the result (N, ...).
+    1985, "Animating rotation with quaternion curves"). For a vanishing angle it is linear. Ends are (...), neither zero
+    nor opposite, weights w (N,), the result (N, ...).
     """
-    u, v = x.double().flatten(), y.double().flatten()
-    lengths = torch.linalg.vector_norm(u), torch.linalg.vector_norm(v)
-    assert min(lengths) > 0, "an end of slerp is zero"
-    u, v = u / lengths[0], v / lengths[1]
+    u, v = (end.double().flatten() / torch.linalg.vector_norm(end.double()) for end in (x, y))
     # arccos of the inner product would lose half the digits of a small angle.
-    angle = 2 * torch.atan2(torch.linalg.vector_norm(u - v), torch.linalg.vector_norm(u + v))
-    assert math.pi - angle > 1e-6, "opposite ends have no shortest way"
-    w = weights.double()
-    near = angle < 1e-9
-    of_x = 1 - w if near else ((1 - w) * angle).sin() / angle.sin()
-    of_y = w if near else (w * angle).sin() / angle.sin()
-    shape = -1, *(1,) * x.ndim
-    return (of_x.view(shape) * x.double() + of_y.view(shape) * y.double()).to(x.dtype)
+    angle = 2 * torch.atan2(torch.linalg.vector_norm(u - v), torch.linalg.vector_norm(u + v)) / math.pi
+    w = weights.double().view(-1, *(1,) * x.ndim)
+    of_x, of_y = (share * torch.sinc(share * angle) / torch.sinc(angle) for share in (1 - w, w))
+    return (of_x * x.double() + of_y * y.double()).to(x.dtype)
 
 
 class Interpolation(NamedTuple):
