@@ -28,7 +28,6 @@ from r2flow.noise import Draws
 from r2flow.registry import Registry
 
 NOTES = "r2flow.json"  # metadata file in a .pt2; an .onnx has the key `r2flow`
-LARGEST = 2**31 - 2**25  # bytes of weights in an .onnx, a single protocol buffer
 
 
 class Tableau(NamedTuple):
@@ -156,8 +155,6 @@ def export(
     steps = None if network else tableau(flow, how)
     if write is _write_onnx:
         require("an .onnx", "export", "onnx", "onnxscript")
-        size = sum(value.numel() * value.element_size() for value in flow.state_dict().values())
-        check(size <= LARGEST, f"an .onnx holds at most 2 GiB, and these weights are {size:,} bytes: use --to pt2.")
     notes = _notes(checkpoint, how, steps)
     logging.getLogger(__name__).info("torch exports the network: this takes up to some minutes")
     with _quiet():
