@@ -9,15 +9,12 @@ LARGEST, KEPT = 1 << 30, 2**31 - 1  # bytes
 
 
 def prepare_process() -> None:
-    """Read arguments as UTF-8, keep freed memory, let waiting threads sleep earlier; call before importing torch.
+    """Keep freed memory, let waiting threads sleep earlier; call before importing torch.
 
     By default glibc returns each freed block of 32 MiB or more, and the kernel clears new pages for the next one. Here
     blocks of up to 1 GiB come from the heap, which keeps up to 2 GiB. Settings of the user (MALLOC_MMAP_...,
     MALLOC_TRIM_..., GOMP_SPINCOUNT) take precedence.
     """
-    if sys.getfilesystemencoding() != "utf-8":  # as under LC_ALL=C with PYTHONUTF8=0: arguments and names are garbled
-        os.environ["PYTHONUTF8"] = "1"
-        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # 1.4 to 2.5 times faster next to other programs
     if sys.platform != "linux" or any(name.startswith(("MALLOC_MMAP_", "MALLOC_TRIM_")) for name in os.environ):
         return

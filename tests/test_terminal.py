@@ -47,13 +47,6 @@ def test_info_ends_quietly_with_its_reader(tmp_path: Path, saved):
     assert (code, error) == (0, "")
 
 
-def test_a_name_is_read_as_utf_8_in_every_locale(tmp_path: Path):
-    variables = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    command = [*R2FLOW, "train", "run_dir='rün'", "--cfg", "job"]
-    done = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, check=True)
-    assert "run_dir: rün" in done.stdout.decode()
-
-
 def test_a_name_does_not_control_the_terminal(r2flow, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     error = r2flow("info", "a\033[31mb").refusal
