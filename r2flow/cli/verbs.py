@@ -75,23 +75,9 @@ def _run() -> None:
         less = "a smaller --batch-size" if batched else "smaller batches or images"
         message = f"the memory has no room{more}; give {less}, or more memory."
     except USAGE_ERROR as error:
-        message = f"{_usage(error.format_message())} See --help."
+        text = one_line(error.format_message()).rstrip(".") or "no verb given"
+        message = f"{text}{'.' * (not text.endswith('?'))} See --help."
     else:
         sys.exit(code if isinstance(code, int) else 0)
     print(f"error: {message}", file=sys.stderr)
     sys.exit(2)
-
-
-def _usage(message: str) -> str:
-    """Format typer's message on a wrong option, with the value found."""
-    text = one_line(message).rstrip(".") or "no verb given"
-    wrong = re.fullmatch(r"Invalid value for ('.*'): Input should be (.*?)(, unable to .*)?", text)
-    if not wrong:
-        return text + "." * (not text.endswith("?"))
-    names = re.findall(r"--?[\w-]+", wrong[1])
-    words = [word.partition("=") for word in sys.argv[1:]]
-    after = [*sys.argv[2:], ""]
-    values = [value if equals else other for (word, equals, value), other in zip(words, after, strict=True)
-              if word in names]  # fmt: skip
-    suffix = f", found {', '.join(values)}" if values else ""
-    return f"{' or '.join(names) or wrong[1]} must be {wrong[2]}{suffix}."
