@@ -35,9 +35,6 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points
     if folder.is_dir():
         whole = (folder / "metadata.yaml").is_file()
         check(whole, f"{folder} has no metadata.yaml: give a .mcap, or make it by ros2 bag reindex {folder}")
-        # Reading a pipe would block.
-        odd = next((file for file in folder.iterdir() if not (file.is_file() or file.is_dir())), None)
-        check(odd is None, f"{odd} is not a regular file.")
     store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
     # rosbags and the stores below it raise many kinds on damaged files
     with telling(path), (Reader1 if old else Reader2)(folder) as reader:

@@ -1,6 +1,5 @@
 """Recordings of ROS, written by rosbags' own writers, hold the points that were written."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -132,11 +131,3 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="holds no topic '/rear'"):
         list(read_bag(tmp_path / "drive", "/rear"))
-
-
-def test_a_pipe_in_a_bag_is_refused(r2flow, tmp_path: Path):
-    file = record(tmp_path / "bag", "SQLITE3")
-    file.unlink()
-    os.mkfifo(file)
-    for path in (file, file.parent):
-        assert r2flow("unpack", path, "--out", tmp_path / "out").refusal
