@@ -183,9 +183,6 @@ def folder(root: Path) -> list[Drive]:
             if any(drive.scans for drive in drives):
                 if len(places) < len(below):
                     warn_odd(min(made), "left out, since r2flow wrote it, as are other such folders below the scans")
-                mixed = [p for p, drive in zip(places, drives, strict=True) if drive.scans and not manifest_of(p)]
-                if endings is FIRM_ENDINGS and (left := sum(len(_files(place, (".csv", ".npz"))) for place in mixed)):
-                    warn_odd(root, f"{left} .csv or .npz files left out: scan files of other formats are next to them")
                 return drives
     return []
 
