@@ -19,13 +19,9 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file that replaces `path` when the block ends without an error.
 
     It is flushed to the disk before the rename and the folder after it: a reader, or a power cut, finds the old file or
-    the whole new one. A link stays, and its target is replaced.
+    the whole new one. A link stays, and its target is written.
     """
     path = Path(path)
-    if path.is_symlink() and not path.exists():
-        raise InputError(
-            f"{path} is a link to {path.readlink()}, which does not exist; remove the link or name another file."
-        )
     if path.exists() and not path.is_file():  # the rename would replace a device or a pipe
         kind = "a folder" if path.is_dir() else "not a regular file"
         raise InputError(f"{path} is {kind}; name a file to write to.")

@@ -33,12 +33,12 @@ def test_the_file_has_the_usual_permissions(tmp_path):
 def test_what_is_no_file_is_refused_by_its_name_and_stays(tmp_path):
     (tmp_path / "out").mkdir()
     os.mkfifo(tmp_path / "pipe")
-    for name, target in (("link", "pipe"), ("dangling", "nothing"), ("a", "b"), ("b", "a")):
+    for name, target in (("link", "pipe"), ("dangling", "nothing")):
         (tmp_path / name).symlink_to(target)
     before = sorted(os.listdir(tmp_path))
     for name, words in (
         ("out", "is a folder"), ("pipe", "is not a regular file"), ("link", "is not a regular file"),
-        ("/dev/null", "is not a regular file"), ("dangling", "is a link to nothing"), ("a", "is a link to b"),
+        ("/dev/null", "is not a regular file"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"{tmp_path / name} {words}"), atomic_write(tmp_path / name):
             pytest.fail("the block was entered")
@@ -52,7 +52,10 @@ def test_what_is_no_file_is_refused_by_its_name_and_stays(tmp_path):
 def test_the_file_that_a_link_leads_to_is_replaced(tmp_path, to):
     target = tmp_path / "other" / "file"
     target.parent.mkdir()
-    target.write_text("old")
+    (tmp_path / "dangling").symlink_to("other/file")
+    with atomic_write(tmp_path / "dangling", "w") as file:
+        file.write("old")
+    assert target.read_text() == "old"
     (tmp_path / "first").symlink_to(target)
     (tmp_path / "link").symlink_to(to)
     before = target.stat().st_ino
