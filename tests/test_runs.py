@@ -68,15 +68,6 @@ def test_a_folder_in_which_nothing_was_learned_is_free(tmp_path: Path):
     assert read_config(tmp_path) == changed(seed=3)
 
 
-def test_settings_of_pairs_matter_only_to_a_run_on_pairs():
-    def config(name, method):
-        return {"data": {"name": name, "pairs": {"sampler": {"name": method}}}}
-
-    assert contradictions(config("simulated", "dopri5"), config("simulated", "adams3")) == []
-    told = contradictions(config("pairs", "dopri5"), config("pairs", "adams3"))
-    assert told == ["data.pairs.sampler.name=dopri5 there, adams3 here"]
-
-
 HOLD = """
 import sys, time
 from r2flow.runs.folder import run_lock

@@ -23,12 +23,7 @@ CONFIG = "config.yaml"
 
 def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Differences that prevent a command from resuming a run."""
-    on_pairs = any((config.get("data") or {}).get("name") == "pairs" for config in (old, new))
-    return [
-        text
-        for key, text in differences(old, new).items()
-        if rule(key).resume != "free" and (on_pairs or not key.startswith("data.pairs."))
-    ]
+    return [text for key, text in differences(old, new).items() if rule(key).resume != "free"]
 
 
 @contextmanager
