@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError, check
+from r2flow.errors import check
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import Positive, Registry, check_options, construct
@@ -146,10 +146,7 @@ class Encoding:
             r = r * self._between(r)
         y = self.format.forward(r)
         if self.reflectance:
-            if image.shape[-3] < 2:
-                raise InputError(
-                    "the model has a reflectance channel and the scan has none; train with encoding.reflectance=false."
-                )
+            assert image.shape[-3] > 1, "the model has a reflectance channel and the scan has none"
             y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)
         return 2 * y - 1
 
@@ -209,14 +206,8 @@ class ModelSpace:
             For each image x, y, z in metres (x ahead, y left, z up) and reflectance, (N, 4) float32; N differs between
             scans. Reflectance is 0 if the images have none.
         """
-        images = torch.as_tensor(images)
-        if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != self.sensor.shape:
-            h, w = self.sensor.shape
-            raise InputError(
-                f"range images have the shape (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}; for "
-                "scans of another sensor there is r2flow.lidar.projection.image_to_points."
-            )
-        rays = self.sensor.rays()
+        images, rays = torch.as_tensor(images), self.sensor.rays()
+        check(images.ndim == 4, f"range images have the shape (B, 2 or 1, H, W), found {tuple(images.shape)}.")
         clouds = (image_to_points(image, rays) for image in images.float().cpu().numpy())
         return [np.column_stack(cloud) for cloud in clouds]
 
