@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -194,15 +194,9 @@ class PairSource:
     def __getitem__(self, index: int) -> Item:
         store, number = self.store, int(self.indices[index])
         shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
-        (path,) = store.files(shard)
-        try:
-            with safe_open(path, framework="pt") as file:
-                names = ("x_1", "knots") if store.knots else ("x_1",)
-                states = {name: file.get_slice(name)[offset].float() for name in names}
-        except (SafetensorError, OSError) as error:
-            raise InputError(
-                f"{path} was lost or damaged while it was in use ({error}). The same command makes it again."
-            ) from None
+        with safe_open(store.files(shard)[0], framework="pt") as file:
+            names = ("x_1", "knots") if store.knots else ("x_1",)
+            states = {name: file.get_slice(name)[offset].float() for name in names}
         return {"x_0": store.noise(store.first + number), **states, **self.times}
 
 

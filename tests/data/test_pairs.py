@@ -134,18 +134,6 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
     assert len(PairSource(store_in(tmp_path / "pairs", num=200))) == 200
 
 
-def test_a_shard_lost_in_use_says_how_to_go_on(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow)
-    source = PairSource(store_in(tmp_path))
-    (tmp_path / "pairs-000001.safetensors").unlink()
-    cut = tmp_path / "pairs-000002.safetensors"
-    cut.write_bytes(cut.read_bytes()[:-100])
-    assert source[0]["x_1"].isfinite().all()
-    for index in (13, 25):
-        with pytest.raises(InputError, match="makes it again"):
-            source[index]
-
-
 def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
     bad = store_in(tmp_path).noise(5)
 
