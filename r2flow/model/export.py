@@ -154,7 +154,7 @@ def export(
     check(not (network and own), f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler.")
     steps = None if network else tableau(flow, how)
     if write is _write_onnx:
-        require("an .onnx", "export", "onnx", "onnxscript")
+        require("an .onnx", "export", "onnx", "onnxscript", "onnxruntime")
     notes = _notes(checkpoint, how, steps)
     logging.getLogger(__name__).info("torch exports the network: this takes up to some minutes")
     with _quiet():
@@ -282,7 +282,6 @@ def run(path: Path, noise: Tensor) -> dict[str, Tensor]:
         with torch.no_grad(), warnings.catch_warnings(action="ignore"):
             scan, points = torch.export.load(path).module()(noise)
         return {"scan": scan, "points": points}
-    require("running an .onnx", "export", "onnxruntime")
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
