@@ -90,7 +90,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
             return LATER
         message = f"{number} of the sweep's jobs failed: {names}"
     except (HydraException, OmegaConfBaseException) as error:
-        message = f"{one_line(explain(error))}{_forgotten_plugins(arguments)}"
+        message = one_line(explain(error))
     except RecursionError:
         message = "a config contains itself, or is nested too deeply."
     except (InputError, OSError) as error:
@@ -110,18 +110,6 @@ def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:
     names = list(dict.fromkeys(name for name in names if name))
     rest = [text for text in others if text not in given]
     return [*rest, *([override("plugins", names)] if names else [])], names
-
-
-def _forgotten_plugins(arguments: Sequence[str]) -> str:
-    """Hint at the plug-ins of an existing run if the command gives none."""
-    given = dict(text.partition("=")[::2] for text in arguments)
-    run = given.get("run_dir") or f"runs/{given.get('name')}"
-    if "plugins" in given or not Path(run, "config.yaml").is_file():
-        return ""
-    from r2flow.runs.folder import read_config
-
-    names = " ".join(f"--plugin {name}" for name in (read_config(run) or {}).get("plugins") or ())
-    return f" {run} was made with {names}: give it again." if names else ""
 
 
 def _checked_arguments(arguments: list[str]) -> list[str]:

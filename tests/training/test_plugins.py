@@ -44,14 +44,6 @@ def test_a_plugin_stands_anywhere_on_the_command_line():
     assert take_plugins(line) == (["sample", "x"], ["a.b", "./c.py"])
 
 
-@pytest.mark.parametrize("wanted", ["stage=eager", "+callbacks.mine={}"])
-def test_a_forgotten_plugin_is_named_by_the_run(tmp_path: Path, wanted: str):
-    write_config(tmp_path / "runs" / "own", {"plugins": ["their.module"]})
-    line = in_process(tmp_path, [wanted, "name=own"], check=False).refusal
-    assert "runs/own was made with" in line
-    assert "--plugin their.module" in line
-
-
 def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     deep = tmp_path / "deep.py"
     deep.write_text("from r2flow.backbones import BACKBONES\nBACKBONES.add('deep', BACKBONES['local'])\n")
