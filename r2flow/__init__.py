@@ -8,7 +8,6 @@ Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1
     scan = r2flow.read("000000.bin", "vlp16")  # a scan file as such an image, (2, H, W)
 """
 
-import os
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -37,10 +36,8 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
         InputError: unknown model, unusable file or unavailable device.
     """
     from r2flow.devices import choose_device
-    from r2flow.errors import check
     from r2flow.model.checkpoint import load_checkpoint  # slow, imports torch
 
-    check(isinstance(name, str | os.PathLike), f"a model has a name, a run folder or a file; found {name!r}.")
     return load_checkpoint(name, choose_device(str(device), "device"))
 
 

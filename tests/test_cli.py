@@ -127,12 +127,6 @@ def test_a_model_is_loaded_on_a_device_that_is_here(saved, device):
     assert str(device) in str(refused.value)
 
 
-@pytest.mark.parametrize("name", [None, 3])
-def test_a_model_has_a_name(name):
-    with pytest.raises(InputError, match=f"a model has a name, a run folder or a file; found {name}"):
-        load(name)
-
-
 def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, shared, tmp_path):
     published, out = shared / "oracle" / "published_format.pth", tmp_path / "out"
     drawn = ("--num", 1, "--steps", 1, "--pictures", 0, "--out", out)
