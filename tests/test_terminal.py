@@ -118,8 +118,8 @@ def test_without_a_terminal_there_is_a_line_every_half_minute(capsys, monkeypatc
     assert shown.out == ""
     # 15 scans in 30 s leave 185 for 6 min 10 s; 30 in 60 s leave 170 for 5 min 40 s
     assert shown.err.splitlines() == [
-        "completing 115/300 scans  0.50/s  6:10 left",
-        "completing 130/300 scans  0.50/s  5:40 left",
+        "completing 115/300 scans  0.50/s  0:06:10 left",
+        "completing 130/300 scans  0.50/s  0:05:40 left",
     ]
 
 
@@ -131,7 +131,7 @@ def test_several_processes_write_lines_on_a_terminal_too(capsys, monkeypatch):
         for done in (16, 32):
             now += 40.0
             bar.set(done)
-    assert capsys.readouterr() == ("", "process 2 of 8: drawing 32/64 pairs  0.40/s  1:20 left\n")
+    assert capsys.readouterr() == ("", "process 2 of 8: drawing 32/64 pairs  0.40/s  0:01:20 left\n")
 
 
 def test_work_goes_on_where_standard_error_was_closed(monkeypatch):
