@@ -26,7 +26,7 @@ from tests.conftest import CONFIG, SENSOR, prepare_folder
 from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
 
 ROOT, SEED = Path(__file__).resolve().parents[1], 20261120
-EACH = 320  # damaged files made of each original
+EACH = 350  # damaged files made of each original
 DRAW = np.random.default_rng(0)
 XYZ = np.round(DRAW.standard_normal((64, 3)) * [20, 20, 2], 2).astype(np.float32)
 REFLECTANCE = np.round(DRAW.random(64), 2).astype(np.float32)
