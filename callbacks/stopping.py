@@ -15,7 +15,6 @@ import lightning as L
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
-from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, outlive_parent
@@ -114,14 +113,12 @@ class Stopping(L.Callback):
         if self.told == signal.SIGUSR1:
             code = LATER
             if first:
-                assert self.job is not None
                 log.info("%s; scontrol requeue %s", where, self.job)
                 try:
-                    subprocess.run(["scontrol", "requeue", self.job], check=True)
+                    subprocess.run(["scontrol", "requeue", str(self.job)], check=True)
                 except (OSError, subprocess.CalledProcessError) as error:
-                    raise InputError(
-                        f"{where}, but SLURM did not take job {self.job} back ({error}). Submit the same script again."
-                    ) from None
+                    refused = f"{where}, but SLURM did not take job {self.job} back ({error})"
+                    raise Stopped(2, f"{refused}. Submit the same script again.") from None  # `listening` passes it on
         has_checkpoint = bool(checkpoints_of(self.run_dir))
         consequence = "resumes from the last checkpoint" if has_checkpoint else "starts it again: no checkpoint yet"
         raise Stopped(code, f"{where}; the same command {consequence}" if first else "") from None
