@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from r2flow.data.sets import ScanSet
+from r2flow.errors import check
 from r2flow.evaluation.measuring import Cache, MetricResult, Statistics, Work, gather_real, measure, speed_result
 from r2flow.evaluation.protocols import Rules
 from r2flow.evaluation.sets import baseline_sets, reference_sets
@@ -94,6 +95,8 @@ class Comparer:
         if results is None:
             if id(real) not in self._statistics:
                 self._statistics[id(real)] = gather_real(self.metrics, real, self.work, self.cache, self.rules)
+                filled = any(one.empty < one.scans for one in self._statistics[id(real)].values())
+                check(filled or kind == "reference", f"{real.label}: none of its {len(real)} scans has a return.")
             results = measure(self.metrics, self._statistics[id(real)], other, self.work, self.rules)
             if other.source.drawn:
                 results.append(speed_result(real, other))
