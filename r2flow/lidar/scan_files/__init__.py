@@ -113,7 +113,8 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
     if Path(path).suffix.lower() != ".npy":
         return None
     array = read_numbers(path)
-    if array.ndim != 3 or array.shape[0] not in (1, 2) or array.dtype.kind != "f" or not array.size:
+    shape = array.shape if array.ndim == 3 and array.dtype.kind == "f" and array.size else (0,)
+    if shape[0] not in (1, 2) or shape[1] > 4 >= shape[2] > 2:  # the latter are points in order, (1, N, 4)
         return None
     with np.errstate(over="ignore"):  # float32 overflow is infinite: no return
         image = np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
