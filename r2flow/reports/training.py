@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from r2flow.model.checkpoint import checkpoints_of, find_checkpoint, load_checkpoint
+from r2flow.model.checkpoint import checkpoints_of, load_checkpoint
 from r2flow.reports.outputs import what_next, write_samples
 from r2flow.reports.pages import STYLES, blank_figure
 from r2flow.reports.pictures import save_figure
@@ -92,27 +92,25 @@ def finish(
         configured = "no checkpoint was kept, as configured" + (f"; loss curve: {run / 'loss.png'}" if curves else "")
         print("stopped before a checkpoint was kept: the same command starts it again" if kept else configured)
         return
-    path = find_checkpoint(run)
-    checkpoint = load_checkpoint(path, device)
+    checkpoint = load_checkpoint(run, device)
     if checkpoint.step < max_steps:
         print(f"stopped at step {checkpoint.step} of {max_steps}: the same command resumes from here")
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
         single = " (single batches: too few to compare)" if tenth == 1 and name.startswith("train/") else ""
-        start = f"{values[:tenth].mean():.4f} at the start, " if len(values) > 1 else ""
+        start = f"{values[:tenth].mean():.4f} first, " if len(values) > 1 else ""  # a validation may be late
         print(f"{name}: {start}{values[-tenth:].mean():.4f} at step {steps[-1]}{single}")
     out = run / "samples"
     if samples["num"] == 0 or not checkpoint.generator.draws:
-        print(f"checkpoint    {path}")
+        print(f"checkpoint    {checkpoint.path}")
         return
     write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"], replace=True)
     during = f"; during training: {run / 'pictures'}" if (run / "pictures").is_dir() else ""
     logged = [str(run / "loss.png")] if curves else []
-    if (run / "tensorboard").is_dir():
-        logged.append(f"tensorboard --logdir {run / 'tensorboard'}")
+    logged += [f"tensorboard --logdir {run / 'tensorboard'}"] if (run / "tensorboard").is_dir() else []
     print(
         f"""
-checkpoint    {path}
+checkpoint    {checkpoint.path}
 pictures      {out / "samples.png"} and one page per scan next to it{during}
 in 3-D        {out / "samples.html"}, in a browser
 point clouds  {out / "000000.ply"} ...
