@@ -253,7 +253,7 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     try:
         with _quiet():
             return L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
-    except (TypeError, ValueError, ImportError, MisconfigurationException) as error:
+    except (TypeError, ValueError, RuntimeError, ImportError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
 
 
