@@ -117,7 +117,7 @@ class Stopping(L.Callback):
                 try:
                     subprocess.run(["scontrol", "requeue", str(self.job)], check=True)
                 except (OSError, subprocess.CalledProcessError) as error:
-                    refused = f"{where}, but SLURM did not take job {self.job} back ({error})"
+                    refused = f"error: {where}, but SLURM did not take job {self.job} back ({error})"
                     raise Stopped(2, f"{refused}. Submit the same script again.") from None  # `listening` passes it on
         has_checkpoint = bool(checkpoints_of(self.run_dir))
         consequence = "resumes from the last checkpoint" if has_checkpoint else "starts it again: no checkpoint yet"
