@@ -152,7 +152,10 @@ class ScanDataModule(L.LightningDataModule):
             if part.slow and len(part):
                 images = np.empty(shapes[i], np.float32)
                 for number in track(range(len(part)), f"reading {what}", least=16):
-                    images[number] = part[number]
+                    image = part[number]
+                    found = np.shape(image)
+                    check(found == shapes[i][1:], f"{part.names[number]}: an image of {shapes[i][1:]}, found {found}.")
+                    images[number] = image  # which would broadcast one channel
                 parts[i] = InMemory(images, part.names)
         return Mixture(parts)
 

@@ -8,7 +8,7 @@ import torch
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.resolving import reflectance_levels, resolve_reflectance
-from r2flow.data.sources import InMemory
+from r2flow.data.sources import InMemory, ScanFiles
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
@@ -253,3 +253,9 @@ def test_the_index_of_a_whole_data_set_is_small(tmp_path: Path, monkeypatch):
 def test_scenes_are_held_out_behind_those_that_are_trained_on():
     data = module(name="simulated", scenes=5, validation={"data": {"scenes": 3}})
     assert list(data.validation_source.names) == ["scene 5", "scene 6", "scene 7"]
+
+
+def test_images_of_one_channel_are_not_read_into_two(numbered: Path, monkeypatch):
+    monkeypatch.setattr(ScanFiles, "__getitem__", lambda scans, number: np.ones((1, *scans.reading.sensor.shape)))
+    with pytest.raises(InputError, match="found \\(1, "):
+        module(name="folder", root=str(numbered))
