@@ -252,7 +252,10 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     loggers = build_loggers(config["loggers"], Path(config["run_dir"]))
     try:
         with _quiet():
-            return L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
+            trainer = L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
+        if environment := getattr(trainer.strategy, "cluster_environment", None):
+            environment.validate_settings(trainer.num_devices, trainer.num_nodes)
+        return trainer
     except (TypeError, ValueError, RuntimeError, ImportError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
 
