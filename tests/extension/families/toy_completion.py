@@ -3,7 +3,6 @@
 import torch
 
 from r2flow import noise
-from r2flow.errors import InputError
 from r2flow.generators import GENERATORS, RectifiedFlow
 from r2flow.stages import STAGES, Rectify
 
@@ -20,8 +19,6 @@ class Completion(RectifiedFlow):
 
     def velocity(self, t, x, condition=None):
         known = condition or {"image": torch.zeros_like(x), "mask": torch.zeros_like(x[:, :1])}
-        if known.keys() != {"image", "mask"}:
-            raise InputError(f"a completion knows of 'image' and 'mask', found {', '.join(known)}.")
         image, mask = (known[name].to(x) for name in ("image", "mask"))
         return self.backbone(t, torch.cat([x, image * mask, mask], dim=1))
 

@@ -1,7 +1,7 @@
 """A DDPM: a network learns the noise in x_t = sqrt(a) x_1 + sqrt(1 - a) x_0, and generating takes it out in steps.
 
 Time runs as everywhere here, from noise at t = 0 to data at t = 1, with a(t) = sin(pi t / 2)^2 (Nichol and Dhariwal
-2021, eq. 17). Ho et al. 2020 for ancestral steps, Song et al. 2021, eq. 12 and 16, for both kinds.
+2021, eq. 17). Steps are ancestral (Song et al. 2021, eq. 12 and 16).
 """
 
 from dataclasses import dataclass
@@ -32,11 +32,7 @@ class ToySteps(Sampler):
     needs = "backbone"
 
     steps: int = 32
-    ancestral: bool = True
-
-    @property
-    def draws(self):
-        return self.ancestral
+    draws = True
 
     def __call__(self, generator, noise, condition=None, draws=None, progress=None):
         x = noise
@@ -44,10 +40,9 @@ class ToySteps(Sampler):
             a, b = signal(j / self.steps), signal((j + 1) / self.steps)
             x_1 = ((x - (1 - a).sqrt() * generator.backbone(j / self.steps, x)) / a.sqrt()).clamp(-1, 1)
             direction = (x - a.sqrt() * x_1) / (1 - a).sqrt()
-            sigma = ((1 - b) / (1 - a) * (1 - a / b)).sqrt() if self.ancestral else torch.zeros(())
+            sigma = ((1 - b) / (1 - a) * (1 - a / b)).sqrt()
             x = b.sqrt() * x_1 + (1 - b - sigma**2).clamp(min=0).sqrt() * direction
-            if sigma > 0:
-                x = x + sigma * draws(j + 1)
+            x = x + sigma * draws(j + 1)
             if progress:
                 progress()
         return Generated.after(x, evaluations=self.steps)
