@@ -342,8 +342,3 @@ def test_a_map_is_drawn_on_the_grid_that_it_learned():
     found = stage(jumps={"grid": "power:3"}).generator
     assert found.sampler == build_sampler("jump", steps=4, grid="power:3")
     assert found.choose(steps=2) == build_sampler("jump", steps=2, grid="power:3")
-
-
-def test_jumps_of_half_precision_noise_are_taken_in_float32(grown):
-    x_0 = Draws(0, range(2)).start(grown.noise_shape).bfloat16()
-    assert torch.equal(grown(x_0).x, grown(x_0.float()).x)

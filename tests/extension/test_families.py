@@ -65,17 +65,6 @@ def test_info_names_the_family(trained: tuple[Family, Path]):
         assert [about["config"]["stage"][key] for key in ("width", "learning_rate", "init")] == [16, 2e-3, None]
 
 
-def test_scan_i_of_a_seed_is_the_same_in_any_batch(trained: tuple[Family, Path], tmp_path: Path):
-    family, run = trained
-    for out, num, batch_size in (("three", 3, 3), ("two", 2, 1)):
-        how = ("-o", tmp_path / out, "--num", num, "--batch-size", batch_size, "--format", "npy", "--pictures", 0)
-        assert r2flow("sample", family.plugin, run, *how).said
-    three, two = ([np.load(path) for path in sorted((tmp_path / out).glob("*.npy"))] for out in ("three", "two"))
-    for a, b in zip(three[:2], two, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-    assert not np.allclose(three[0], three[1])
-
-
 def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
     family, run = trained
     how = (*EVALUATE, "--steps", "1,2", "--json", tmp_path / "e.json")

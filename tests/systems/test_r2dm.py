@@ -319,11 +319,6 @@ def test_a_part_of_the_image_has_the_noise_of_the_whole(exact, method):
 
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
-    noise = torch.zeros(1, *exact.noise_shape)
-    with pytest.raises(InputError, match="give draws"):
-        exact(noise)
-    with pytest.raises(InputError, match="condition"):
-        exact(noise, {"image": noise}, draws=Draws(0, [0]))
     flow = build_generator({**CONFIG, "generator": {"name": "rectified_flow"}})
     stage = {"data": {"name": "simulated", "batch_size": 2}, "seed": 0, "stage": {"name": "diffusion"}}
     with pytest.raises(InputError, match=r"tells v\(t, x\), and this one learns eps\(z, log-SNR\)"):
