@@ -22,7 +22,6 @@ from r2flow.data.opening import find_drives
 from r2flow.data.prepared import plan_files, prepare
 from r2flow.data.reading import Reading
 from r2flow.generators import build_generator
-from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.model.checkpoint import Checkpoint
@@ -228,14 +227,6 @@ def ground(sensor: Sensor, above: float = 0.0) -> np.ndarray:
     e = sensor.rays()[0].numpy()
     r = np.where(e < -0.03, -1.73 / np.sin(np.minimum(e, -0.03)), above)
     return np.stack([r, np.full_like(r, 0.3)]).astype(np.float32)
-
-
-@pytest.fixture
-def scan(tmp_path: Path) -> Path:
-    """A scan of the ground 1.73 m below, as a KITTI .bin."""
-    sensor = SENSORS["hdl64e"]
-    write_points(tmp_path / "ground.bin", *image_to_points(ground(sensor), sensor.rays()))
-    return tmp_path / "ground.bin"
 
 
 def write_scan(path: Path, number: int, reflectance: float = 0.5) -> None:

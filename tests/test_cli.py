@@ -12,7 +12,6 @@ from r2flow import load
 from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
-from r2flow.lidar.sensors import SENSORS
 from tests.conftest import CONFIG, SENSOR, tiny_options, write_checkpoint, write_run, write_scan
 from tests.test_sampling import network, scans
 
@@ -30,17 +29,6 @@ def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path)
     assert (images["a"] != images["c"]).any()
     assert not list((tmp_path / "b").glob("*.png"))
     assert sorted(p.suffix for p in (tmp_path / "c").glob("00000*")) == [".npy"] * 3 + [".png"] * 3
-
-
-def test_show_writes_range_images(r2flow, scan, tmp_path):
-    more = ("--projection", "unfolding", "--size", "64x1024", "--format", "npy", "--out", tmp_path)
-    said = r2flow("show", scan, *more).said
-    image = np.load(tmp_path / f"{scan.stem}.npy")
-    assert (image.shape, image.dtype) == ((2, 64, 1024), np.float32)
-    e = SENSORS["hdl64e"].rays()[0].numpy()
-    seen = image[0] > 0
-    np.testing.assert_allclose(image[0][seen], -1.73 / np.sin(e[seen]), rtol=1e-4)
-    assert "2 x 64 x 1024" in said
 
 
 def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path):
