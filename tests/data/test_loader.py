@@ -2,12 +2,10 @@ from collections import Counter
 
 import numpy as np
 import pytest
-import torch
 
-from r2flow.data.loader import FlowDataset, MixedOrder, Mixture, Permutations, RunLoader, RunSampler
+from r2flow.data.loader import MixedOrder, Mixture, Permutations, RunSampler
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
-from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 
 SENSOR = SENSORS["hdl64e"].resized(4, 8)
@@ -45,15 +43,6 @@ def test_ranks_share_every_global_batch(ranks):
     for whole, *shares in zip(keys(), *parts, strict=True):
         assert sorted(k for share in shares for k in share) == sorted(whole)
         assert len({len(share) for share in shares}) == 1
-
-
-def test_workers_change_nothing():
-    def batches(workers):
-        dataset = FlowDataset(SCANS, Encoding(SENSOR), 0, "training")
-        return list(RunLoader(dataset, batch_sampler=RunSampler(Permutations(10, 3), 4, 20), num_workers=workers))
-
-    for a, b in zip(batches(0), batches(2), strict=True):
-        assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_validation_covers_every_scan_once_over_the_ranks():

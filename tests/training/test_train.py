@@ -134,20 +134,6 @@ def test_handlers_and_hydra_are_as_they_were(train: Run, tmp_path: Path):
     assert not GlobalHydra.instance().is_initialized()
 
 
-@pytest.mark.parametrize(("workers", "threads"), [(2, 1), pytest.param(3, 2, marks=pytest.mark.slow)])
-def test_a_run_goes_on_with_other_workers_and_threads(
-    train: Run, alone: tuple[Path, str], copied: Path, workers: int, threads: int, monkeypatch: pytest.MonkeyPatch
-):
-    """Bit-equal with any number of loader workers, and with as many threads: sums of another number round otherwise."""
-    checkpoints_of(copied)[0].unlink()
-    limit, here = torch.set_num_threads, os.getpid()  # in a loader's worker threads of OpenMP would wait for ever
-    monkeypatch.setattr(torch, "set_num_threads", lambda n: limit(threads if n == 1 and os.getpid() == here else n))
-    train("name=copied", f"data.workers={workers}", "data.memory_gib=0")
-    if threads == 1:
-        assert_bit_equal(alone[0], copied)
-    torch.testing.assert_close(weights(alone[0]), weights(copied), rtol=1e-4, atol=1e-6)
-
-
 def test_odd_later_checkpoints_are_passed_over_and_set_aside(train: Run, alone: tuple[Path, str], copied: Path):
     newest, older = checkpoints_of(copied)
     cut, whole = newest.read_bytes()[:1000], torch.load(newest, weights_only=True)
