@@ -23,25 +23,18 @@ from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from r2flow.store import Store
 from tests.conftest import CONFIG, SENSOR, prepare_folder
-from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
+from tests.lidar.test_scan_files_damage import REFLECTANCE, TABLE, XYZ, in_every_format
 
 ROOT, SEED = Path(__file__).resolve().parents[1], 20261120
 EACH = 350  # damaged files made of each original
 DRAW = np.random.default_rng(0)
-XYZ = np.round(DRAW.standard_normal((64, 3)) * [20, 20, 2], 2).astype(np.float32)
-REFLECTANCE = np.round(DRAW.random(64), 2).astype(np.float32)
-TABLE = np.column_stack([XYZ, REFLECTANCE])
 
 
 def write_scans(folder: Path) -> None:
     folder.mkdir(parents=True)
-    TABLE.tofile(folder / "a.bin")
-    np.column_stack([TABLE, np.arange(64) % 32]).astype(np.float32).tofile(folder / "a.pcd.bin")
-    for ending in ("npy", "ply", "pcd"):
-        write_points(folder / f"a.{ending}", XYZ, REFLECTANCE)
-    (folder / "ascii.ply").write_bytes(ply_ascii())
-    (folder / "ascii.pcd").write_bytes(PCD_OF_4.format("ascii").encode() + TEXT)
-    (folder / "packed.pcd").write_bytes(PCD_OF_4.format("binary_compressed").encode() + compressed(TABLE.T.tobytes()))
+    for name, content in in_every_format(folder.parent).items():
+        ending, _, kind = name.partition(" ")
+        (folder / f"{kind or 'a'}.{ending}").write_bytes(content)
     np.savetxt(folder / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="", fmt="%.2f")
     np.savetxt(folder / "a.xyz", TABLE, fmt="%.2f")
     np.savez(folder / "a.npz", xyz=XYZ, intensity=REFLECTANCE)

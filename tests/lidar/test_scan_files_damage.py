@@ -29,10 +29,8 @@ FORMATS = ("bin", "pcd.bin", "npy", "ply", "ply ascii", "pcd ascii", "pcd binary
 BODY_STARTS = {"npy": rb"\} *\n", "ply": rb"end_header\n", "pcd": rb"DATA \w+\n"}
 
 
-@pytest.fixture(scope="module")
-def originals(tmp_path_factory) -> dict[str, bytes]:
-    """The same scan in every format."""
-    folder = tmp_path_factory.mktemp("originals")
+def in_every_format(folder: Path) -> dict[str, bytes]:
+    """The bytes of the same scan; some are written into the folder."""
     files = {
         "bin": TABLE.tobytes(),
         "pcd.bin": np.column_stack([TABLE, RING]).tobytes(),
@@ -45,6 +43,11 @@ def originals(tmp_path_factory) -> dict[str, bytes]:
         write_points(path, XYZ, REFLECTANCE)
         files[name] = path.read_bytes()
     return files
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory) -> dict[str, bytes]:
+    return in_every_format(tmp_path_factory.mktemp("originals"))
 
 
 TEXT = "".join(" ".join(str(value) for value in row) + "\n" for row in TABLE).encode()

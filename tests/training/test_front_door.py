@@ -1,5 +1,6 @@
 """Values of the wrong kind or out of their range, key by key: one line, exit code 2, nothing written."""
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -190,10 +191,7 @@ def test_a_lost_config_is_that_of_the_newest_checkpoint(tmp_path: Path):
 
 
 def test_one_bad_scan_stops_the_run_or_is_left_out(train: Run, scans: Path, tmp_path: Path):
-    folder = tmp_path / "copy"
-    folder.mkdir()
-    for path in scans.iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
+    folder = Path(shutil.copytree(scans, tmp_path / "copy"))
     (folder / "000004.bin").write_bytes(b"\0" * 33)
     done = train(f"data.root={folder}", "name=strict", check=False)
     for words in ("000004.bin", "data.reading.on_bad_scan=skip"):
