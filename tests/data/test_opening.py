@@ -42,11 +42,6 @@ def write_image(path: Path, number: int, channels: int = 2, size: tuple[int, int
     return path
 
 
-def test_a_usual_sensor_is_the_data_set_s():
-    assert reading_for(["nuscenes:x"]) == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)
-    assert reading_for(["kitti_raw:x"]) == Reading(SENSORS["hdl64e"])
-
-
 class TestSamples:
     """Samples say their own size and sensor."""
 

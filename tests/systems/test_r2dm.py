@@ -13,7 +13,6 @@ from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
-from r2flow.lidar.region import Region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.completion import completing
@@ -305,17 +304,6 @@ def test_ancestral_scans_have_the_spread_that_their_steps_leave(exact):
     assert found.x.mean().item() == pytest.approx(mean, abs=0.003)
     assert found.x.std().item() == pytest.approx(variance**0.5, rel=0.03)
     assert variance**0.5 < 0.8 * exact.std  # that of so few steps; more of them leave all of it
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("method", ["ddpm", "euler"])
-def test_a_part_of_the_image_has_the_noise_of_the_whole(exact, method):
-    """The expected noise of a pixel is a function of that pixel here, and so is the scan."""
-    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(0, [4]), build_sampler(method, steps=3)
-    noise = draws.start(exact.noise_shape)
-    whole = exact(noise, sampler=sampler, draws=draws)
-    part = exact.part(region)(region.crop(noise), sampler=sampler, draws=draws)
-    torch.testing.assert_close(part.x, region.crop(whole.x), rtol=0, atol=1e-6)
 
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
