@@ -232,16 +232,10 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
     assert complete(tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
 
 
-def prepared(folder: Path, numbers: list[int]) -> Path:
-    """Some scans of `full_scan`, as they are prepared."""
-    for place, number in enumerate(numbers):
-        full_scan(folder / "scans" / f"{place}.npy", number)
-    prepare_folder(folder / "scans", folder / "prep", SENSOR)
-    return folder / "prep"
-
-
 def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path):
-    given = prepared(tmp_path, [0, 1, 0, 1])
+    for place, number in enumerate([0, 1, 0, 1]):
+        full_scan(tmp_path / "scans" / f"{place}.npy", number)
+    given = prepare_folder(tmp_path / "scans", tmp_path / "prep", SENSOR)
     asked = given, "--mask", "rows:2", "--scans"
     for most, numbers in ((1, [2]), (2, [1, 2, 3])):  # evenly spread
         assert complete(*asked, most)[0] == 0
@@ -261,8 +255,6 @@ def test_a_bad_scan_may_be_mended_and_the_command_given_again(complete, tmp_path
     assert complete(*asked)[0] == 2
     np.save(tmp_path / "in" / "b.npy", image)
     assert "1 scan written" in complete(*asked).said
-    full_scan(tmp_path / "in" / "b.npy", 0)
-    assert "another scan of the name b" in complete(*asked)[2]
 
 
 def test_an_unusual_scale_that_is_estimated_is_told(complete, tmp_path):

@@ -166,7 +166,6 @@ name=x stage=reflow data=pairs stage.init=run backbone=hdit
 name=x trainer.max_time=foo
 name=x --plugin nowhere.py
 --plugin
-name=x experiment=nope
 name=x 'chain={a: {init: b}}'
 name=x 'chain={a/b: {seed: 3}}'
 name=x experiment=demo chain.rf1=null

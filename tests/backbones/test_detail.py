@@ -5,7 +5,6 @@ import torch
 from tiny_backbones import PUBLISHED, image, tiny, untrained
 
 from r2flow.backbones.base import precondition
-from r2flow.errors import InputError
 
 T = torch.linspace(0, 1, 23, dtype=torch.float64)
 
@@ -38,12 +37,6 @@ def test_a_part_of_the_image_has_no_ring():
     part = model.cropped(torch.arange(16), torch.arange(16, 48))
     assert not any(getattr(module, "ring", False) for module in part.detail.modules())
     assert part(0.5, image()[..., 16:48]).shape == (2, 2, 16, 32)
-
-
-@pytest.mark.parametrize("detail", [[2], [0, 8], [2, 8, 8]])
-def test_a_path_that_cannot_be_built(detail):
-    with pytest.raises(InputError, match="detail must be 2 integers"):
-        untrained("hdit", detail=detail)
 
 
 @pytest.mark.parametrize("s", [0.3, 1.0, 2.0])

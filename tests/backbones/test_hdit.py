@@ -65,6 +65,7 @@ def test_autocast_does_not_round_the_image_at_the_ends():
         ({"num_heads": (1,)}, "num_heads must be 2 integers of at least 1"),
         ({"depths": (1, 0)}, "depths must be 2 integers of at least 1"),
         ({"num_heads": (3, 2)}, "16 channels cannot be shared by 3 heads"),
+        *(({"detail": detail}, "detail must be 2 integers") for detail in ([2], [0, 8], [2, 8, 8])),
         ({"attention": "tile"}, "no attention backend named 'tile'.*Did you mean 'tiles'"),
     ],
 )

@@ -13,6 +13,7 @@ from hydra.core.config_store import ConfigStore
 from r2flow import cli, plugins
 from r2flow.backbones import BACKBONES
 from r2flow.callbacks import CALLBACKS
+from r2flow.flow.losses import LOSSES
 from r2flow.generators import GENERATORS
 from r2flow.runs.composing import REGISTRIES
 from r2flow.samplers import SAMPLERS
@@ -57,7 +58,7 @@ ALL = (GAN, DDPM, COMPLETION, BACKBONE)
 @contextlib.contextmanager
 def loaded(*families: Family) -> Iterator[None]:
     """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
-    tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS, SAMPLERS), ConfigStore.instance()
+    tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS, SAMPLERS, LOSSES), ConfigStore.instance()
     choices = {group: copy.deepcopy(store.repo.get(group, {})) for group in REGISTRIES}  # Hydra's own stay
     before, known = [dict(table.items()) for table in tables], dict(plugins._loaded)
     try:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra.core.config_store import ConfigStore
 
 from r2flow import plugins
 from r2flow.backbones import BACKBONES
@@ -27,14 +26,10 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "street"
 
 
 @pytest.fixture(autouse=True)
-def choices_before() -> Iterator[None]:
-    """The choices that a test adds to Hydra's are forgotten again; other tests compose every choice."""
-    stored = ConfigStore.instance().repo
-    before = {group: set(stored.get(group, ())) for group in REGISTRIES}
-    yield
-    for group, names in before.items():
-        for name in set(stored.get(group, ())) - names:
-            del stored[group][name]
+def _as_before() -> Iterator[None]:
+    """What a test loads and adds is forgotten again; other tests compose every choice."""
+    with loaded():
+        yield
 
 
 def test_a_plugin_stands_anywhere_on_the_command_line():
@@ -44,11 +39,9 @@ def test_a_plugin_stands_anywhere_on_the_command_line():
     assert take_plugins(line) == (["sample", "x"], ["a.b", "./c.py"])
 
 
-def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path):
     deep = tmp_path / "deep.py"
     deep.write_text("from r2flow.backbones import BACKBONES\nBACKBONES.add('deep', BACKBONES['local'])\n")
-    monkeypatch.setattr(plugins, "_loaded", {})
-    monkeypatch.setattr(BACKBONES, "_entries", dict(BACKBONES._entries))
     load_plugins([str(deep)])
     run = build(compose(["backbone=deep", f"run_dir={tmp_path}/run"]))
     write_config(run.folder, run.config)
