@@ -2,7 +2,7 @@
 
 import json
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -109,20 +109,3 @@ def published_names(shared: Path, system: str) -> dict[str, list[int]]:
 
 def shapes_of(model: nn.Module) -> dict[str, list[int]]:
     return {name: list(value.shape) for name, value in model.state_dict().items()}
-
-
-def backbone_outputs(name: str, case: dict[str, Any]) -> Iterator[tuple[Tensor, Tensor]]:
-    """What a backbone computes and what is published, at times of their own and at one time.
-
-    The gradients of sum(output * grad_w) are the published to 1e-3: by x in full, by parameters in norm.
-    """
-    model, x = backbone_of(name, case), case["x"].clone().requires_grad_()
-    output = model(case["t"], x)
-    yield output, case["output"]
-    (output * case["grad_w"]).sum().backward()
-    assert relative(x.grad, case["grad_x"]) < 1e-3
-    for parameter_name, parameter in model.named_parameters():
-        expected = case["grad_param_norms"][parameter_name]
-        assert abs(parameter.grad.norm().item() - expected) <= 1e-3 * expected + 1e-6, parameter_name
-    with torch.no_grad():
-        yield model(case["t_scalar"], case["x"][:1]), case["output_t_scalar"]

@@ -6,15 +6,7 @@ from tiny_backbones import image, tiny, untrained
 
 from r2flow.backbones.hdit import Attention, BlockOptions, Neighbourhood
 from r2flow.errors import InputError
-from tests.reference import backbone_outputs, load_case, relative
-
-
-@pytest.mark.parametrize("name", ["hdit_16x192", "hdit_16x192_fourier_features", "hdit_16x64_dup"])
-def test_output_and_gradients_are_the_references(shared, name):
-    for found, expected in backbone_outputs("hdit", load_case(shared, f"{name}.pt")):
-        # relative to the norm: logit scales of 100 amplify rounding, and the reference itself, computed again in
-        # float64, differs from its float32 output by up to 1.2e-4 in single pixels
-        assert relative(found, expected) < 5e-5
+from tests.reference import load_case
 
 
 @pytest.mark.parametrize("index", range(4))
