@@ -24,16 +24,6 @@ def module(encoding: Encoding | None = None, **options) -> ScanDataModule:
     return data
 
 
-def test_validation_batches_are_the_same_every_time(numbered: Path):
-    data = module(name="folder", root=str(numbered), validation={"share": 0.5}, batch_size=4)
-    assert numbers(data.training_source) == list(range(6))
-    assert numbers(data.validation_source) == list(range(6, 12))
-    first, second = list(data.val_dataloader()), list(data.val_dataloader())
-    assert [len(batch["k"]) for batch in first] == [4, 2]
-    for a, b in zip(first, second, strict=True):
-        assert all(torch.equal(a[name], b[name]) for name in a)
-
-
 def mixed(tmp_path: Path, weights=(3, 1), **options) -> ScanDataModule:
     parts = [
         {"name": "folder", "root": str(folder_of(tmp_path / "a", 0, 8))},
