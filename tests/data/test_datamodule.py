@@ -153,6 +153,11 @@ def test_a_part_that_trains_on_what_another_holds_out_is_said(numbered: Path, tm
         assert bool(said) == bool(caplog.text)
 
 
+def test_scans_are_projected_as_the_run_says(numbered: Path):
+    with pytest.raises(InputError, match="neither ring after ring nor in whole firings"):  # of one point
+        module(name="folder", root=str(numbered), reading={"projection": "unfolding"})
+
+
 def test_validation_is_never_augmented(numbered: Path):
     options = {"name": "folder", "root": str(numbered), "validation": {"share": 0.5}}
     plain = next(iter(module(**options).val_dataloader()))
