@@ -105,8 +105,3 @@ def run_of(family: Family, folders: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def gan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_of(GAN, tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def completion(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_of(COMPLETION, tmp_path_factory)

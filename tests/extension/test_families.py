@@ -187,9 +187,9 @@ def test_verbs_take_it(shrunken_run: Path, tmp_path: Path):
     assert "shrunken" in r2flow("info", shrunken_run, SHRUNKEN.plugin).stdout
 
 
-def test_known_rays_are_given_back_and_the_others_depend_on_them(completion: Path):
+def test_known_rays_are_given_back_and_the_others_depend_on_them(tmp_path_factory: pytest.TempPathFactory):
     with loaded(COMPLETION):
-        checkpoint = load_checkpoint(completion)
+        checkpoint = load_checkpoint(run_of(COMPLETION, tmp_path_factory))
     space = checkpoint.generator.space
     mask = torch.zeros(2, 1, 16, 64)
     mask[:, :, ::2] = 1
