@@ -92,14 +92,6 @@ def test_what_is_unpacked_is_the_scan(farthest):
     np.testing.assert_allclose(np.stack([e, a]), RAYS.numpy(), atol=2e-7)
 
 
-def test_rays_of_no_grid_are_kept_pixel_by_pixel():
-    bent = RAYS.clone()
-    bent[1] += 0.01 * torch.arange(8.0)[:, None]
-    (rays,) = Parsed(page_of(*images(1), rays=bent)).data["rays"]
-    kept = np.frombuffer(base64.b64decode(rays["pixels"]), "<f4").reshape(2, 8, 32)
-    np.testing.assert_array_equal(kept, bent.numpy())
-
-
 def test_values_that_are_no_numbers_are_no_returns():
     image = images(1)[0]
     image[0, 0, :3] = np.nan, np.inf, -1

@@ -114,15 +114,13 @@ def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = No
 
 
 def _described(rays: np.ndarray) -> dict[str, Any]:
-    """Rays as elevations of rows and azimuths of columns if they determine all pixels, else per pixel."""
+    """Rays, (2, H, W), as elevations of rows and azimuths of columns, which all sensors have."""
     e, a = rays
     # The geometric mean of the median angles between neighbouring rows and columns, in radians.
     gaps = [float(np.median(np.abs(np.diff(x, axis=axis)))) for axis, x in enumerate((e, a)) if x.shape[axis] > 1]
     spacing = float(np.prod(gaps) ** (1 / len(gaps))) if gaps else 0.01
-    size = {"rows": e.shape[0], "columns": e.shape[1], "spacing": spacing}
-    if (e == e[:, :1]).all() and (a == a[:1]).all():
-        return {**size, "elevations": e[:, 0].round(7).tolist(), "azimuths": a[0].round(7).tolist()}
-    return {**size, "pixels": _text(rays.astype("<f4").tobytes())}
+    angles = {"elevations": e[:, 0].round(7).tolist(), "azimuths": a[0].round(7).tolist()}
+    return {"rows": e.shape[0], "columns": e.shape[1], "spacing": spacing, **angles}
 
 
 def _numbered(ids: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:

@@ -24,14 +24,13 @@ async function inflate(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Directions of a sensor's rays, (H W, 4), from elevations of rows and azimuths of columns, or from both per pixel. */
+/** Directions of a sensor's rays, (H W, 4), from elevations of rows and azimuths of columns. */
 function directionsOf(rays) {
   const { rows, columns } = rays;
   const found = new Float32Array(4 * rows * columns);
-  const given = rays.pixels && new Float32Array(bytesOf(rays.pixels).buffer);
   for (let i = 0; i < rows * columns; i++) {
-    const e = given ? given[i] : rays.elevations[Math.floor(i / columns)];
-    const a = given ? given[rows * columns + i] : rays.azimuths[i % columns];
+    const e = rays.elevations[Math.floor(i / columns)];
+    const a = rays.azimuths[i % columns];
     found[4 * i] = Math.cos(e) * Math.cos(a);
     found[4 * i + 1] = Math.cos(e) * Math.sin(a);
     found[4 * i + 2] = Math.sin(e);
