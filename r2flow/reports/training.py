@@ -1,8 +1,8 @@
 """Report at the end of training: loss curve, samples and files."""
 
 import csv
-import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,6 @@ from r2flow.model.checkpoint import checkpoints_of, load_checkpoint
 from r2flow.reports.outputs import what_next, write_samples
 from r2flow.reports.pages import STYLES, blank_figure
 from r2flow.reports.pictures import save_figure
-
-log = logging.getLogger(__name__)
 
 Curve = tuple[np.ndarray, np.ndarray]
 
@@ -33,17 +31,10 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
     folders = Path(run, "metrics").glob("version_*/metrics.csv")
     numbered = {int(number): path for path in folders if (number := path.parent.name.split("_")[1]).isdecimal()}
     for _, path in sorted(numbered.items()):
-        damaged = 0
-        lines = path.read_text(encoding="utf-8", errors="replace").replace("\0", "").splitlines()
-        for row in csv.DictReader(lines):
-            for name in names:
-                if row.get(name):
-                    try:  # Lightning logs the index of the current step.
-                        values[name][int(row["step"]) + 1] = float(row[name])
-                    except (TypeError, ValueError):  # a damaged line
-                        damaged += 1
-        if damaged:
-            log.warning("%s: ignored %d values that are not numbers", path, damaged)
+        for row in csv.DictReader(path.read_text(encoding="utf-8").splitlines()):
+            for name in (name for name in names if row.get(name)):
+                with suppress(TypeError, ValueError):  # a line cut by a kill or a full disk
+                    values[name][int(row["step"]) + 1] = float(row[name])  # Lightning logs the index of the step
     return {
         name: (np.array(sorted(points)), np.array([points[step] for step in sorted(points)]))
         for name, points in values.items()
