@@ -307,6 +307,7 @@ def test_the_network_is_computed_in_the_precision_that_is_asked_for():
 def test_a_samplers_name_may_have_fields_as_on_the_command_line():
     short = build_sampler("adams3", steps=2, finish=0.02)
     assert flow().generator.choose("adams3:steps=9:finish=0.02", steps=2) == short
+    assert build_sampler("euler:grid=[0,1e-3,1]").grid == (0, 0.001, 1)
     with pytest.raises(InputError, match="cannot be read"):
         flow().generator.choose("adams3:grid=[0")
     assert completing(flow().generator, "repaint:steps=2") == completing(flow().generator, "repaint", steps=2)

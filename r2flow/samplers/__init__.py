@@ -9,11 +9,8 @@ To add a sampler, derive a dataclass from `Sampler` and call `SAMPLERS.add(name,
 
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from functools import partial
 from typing import Any
-
-import yaml
 
 from r2flow.errors import InputError, check
 from r2flow.flow.solvers import SOLVERS, usual_grid
@@ -73,18 +70,13 @@ SAMPLERS = _Samplers(
 
 def parse_sampler(text: str) -> dict[str, Any]:
     """Parse `NAME[:FIELD=VALUE]...`, as `sde:steps=16:grid=power:2`, into name and fields."""
+    from omegaconf import OmegaConf
+
     name, *fields = re.split(r":(?=\w+=)", text)
-    pairs = (word.partition("=") for word in fields)
-    return {"name": name, **{key: _plain(value) for key, _, value in pairs}}
-
-
-def _plain(text: str) -> Any:
-    with suppress(ValueError):  # YAML takes 1e-3 for a word
-        return int(text) if text.lstrip("-").isdigit() else float(text)
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise InputError(f"a sampler's value cannot be read: {text!r}.") from None
+        return {"name": name, **OmegaConf.to_object(OmegaConf.from_dotlist(fields))}  # type: ignore[dict-item]
+    except Exception as error:  # of YAML, or of an interpolation
+        raise InputError(f"a sampler's fields cannot be read: {text!r}.") from error
 
 
 def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
