@@ -107,9 +107,7 @@ def test_a_model_is_loaded_on_a_device_that_is_here(saved, device):
 def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, shared, tmp_path):
     published, out = shared / "oracle" / "published_format.pth", tmp_path / "out"
     drawn = ("--num", 1, "--steps", 1, "--pictures", 0, "--out", out)
-    code, _, error = r2flow("sample", published, *drawn, "--format", "npy,ply")
-    assert code == 0
-    assert error.count("points are written along rays through bin centres") == 1
+    assert r2flow("sample", published, *drawn, "--format", "npy,ply").returncode == 0
     assert json.loads((out / "manifest.json").read_text())["recipe"]["rays"] == "centre"
     h, w, image = 16, 192, np.load(out / "000000.npy")
     xyz = read_points(out / "000000.ply").xyz

@@ -1,6 +1,5 @@
 """Generated scans as files and pictures."""
 
-import logging
 import math
 import re
 import shlex
@@ -26,8 +25,6 @@ from r2flow.progress import Bar, track
 from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 from r2flow.reports.view import Panel, most_images, write_page
 from r2flow.store import MANIFEST, FileStore, read_manifest
-
-log = logging.getLogger(__name__)
 
 FORMATS = ("ply", "bin", "npy")
 OWN = re.compile(r"\d{6}\.(ply|bin|npy|png)|samples\.(png|html)")  # file names of samples
@@ -93,11 +90,6 @@ def _chosen(checkpoint: Checkpoint, formats: Sequence[str] | None) -> Sequence[s
     formats = fitting if formats is None else formats
     if other := [name for name in formats if name not in fitting]:
         raise InputError(f"--format {','.join(other)} cannot hold these scans; give some of {','.join(fitting)}.")
-    if {"ply", "bin"} & set(formats) and not torch.equal(checkpoint.generator.space.rays, checkpoint.sensor.rays()):
-        log.warning(
-            "the model uses rays through the corners of bins (rays=reference); points are written along rays through "
-            "bin centres, closer to the returns (docs/data.md, Projection)"
-        )
     return formats
 
 
