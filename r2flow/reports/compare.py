@@ -1,7 +1,6 @@
 """Comparison of runs: settings, losses, bend and cost."""
 
 import json
-import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -19,8 +18,6 @@ from r2flow.reports.pages import Page
 from r2flow.reports.tables import shown, table
 from r2flow.reports.training import CURVES, Curve, curves_figure, read_curves
 from r2flow.runs.folder import CONFIG, read_config
-
-log = logging.getLogger(__name__)
 
 # Column -> heading: equal for all seeds, and averaged over seeds.
 FIXED = {
@@ -52,7 +49,7 @@ Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ only 
 def find_runs(paths: Sequence[Path]) -> list[Path]:
     """Given run folders, and the runs in folders of runs (a chain, a sweep, a sweep of chains).
 
-    Other paths, as in `runs/sweep/*`, are skipped with a warning if there is any run.
+    Other paths, as in `runs/sweep/*`, are skipped if there is any run.
     """
     runs: list[Path] = []
     for path in paths:
@@ -61,9 +58,6 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     others = [path for path in paths if not any(run.is_relative_to(path) for run in runs)]
     if wrong := [path for path in others if not runs or not path.exists()]:
         raise InputError(f"{wrong[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
-    for path in others:
-        if path.suffix not in (".yaml", ".log"):  # files of a sweep's folder
-            log.warning("%s holds no run and is skipped.", path)
     return list(dict.fromkeys(runs))
 
 

@@ -155,13 +155,11 @@ def test_what_is_free_on_resumption_still_tells_configurations_apart(tmp_path, k
     assert len(group_runs(read_runs([tmp_path / "b", tmp_path / "c"]))) == 2
 
 
-def test_a_sweep_s_files_and_folders_without_a_run_are_passed_over(tmp_path, caplog):
+def test_a_sweep_s_files_and_folders_without_a_run_are_passed_over(tmp_path):
     make_run(tmp_path / "a")
     (tmp_path / "multirun.yaml").touch()
     (tmp_path / "logs").mkdir()
     assert find_runs(sorted(tmp_path.iterdir())) == [tmp_path / "a"]
-    assert "logs holds no run" in caplog.text
-    assert "multirun" not in caplog.text
     with pytest.raises(InputError, match="none is not a run"):
         find_runs([tmp_path / "a", tmp_path / "none"])
     with pytest.raises(InputError, match="logs is not a run"):
