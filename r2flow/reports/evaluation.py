@@ -81,7 +81,6 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     best = baselines[0][0] if baselines else math.inf
     title, factor = heading(metric, metric)
     unbiased = metric.startswith(UNBIASED)
-    equal = len(judged) > 1 and len({len(c.generated) for _, c in judged}) == 1
     lines = []
     for value, comparison in judged:
         as_many = None if unbiased else references.get(f"{comparison.name}{AS_MANY}")
@@ -108,10 +107,7 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
         bounds = [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
         if as_many:
             bounds.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
-        ratio = 0.0 if unbiased or judged[0][0] <= 0 else value / judged[0][0]
-        rank = "lowest, " if comparison is judged[0][1] else f"{ratio:.2f} times the lowest, " if ratio else ""
-        place = f"{comparison.name}: {rank if equal else ''}{title} {value * factor:.3g}"
-        lines.append(f"{place} ({', '.join(bounds)}): {judgement}.")
+        lines.append(f"{comparison.name}: {title} {value * factor:.3g} ({', '.join(bounds)}): {judgement}.")
     return lines
 
 
