@@ -54,10 +54,7 @@ class Cache:
         """Read the statistics of a key from `key_of`; None if missing or damaged."""
         try:
             states, notes = self._store(key).read(0)
-        except FileNotFoundError:
-            return None
-        except (Damaged, InputError) as error:
-            log.warning("statistics in %s are damaged (%s): recomputing them.", self.folder, error)
+        except (FileNotFoundError, Damaged, InputError):
             return None
         return Statistics({name: torch.from_numpy(value) for name, value in states.items()}, **notes)
 

@@ -198,8 +198,7 @@ class ScanMetric(Metric):
         with self.sync_context():
             names = [name for name in self._defaults if name.startswith("real_")]
             states = {name: self._numbered("real") if name == "real_rows" else getattr(self, name) for name in names}
-            wide = {name: s.float() if s.dtype == torch.bfloat16 else s for name, s in states.items()}  # as NumPy
-            return {name: state.detach().cpu().clone() for name, state in wide.items()}
+            return {name: state.detach().cpu().clone() for name, state in states.items()}
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
         """Load the real set's statistics from `real_state`, after `reset`; only on the first process."""
