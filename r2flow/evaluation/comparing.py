@@ -2,7 +2,6 @@
 
 import json
 import math
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -29,13 +28,12 @@ Pair = tuple[Kind, str, ScanSet, ScanSet]  # kind, name, real scans, scans compa
 
 @dataclass(frozen=True)
 class Comparison:
-    """Results of one set against another; the seconds include gathering the real statistics."""
+    """Results of one set against another."""
 
     name: str
     real: ScanSet
     generated: ScanSet
     measured: Sequence[MetricResult]
-    seconds: float
     kind: Kind = "judged"
 
     @property
@@ -87,7 +85,6 @@ class Comparer:
 
     def __call__(self, kind: Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
         """Compare two sets, or read the stored results."""
-        start = time.monotonic()
         path, results = self._path(real, other), None
         if path is not None:
             with suppress(OSError, ValueError, TypeError):  # missing or damaged
@@ -102,7 +99,7 @@ class Comparer:
                 results.append(speed_result(real, other))
             if path is not None and place()[0] == 0:
                 write_file(path, json.dumps([asdict(result) for result in results]))
-        return Comparison(name, real, other, results, time.monotonic() - start, kind)
+        return Comparison(name, real, other, results, kind)
 
     def _path(self, real: ScanSet, other: ScanSet) -> Path | None:
         """File of the results; None unless they are stored."""

@@ -220,7 +220,6 @@ def _plain_comparison(comparison: Comparison) -> dict[str, Any]:
         "comparison": comparison.name,
         "kind": comparison.kind,
         **{side: {"set": s.label, "scans": len(s), **s.about} for side, s in sets.items()},
-        "seconds": round(comparison.seconds, 2),
         "metrics": [
             asdict(result) | {"printed": {r["printed_as"]: r["printed"] for r in rows if r["metric"] == result.metric}}
             for result in comparison.measured
