@@ -5,6 +5,7 @@ import hashlib
 import json
 import zlib
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,12 +14,14 @@ import torch
 from r2flow import load
 from r2flow.errors import InputError
 from r2flow.lidar.labels import CLASSES
+from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import Draws
 from r2flow.reports.view import MOST, Panel, page
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
+from tests.conftest import ground
 from tests.simulator.test_folder import write_folder
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
@@ -149,6 +152,13 @@ def test_what_does_not_fit_is_refused():
 
 
 class TestTheVerb:
+    @pytest.fixture
+    def scan(self, tmp_path: Path) -> Path:
+        """A scan of the ground 1.73 m below, as a KITTI .bin."""
+        sensor = SENSORS["hdl64e"]
+        write_points(tmp_path / "ground.bin", *image_to_points(ground(sensor), sensor.rays()))
+        return tmp_path / "ground.bin"
+
     def test_shows_files_and_says_how_many_of_a_folder(self, r2flow, scan, tmp_path):
         many = tmp_path / "many"
         many.mkdir()

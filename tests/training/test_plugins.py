@@ -42,6 +42,7 @@ def test_a_plugin_stands_anywhere_on_the_command_line():
 def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path):
     deep = tmp_path / "deep.py"
     deep.write_text("from r2flow.backbones import BACKBONES\nBACKBONES.add('deep', BACKBONES['local'])\n")
+    plugins._loaded.clear()  # of other tests of this process
     load_plugins([str(deep)])
     run = build(compose(["backbone=deep", f"run_dir={tmp_path}/run"]))
     write_config(run.folder, run.config)
