@@ -205,7 +205,7 @@ def test_the_page_is_written_with_its_picture(tmp_path):
 def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path):
     run = make_run(tmp_path / "run", train=[2.0, 1.0, 0.5], checkpoint=3)
     log = run / "metrics" / "version_0" / "metrics.csv"
-    log.write_bytes(log.read_bytes() + b"3,0.2" + b"\0" * 40 + b"\n4,0.x\n")
+    log.write_bytes(log.read_bytes() + b"3,0.2" + b"\0\xff" * 20 + b"\n4,0.x\n")
     (run / "metrics" / "version_x").mkdir()
     (run / "metrics" / "version_x" / "metrics.csv").touch()
     steps, values = read_curves(run)["train/loss"]
