@@ -55,7 +55,7 @@ class Bar(Progress):
         done = task.completed - before
         if self._lines and done > 0 and now - self._printed >= EVERY:
             self._printed, rate = now, done / (now - began)
-            left = timedelta(seconds=round(max((task.total or 0) - task.completed, 0) / rate))
+            left = timedelta(seconds=min(round(max((task.total or 0) - task.completed, 0) / rate), 10**13))
             counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
             print(f"{counted}  {rate:.2f}/s  {left} left", file=sys.stderr, flush=True)
 
