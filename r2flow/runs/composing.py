@@ -50,14 +50,14 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
     for name, given in ("overrides", overrides), ("folders", folders):
         check(not isinstance(given, str), f"{name} are a list, as {[given]}; found a text.")
     search = [f"file://{Path(folder).resolve()}" for folder in folders]
-    overrides = [*as_hydra_takes(overrides), override("hydra.searchpath", search)]
-    try:
-        with _hydra():
+    with _hydra():  # also where a mistake is explained, by its choices
+        try:
+            overrides = [*as_hydra_takes(overrides), override("hydra.searchpath", search)]
             config = with_choices(partial(hydra.compose, "train", overrides, return_hydra_config=True))
             HydraConfig.instance().set_config(config)
             return plain(config)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise InputError(explain(error)) from None
+        except (HydraException, OmegaConfBaseException) as error:
+            raise InputError(explain(error)) from None
 
 
 IN_RUNS = Bound("that names a folder in runs", lambda text: text.strip("./") and ".." not in Path(text).parts)
