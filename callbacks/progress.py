@@ -3,12 +3,12 @@
 import math
 import sys
 import time
-from datetime import timedelta
 from typing import Any
 
 import lightning as L
 from lightning.pytorch.callbacks import RichProgressBar
 
+from r2flow.progress import duration
 from r2flow.registry import NonNegative
 
 
@@ -57,7 +57,7 @@ class Progress(RichProgressBar):
             return
         self._last_line = now
         per_step = (now - self._begin[0]) / max(trainer.global_step - self._begin[1], 1)
-        left = timedelta(seconds=min(round((trainer.max_steps - trainer.global_step) * per_step), 10**13))
+        left = duration((trainer.max_steps - trainer.global_step) * per_step)
         loss = float(trainer.callback_metrics.get("train/loss", math.nan))
         self._print(trainer, f"loss {loss:.4f}  {self._rate(trainer):.1f} scans/s  {left} left")
 

@@ -3,7 +3,6 @@
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from datetime import timedelta
 from operator import length_hint
 from typing import TypeVar
 
@@ -55,7 +54,7 @@ class Bar(Progress):
         done = task.completed - before
         if self._lines and done > 0 and now - self._printed >= EVERY:
             self._printed, rate = now, done / (now - began)
-            left = timedelta(seconds=min(round(max((task.total or 0) - task.completed, 0) / rate), 10**13))
+            left = duration(max((task.total or 0) - task.completed, 0) / rate)
             counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
             print(f"{counted}  {rate:.2f}/s  {left} left", file=sys.stderr, flush=True)
 
@@ -73,3 +72,10 @@ def track(items: Iterable[T], doing: str, unit: str = "", total: int | None = No
         for item in items:
             yield item
             bar()
+
+
+def duration(seconds: float) -> str:
+    """75 -> '1:15', 3700 -> '1:01:40'."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
