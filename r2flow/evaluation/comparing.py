@@ -92,9 +92,10 @@ class Comparer:
         if results is None:
             if id(real) not in self._statistics:
                 self._statistics[id(real)] = gather_real(self.metrics, real, self.work, self.cache, self.rules)
-                filled = any(one.empty < one.scans for one in self._statistics[id(real)].values())
-                check(filled or kind == "reference", f"{real.label}: none of its {len(real)} scans has a return.")
-            results = measure(self.metrics, self._statistics[id(real)], other, self.work, self.rules)
+            statistics = self._statistics[id(real)]
+            filled = kind == "reference" or any(one.empty < one.scans for one in statistics.values())
+            check(filled, f"{real.label}: none of its {len(real)} scans has a return.")
+            results = measure(self.metrics, statistics, other, self.work, self.rules)
             if other.source.drawn:
                 results.append(speed_result(real, other))
             if path is not None and place()[0] == 0:
