@@ -114,7 +114,7 @@ class Checkpoint:
             check(state is None, "a scan file has the states of its rays: give no state.")
             self, scans, remarks = self.open_partial([str(images)], sensor)
             for lost in remarks[1:]:
-                warnings.warn(lost.removeprefix(f"{images}: "), stacklevel=2 + ("points in memory " in str(images)))
+                warnings.warn(lost.removeprefix(f"{images}: "), stacklevel=2)
             seen = [scan.read() for scan in scans]
             images = torch.from_numpy(np.stack([one.image for one in seen]))
             state = torch.from_numpy(np.stack([one.state for one in seen]))
