@@ -100,13 +100,9 @@ def provenance(page: Page) -> dict[str, Any]:
     }
 
 
-def blank_figure(width: float, height: float, title: str = "") -> Figure:
-    """Create an empty figure, sized in inches, at least as wide as its title."""
-    width = max(width, 0.08 * len(title))  # a letter is about 0.075 inches wide
-    figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
-    if title:
-        figure.suptitle(title, fontsize=11)
-    return figure
+def blank_figure(width: float, height: float) -> Figure:
+    """Create an empty figure, sized in inches."""
+    return Figure(figsize=(width, height), facecolor="white", layout="constrained")
 
 
 def _json(page: Page, origin: Mapping[str, Any]) -> str:

@@ -73,8 +73,8 @@ def paper_page(
 
     Figures 5 and 7 have `num` scans per generator, figure 8 four paths of `steps` Euler steps.
     """
-    known = {weights_hash(run.checkpoint): run for run in runs}
-    evaluated = [{**row, "role": known[row["weights"]].role} for row in rows if row["weights"] in known]
+    run_of = {weights_hash(run.checkpoint): run for run in runs}
+    evaluated = [{**row, "role": run_of[row["weights"]].role} for row in rows if row["weights"] in run_of]
     names = ", ".join(f"{run.label} ({run.role})" for run in runs)
     check(evaluated or not rows, f"the results are of other models or checkpoints than {names}: evaluate these.")
     architectures = architecture_rows(runs, evaluated, device)
@@ -98,7 +98,7 @@ def paper_page(
         None if scans is None else _birds_eye(scans, runs[0].checkpoint),
     )
     if metrics := [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in evaluated)]:
-        labelled = [{**row, "flow": f"{known[row['weights']].label} ({row['role']})"} for row in evaluated]
+        labelled = [{**row, "flow": f"{run_of[row['weights']].label} ({row['role']})"} for row in evaluated]
         figures["figure_6"] = speed_figure(labelled, metrics)
     figures["figure_7"] = scans_figure(runs, samples, scans)
     if solvable := [run for run in flows if not run.checkpoint.generator.fixed]:

@@ -7,7 +7,6 @@ import torch
 
 import r2flow
 from r2flow.reports.pages import STYLES, Page, blank_figure, command, write_page
-from r2flow.reports.pictures import figure_pixels
 from r2flow.reports.tables import print_table, shown, table
 
 ROWS = [
@@ -17,7 +16,7 @@ ROWS = [
 
 
 def page(**changes) -> Page:
-    figure = blank_figure(3, 2, "title")
+    figure = blank_figure(3, 2)
     figure.add_subplot().plot([0, 1], [0, 1], **STYLES[0])
     given = {
         "name": "speed", "title": "How fast", "text": ["First.", table(ROWS, {"solver": "solver", "error": "RMS"})],
@@ -64,13 +63,6 @@ def test_a_page_that_fails_leaves_the_old_one(tmp_path):
     with pytest.raises(TypeError):
         write_page(page(rows=[{"solver": object()}]), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix not in (".png", ".pdf")} == before
-
-
-def test_a_figure_is_as_wide_as_its_title():
-    figure = blank_figure(2, 2, "Each metric's first figure, generated scans and real ones")
-    figure_pixels(figure)
-    title = figure.texts[0].get_window_extent()
-    assert 0 <= title.x0 < title.x1 <= figure.bbox.width
 
 
 @pytest.mark.parametrize(
