@@ -71,21 +71,19 @@ class Store:
         return [self.folder / f"{self.kind}-{item:06d}.safetensors"]
 
     def check(self) -> bool:
-        """Whether the folder has a manifest; refuses a folder with another recipe or with scans."""
+        """Whether the folder has a manifest; refuses a folder with scans, or with anything of another recipe."""
         if (self.folder / MANIFEST).is_file():
             recipe = read_manifest(self.folder, self.kind)["recipe"]
             if other := [*differences(recipe, self.described).values()]:
-                kind = self.kind.replace("simulated", "simulated scans")
+                if len(os.listdir(self.folder)) == 1:
+                    return False  # its command was refused before it made anything
                 raise InputError(
-                    f"{self.folder} holds other {kind}: {at_most_three(other)}. Give the same settings, or "
-                    f"another folder by {self.option}."
+                    f"{self.folder} holds other {self.kind.replace('simulated', 'simulated scans')}: "
+                    f"{at_most_three(other)}. Give the same settings, or another folder by {self.option}."
                 )
             return True
-        scan = next((path for path in self.folder.glob("*") if path.name.endswith(FIRM_ENDINGS)), None)
-        if scan is not None:
-            raise InputError(
-                f"{self.folder} holds scans ({scan.name}) and no {MANIFEST}: give another folder by {self.option}."
-            )
+        scan = next((path.name for path in self.folder.glob("*") if path.name.endswith(FIRM_ENDINGS)), None)
+        check(not scan, f"{self.folder} holds scans ({scan}) and no {MANIFEST}: give another folder by {self.option}.")
         return False
 
     def begin(self, **notes: Any) -> None:

@@ -51,9 +51,6 @@ def test_validation_covers_every_scan_once_over_the_ranks():
     assert parts[0] == [[(0, 0), (3, 3)], [(6, 6), (9, 9)]]
 
 
-SIZES, WEIGHTS = [5, 40, 3], [3.0, 1.0, 4.0]
-
-
 def values(source) -> list[int]:
     return [int(source[i][0, 0, 0]) for i in range(len(source))]
 
@@ -70,12 +67,13 @@ def test_parts_lie_end_to_end():
 
 
 def test_weights_are_the_shares_of_the_images():
-    order = MixedOrder(SIZES, WEIGHTS, seed=1)
-    parts = np.bincount(np.searchsorted(np.cumsum(SIZES), [order[k] for k in range(8000)], side="right")) / 8000
+    sizes, weights = [5, 40, 3], [3.0, 1.0, 4.0]
+    order = MixedOrder(sizes, weights, seed=1)
+    parts = np.bincount(np.searchsorted(np.cumsum(sizes), [order[k] for k in range(8000)], side="right")) / 8000
     np.testing.assert_allclose(parts, [3 / 8, 1 / 8, 4 / 8], atol=0.02)  # standard deviation at most 0.0056
     first = [index for k in range(8000) if (index := order[k]) < 5]
     np.testing.assert_allclose(np.bincount(first) / len(first), [0.2] * 5, atol=0.03)  # standard deviation 0.0073
-    assert [order[k] for k in (7999, 3)] == [MixedOrder(SIZES, WEIGHTS, seed=1)[k] for k in (7999, 3)]
+    assert [order[k] for k in (7999, 3)] == [MixedOrder(sizes, weights, seed=1)[k] for k in (7999, 3)]
 
 
 def test_what_cannot_be_mixed_is_refused():

@@ -283,8 +283,9 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tm
 def test_a_scan_that_has_no_reflectance_among_others_is_a_bad_one(tmp_path: Path):
     for number in range(40):
         write_cloud(tmp_path / "scans" / f"{number:02d}.ply", number, levels=None if number == 1 else 100)
-    with pytest.raises(InputError, match=r"01.ply has no reflectance"):
-        make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    for convention in ("centre", "reference"):  # nothing is made, so that the folder takes another recipe
+        with pytest.raises(InputError, match=r"01.ply has no reflectance"):
+            make(tmp_path / "out", plan_of(tmp_path / "scans", convention=convention))
 
 
 # At any number of attempts, by any number of processes; test_pairs.py has stores that several commands share
