@@ -14,7 +14,7 @@ from torch import nn
 import r2flow
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import sampled_set
-from r2flow.generators import Generator, Sampler, build_generator
+from r2flow.generators import Generated, Generator, Sampler, build_generator
 from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.region import region
@@ -304,13 +304,20 @@ def test_the_network_is_computed_in_the_precision_that_is_asked_for():
     assert sampled_set(one, "", 2).about != sampled_set(network(), "", 2).about
 
 
+@pytest.mark.parametrize("made", [Generated.after(torch.zeros(1, 2, 8, 16), 1), torch.zeros(2, 2, 8, 16), None])
+def test_a_sampler_that_gives_other_than_a_scan_for_each_noise_is_refused(made):
+    generator = flow().generator
+    with pytest.raises(InputError, match="must give a Generated of 2 scans"):
+        generator(torch.zeros(2, *generator.noise_shape), sampler=mock.MagicMock(draws=False, return_value=made))
+
+
 def test_a_samplers_name_may_have_fields_as_on_the_command_line():
     short = build_sampler("adams3", steps=2, finish=0.02)
     assert flow().generator.choose("adams3:steps=9:finish=0.02", steps=2) == short
     assert build_sampler("euler:grid=[0,1e-3,1]").grid == (0, 0.001, 1)
     with pytest.raises(InputError, match="cannot be read"):
         flow().generator.choose("adams3:grid=[0")
-    assert completing(flow().generator, "repaint:steps=2") == completing(flow().generator, "repaint", steps=2)
+    assert completing(flow().generator, "repaint:steps=010") == completing(flow().generator, "repaint", steps=10)
 
 
 def test_settings_may_be_numpy_s_and_torch_s():

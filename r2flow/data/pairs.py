@@ -176,9 +176,8 @@ class PairSource:
 
     def __init__(self, store: PairStore) -> None:
         self.store = store
-        if lacking := store.missing_pairs():
-            num = store.options.num
-            raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
+        lacking, num = store.missing_pairs(), store.options.num
+        check(not lacking, f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
         usable = [flag for shard in store.shards for flag in store.head(shard)["usable"]]
         self.indices = np.flatnonzero(usable[: store.options.num])
         self.times = {"times": store.sampler.knot_times(store.knots).float()} if store.knots else {}

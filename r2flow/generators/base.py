@@ -134,7 +134,10 @@ class Generator(nn.Module):
         conditions = condition and {name: value.to(self.device) for name, value in condition.items()}
         noise_of_step = None if draws is None else lambda j: self.further_noise(draws, j).to(x)
         with autocast(self.device, precision):
-            return how(self, x, conditions, noise_of_step, progress or (lambda: None))
+            made = how(self, x, conditions, noise_of_step, progress or (lambda: None))
+        whole = isinstance(made, Generated) and len(made.x) == len(x)
+        check(whole, f"sampler {how.name} must give a Generated of {len(x)} scans, one for each noise.")
+        return made
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
         """Noise of step j."""
@@ -156,10 +159,8 @@ class Generator(nn.Module):
         if name in (None, default.name):
             sampler = default.changed(**given)
         else:
-            names = options_of(SAMPLERS[name])
-            sampler = build_sampler(
-                {"name": name, **({"steps": steps} if "steps" in names and "grid" not in given else {}), **given}
-            )
+            kept = {"steps": steps} if "steps" in options_of(SAMPLERS[name]) and "grid" not in given else {}
+            sampler = build_sampler({"name": name, **kept, **given})
         sampler.check(self)
         return sampler
 
