@@ -81,12 +81,10 @@ class Stage(L.LightningModule):
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         """Refuse a config's `data` that the stage of this name cannot train on."""
         on_pairs = data["name"] == "pairs"
-        if self.needs_pairs and not on_pairs:
-            raise InputError(f"stage={name} learns from pairs: give data=pairs, found {data['name']}.")
+        check(on_pairs or not self.needs_pairs, f"stage={name} learns from pairs: give data=pairs, not {data['name']}.")
         if data.get("scans") is not None:
             raise InputError(f"stage={name} learns from pairs alone: leave data.scans out, or give stage=flow_map.")
-        if on_pairs and not self.needs_pairs:
-            raise InputError(f"stage={name} learns from scans, not from data=pairs; give stage=reflow.")
+        check(self.needs_pairs or not on_pairs, f"stage={name} learns from scans, not data=pairs; give stage=reflow.")
         if not self.several_sensors and any(part.get("sensor") for part in data.get("parts") or ()):
             raise InputError(f"stage={name} learns from scans of one sensor: leave sensor out of data.parts.")
 
@@ -166,6 +164,8 @@ class SingleLoss(Stage):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss = self.regression_loss(batch, batch["u"])
+        usable = isinstance(loss, Tensor) and loss.numel() == 1 and loss.requires_grad
+        check(usable, f"regression_loss of a {type(self).__name__} must be one number with a gradient.")
         part = batch_idx % (self._trainer.accumulate_grad_batches if self._trainer else 1)
         self._sum = loss.detach() + (self._sum if part else 0.0)
         self.log("train/loss", self._sum / (part + 1), prog_bar=True, sync_dist=True)

@@ -89,6 +89,13 @@ def test_the_logged_loss_is_the_mean_over_the_parts_of_a_step(tmp_path):
     assert trainer.callback_metrics["train/loss"] == (4 + 8) / 2
 
 
+@pytest.mark.parametrize("loss", [None, 1.0, torch.ones(()), torch.ones(2, requires_grad=True)])
+def test_a_loss_without_a_gradient_or_of_many_numbers_is_refused(loss):
+    stage = type("Wrong", (Given,), {"regression_loss": lambda *_: loss})(Linear())
+    with pytest.raises(InputError, match="regression_loss of a Wrong must be one number with a gradient"):
+        stage.training_step({"u": torch.zeros(2)}, 0)
+
+
 class Slope(Stage):
     """One step of SGD, of the length of its clipped gradient."""
 
