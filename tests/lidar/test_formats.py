@@ -142,8 +142,8 @@ def test_tables_of_arrow(tmp_path: Path):
     parquet.write_table(pyarrow.table({"x": ["a"], "y": [1.0], "z": [1.0]}), tmp_path / "b.parquet")
     with pytest.raises(InputError, match="in the place of"):
         read_points(tmp_path / "b.parquet")
-    parquet.write_table(pyarrow.table({"points": [[1.0, 2.0]]}), tmp_path / "c.parquet")
-    with pytest.raises(InputError, match="no field x, y, z; it has: points"):
+    parquet.write_table(pyarrow.table({"points": [[1.0]], "intensity": [1.0]}), tmp_path / "c.parquet")
+    with pytest.raises(InputError, match="no field x, y, z; it has: points, intensity"):
         read_points(tmp_path / "c.parquet")
 
 
@@ -244,14 +244,11 @@ def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Pat
     table = np.zeros(500, kinds)
     for name, column in zip("xyz", F4.T, strict=True):
         table[name] = column
-    np.save(tmp_path / "none.npy", table)
-    same(read_points(tmp_path / "none.npy"), intensity=np.zeros(500))
-    table["reflectivity"] = INTENSITY
-    np.save(tmp_path / "one.npy", table)
-    same(read_points(tmp_path / "one.npy"))
-    table["intensity"] = 7
-    np.save(tmp_path / "both.npy", table)
-    same(read_points(tmp_path / "both.npy"), intensity=np.full(500, 7))
+    sevens = np.full(500, 7)
+    for reflectivity, intensity, read in ((0, 0, 0 * sevens), (INTENSITY, 0, INTENSITY), (INTENSITY, sevens, sevens)):
+        table["reflectivity"], table["intensity"] = reflectivity, intensity
+        np.save(tmp_path / "a.npy", table)
+        same(read_points(tmp_path / "a.npy"), intensity=read)
 
 
 @pytest.mark.parametrize("kind", ["S3", "(2,)f4", "(1,)f4", "c8"])

@@ -12,7 +12,7 @@ import numpy as np
 
 from r2flow.errors import check, require
 from r2flow.lidar.scan_files.clouds import Table
-from r2flow.lidar.scan_files.points import MOST_COLUMNS, ROLES
+from r2flow.lidar.scan_files.points import MOST_COLUMNS, ROLES, find_roles
 
 MOST_UNPACKED = 100  # maximum expansion of a compressed file, plus 1 MiB
 TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar", "scan", "data", "arr_0")
@@ -66,7 +66,7 @@ def read_npz(path: Path) -> Table:
 def _named(names: Iterable[str]) -> list[str]:
     """The names that are columns of points."""
     roles = {alias for aliases in ROLES.values() for alias in aliases}
-    return [name for name in names if name.lower() in roles]
+    return [name for name in names if name.lower().removeprefix("scalar_") in roles]
 
 
 def read_array(file: IO[bytes], size: int) -> np.ndarray:
@@ -138,11 +138,12 @@ def read_arrow(path: Path) -> Table:
     if path.name.lower().endswith(".parquet"):
         file = parquet.ParquetFile(path)
         check_unpacked(path, 8 * file.metadata.num_rows)  # run-length encoded values take no bytes
-        table = file.read(_named(file.schema_arrow.names) or None)
+        find_roles(file.schema_arrow.names)  # refuses a table with all of its names
+        table = file.read(_named(file.schema_arrow.names))
     else:
         with pyarrow.memory_map(str(path)) as source:
-            names = _named(pyarrow.ipc.open_file(source).schema.names)
-        table = feather.read_table(path, names or None, memory_map=False)
+            find_roles(names := pyarrow.ipc.open_file(source).schema.names)
+        table = feather.read_table(path, _named(names), memory_map=False)
     table.validate(full=True)
     return table.column_names, [column.to_numpy() for column in table.columns]
 
