@@ -207,7 +207,7 @@ class ModelSpace:
             scans. Reflectance is 0 if the images have none.
         """
         images, rays = torch.as_tensor(images), self.sensor.rays()
-        check(images.ndim == 4, f"range images have the shape (B, 2 or 1, H, W), found {tuple(images.shape)}.")
+        check(images.ndim == 4 and images.shape[1] < 3, f"images are (B, 2 or 1, H, W), found {tuple(images.shape)}.")
         clouds = (image_to_points(image, rays) for image in images.float().cpu().numpy())
         return [np.column_stack(cloud) for cloud in clouds]
 

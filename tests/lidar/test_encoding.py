@@ -18,9 +18,7 @@ def test_encode_then_decode_is_exact_to_a_millimetre_or_to_float32(sensor, forma
     r[:, ::5, ::7] = 0
     image = torch.cat([r, torch.rand(r.shape) * (r > 0)]) if reflectance else r
     if format == "inverse_depth":  # which has no tolerance at the limits, where float32 may lose a range
-        image[0][image[0] > 0] = image[0][image[0] > 0].clamp(
-            sensor.min_range * (1 + 2e-5), sensor.max_range * (1 - 2e-5)
-        )
+        image[0] = image[0].clamp(sensor.min_range * (1 + 2e-5), sensor.max_range * (1 - 2e-5)) * (image[0] > 0)
     encoding = Encoding(sensor, format, reflectance)
     x = encoding.encode(image[None])
     assert x.shape == (1, encoding.channels, *sensor.shape)
@@ -77,20 +75,12 @@ def test_points_lie_along_the_middles_of_the_pixels(rays):
     empty, (point,) = space.points(images)[1], space.points(images)[0]
     flat = 10 * np.cos(np.pi / 6) * np.sqrt(0.5)  # x = y at 45 degrees; z = 10 sin 30
     np.testing.assert_allclose(point, [flat, flat, 5.0, 0.25], rtol=1e-6)
+    np.testing.assert_allclose(space.points(images[:1, :1])[0], [[flat, flat, 5.0, 0]], rtol=1e-6)  # of range alone
     assert empty.shape == (0, 4)
     assert empty.dtype == point.dtype == np.float32
 
 
-def test_points_of_range_alone_have_no_reflectance():
-    space = ModelSpace(SENSOR, Encoding(SENSOR, reflectance=False), SENSOR.rays())
-    (points,) = space.points(torch.full((1, 1, 2, 4), 7.0))
-    np.testing.assert_allclose(np.linalg.norm(points[:, :3], axis=1), 7.0, rtol=1e-6)
-    assert points.shape == (8, 4)
-    assert (points[:, 3] == 0).all()
-
-
-@pytest.mark.parametrize("shape", [(2, 2, 4), (1, 2, 4, 2)])
+@pytest.mark.parametrize("shape", [(2, 2, 4), (1, 2, 4, 2), (1, 3, 2, 4)])
 def test_images_of_another_shape_are_refused(shape):
-    space = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays())
     with pytest.raises(InputError, match=r"\(.*2 or 1, H, W\)"):
-        space.points(torch.zeros(shape))
+        ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays()).points(torch.zeros(shape))
