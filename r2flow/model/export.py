@@ -154,7 +154,7 @@ def export(
     check(not (network and own), f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler.")
     steps = None if network else tableau(flow, how)
     if write is _write_onnx:
-        require("an .onnx", "export", "onnx", "onnxscript", "onnxruntime")
+        require("an .onnx", "export", "onnx", "onnxscript", *([] if network else ["onnxruntime"]))
     notes = _notes(checkpoint, how, steps)
     logging.getLogger(__name__).info("torch exports the network: this takes up to some minutes")
     with _quiet():
