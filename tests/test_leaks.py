@@ -3,11 +3,10 @@
 import gc
 import os
 from pathlib import Path
-from typing import Any
 
-import lightning as L
 import pytest
 import torch
+from lightning.pytorch.callbacks import LambdaCallback
 
 from r2flow.generators import build_generator
 from r2flow.model.sampling import sample
@@ -41,15 +40,6 @@ class Held:
         assert memory_now - memory < ALLOWED, self.noted
 
 
-class Noting(L.Callback):
-    def __init__(self, held: Held, every: int) -> None:
-        self.held, self.every = held, every
-
-    def on_train_batch_end(self, trainer: L.Trainer, *others: Any) -> None:
-        if trainer.global_step % self.every == 0:
-            self.held.note()
-
-
 @pytest.mark.parametrize("workers", [0, 2])
 def test_two_thousand_training_steps(scans, tmp_path, workers):  # noqa: F811
     options = tiny(
@@ -58,7 +48,8 @@ def test_two_thousand_training_steps(scans, tmp_path, workers):  # noqa: F811
         "loggers=[csv,tensorboard]",
     )  # fmt: skip
     run, held = build(compose(options)), Held()
-    run.trainer.callbacks.append(Noting(held, 400))
+    noting = LambdaCallback(on_train_batch_end=lambda trainer, *_: trainer.global_step % 400 or held.note())
+    run.trainer.callbacks.append(noting)
     assert fit(run).finished
     assert len(held.noted) == 5
     held.check()
