@@ -3,6 +3,7 @@ from types import SimpleNamespace
 import lightning as L
 import pytest
 import torch
+from lightning.pytorch.callbacks import LambdaCallback
 from torch import nn
 
 from r2flow.callbacks.ema import DECAYS, EMA, averaged_weights
@@ -45,38 +46,34 @@ class Scripted(L.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.0)
 
 
-class Watch(L.Callback):
-    def __init__(self, ema: EMA) -> None:
-        self.ema, self.trace = ema, []
+def trained(ema: EMA, values: list[float], tmp_path) -> tuple[Scripted, list[tuple[float, float]]]:
+    """(weight, average) after each step, and the module, which is validated after the last."""
+    module, trace, loader = Scripted(values), [], torch.utils.data.DataLoader(range(len(values)))
 
-    def on_train_batch_end(self, trainer, pl_module, *rest):
-        with averaged_weights(trainer, pl_module):
-            average = pl_module.weight.item()
-        self.trace.append((pl_module.weight.item(), average))
+    def look(trainer, *_):
+        with averaged_weights(trainer, module):
+            average = module.weight.item()
+        trace.append((module.weight.item(), average))
 
-
-def trainer(callbacks: list[L.Callback], steps: int, tmp_path, **options) -> L.Trainer:
-    return quiet_trainer(tmp_path, max_steps=steps, callbacks=callbacks, num_sanity_val_steps=0, **options)
+    callbacks = [ema, LambdaCallback(on_train_batch_end=look)]
+    trainer = quiet_trainer(tmp_path, max_steps=len(values), callbacks=callbacks, num_sanity_val_steps=0)
+    trainer.fit(module, loader, loader)
+    return module, trace
 
 
 def test_the_average_follows_the_reference_s_trace(shared, tmp_path):
     reference = torch.load(shared / "oracle" / "training.pt", weights_only=False)["ema"]
     values = [raw for _, raw, _, _ in reference["trace"]]
-    watch = Watch(ema := EMA(reference["beta"], reference["update_every"], reference["update_after_step"]))
-    loader = torch.utils.data.DataLoader(range(len(values)))
-    trainer([ema, watch], len(values), tmp_path).fit(Scripted(values), loader)
-    assert len(watch.trace) == len(values)
-    for (raw, average), (_, expected_raw, expected, _) in zip(watch.trace, reference["trace"], strict=True):
+    ema = EMA(reference["beta"], reference["update_every"], reference["update_after_step"])
+    _, trace = trained(ema, values, tmp_path)
+    for (raw, average), (_, expected_raw, expected, _) in zip(trace, reference["trace"], strict=True):
         assert raw == pytest.approx(expected_raw, abs=1e-6)
         assert average == pytest.approx(expected, abs=1e-5)
 
 
 def test_validation_sees_the_average_and_leaves_the_weights(tmp_path):
-    module = Scripted([1.0, 2.0, 3.0, 4.0])
-    watch = Watch(ema := EMA(decay=0.5, every=1, warmup_steps=0))
-    loader = torch.utils.data.DataLoader(range(4))
-    trainer([ema, watch], 4, tmp_path, val_check_interval=4, check_val_every_n_epoch=None).fit(module, loader, loader)
-    raw, average = watch.trace[-1]
+    module, trace = trained(EMA(decay=0.5, every=1, warmup_steps=0), [1.0, 2.0, 3.0, 4.0], tmp_path)
+    raw, average = trace[-1]
     assert raw == 4.0
     # By hand: decays 0, 1 - 2^(-2/3) = 0.370, then 0.5, 0.5 at most: 1 -> 1.630 -> 2.315 -> 3.157.
     assert average == pytest.approx(3.1575, abs=1e-3)
@@ -103,8 +100,7 @@ def test_a_look_at_a_float32_average_of_bfloat16_leaves_what_the_module_counts()
 @pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (3, 2), (3, 6), (3, 10), (20, 15)])
 def test_a_run_that_ends_before_its_average_begins_has_the_weights_that_it_learned(tmp_path, warmup: int, steps: int):
     """Until then the average is that of the last copy; behind the warm-up it moves by half."""
-    watch = Watch(ema := EMA(0.5, every=10, warmup_steps=warmup))
     values = [float(n) for n in range(1, steps + 1)]
-    trainer([ema, watch], steps, tmp_path).fit(Scripted(values), torch.utils.data.DataLoader(torch.zeros(steps)))
+    _, trace = trained(EMA(0.5, every=10, warmup_steps=warmup), values, tmp_path)
     copied = [values[n - n % 10] for n in range(steps - 1)]
-    assert watch.trace == list(zip(values, [*copied, values[-1]], strict=True))
+    assert trace == list(zip(values, [*copied, values[-1]], strict=True))
