@@ -1,6 +1,5 @@
 """A GAN, a DDPM, a conditional flow and a backbone from files outside the package: every verb."""
 
-import ast
 import hashlib
 import json
 import shutil
@@ -137,16 +136,6 @@ def test_a_run_without_its_plugin_says_which_and_how(trained: tuple[Family, Path
         said = r2flow(*arguments).refusal
         assert f"no {kind} named '{name}'" in said
         assert f"give --plugin {FAMILIES / f'{family.file}.py'}." in said
-
-
-@pytest.mark.parametrize("file", sorted(FAMILIES.glob("*.py")), ids=lambda file: file.stem)
-def test_a_family_is_made_of_public_names(file: Path):
-    for node in ast.walk(ast.parse(file.read_text())):
-        names = [node.attr] if isinstance(node, ast.Attribute) else []
-        if isinstance(node, ast.ImportFrom):
-            names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
-        private = [name for name in names if name.startswith("_") and name != "__init__"]
-        assert not private
 
 
 SHRUNKEN = Family("sampler", "toy_sampler", ("sampler={name: shrunken, steps: 3, share: 0.25}",))
