@@ -10,9 +10,7 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
-from r2flow.models import find_model
 from r2flow.reports.chain import report
-from r2flow.runs import launch
 from r2flow.runs.chain import Link, is_finished, links_of
 from r2flow.runs.composing import compose
 from r2flow.training import build
@@ -26,29 +24,14 @@ LINKS = ("rf1", "rf2", "td2")
 SCANS_ALONE = ("data=", "sensor", "backbone", "data.root")
 
 
-def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatch, capsys):
-    said: list[str] = []
-    out = tmp_path / "preview" / "samples.png"
-
-    def write_samples(checkpoint, folder, num, seed):
-        assert checkpoint.path == find_model("street")
-        said.append(f"{num} scans")
-        folder.mkdir()
-        (folder / "samples.png").touch()
-
-    def run_chain(links, command):
-        said.append("chain")
-        return 2, True
-
-    monkeypatch.setattr(launch, "_check_links", lambda links: None)
-    monkeypatch.setattr(launch, "_config_folders", lambda: [])
-    monkeypatch.setattr("r2flow.reports.outputs.write_samples", write_samples)
-    monkeypatch.setattr("r2flow.runs.chain.run_chain", run_chain)
-    settings = compose(["experiment=demo", f"run_dir={tmp_path}"])
+def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    picture = tmp_path / "runs" / "demo" / "preview" / "samples.png"
+    drawn: list[int] = []
+    monkeypatch.setattr("r2flow.runs.chain.run_process", lambda _: drawn.append(picture.stat().st_mtime_ns) or 2)
     for _ in range(2):
-        assert launch._chain(settings, [], []) == 2
-    assert said == ["4 scans", "chain", "chain"]
-    assert capsys.readouterr().out.count(f"preview: scans of the model street in {out}") == 2
+        done = in_process(tmp_path, ["experiment=demo", "trainer.accelerator=cpu"], check=False)
+        assert "preview: scans of the model street in runs/demo/preview/samples.png" in done.stdout
+    assert drawn[0] == drawn[1]
 
 
 def of_a_child(*overrides: str) -> list[str]:
@@ -263,7 +246,6 @@ def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_optio
         # What only building finds out, in links that would run last.
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
-        (["+chain.td2.data.batch_size=3", "trainer.accumulate_grad_batches=2"], "chain.td2: data.batch_size=3"),
     ],
 )
 def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path: Path, overrides: list[str], message: str):
