@@ -1,7 +1,6 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-import omegaconf
 import pytest
 
 from r2flow.errors import InputError
@@ -53,19 +52,6 @@ def test_an_annotated_option_is_checked_as_what_it_annotates():
         check_options("thing", make, {"width": 1.5})
     with pytest.raises(InputError, match="thing: name must be a word or null or true or false, found 3"):
         check_options("thing", make, {"width": 1, "name": 3})
-
-
-def test_options_are_those_of_the_constructor_and_of_the_base_that_it_passes_them_to():
-    class Base:
-        def __init__(self, first, width: int, depth: int = 2, *, kind: str = "a"):
-            pass
-
-    class Child(Base):
-        def __init__(self, first, depth: int = 3, **options):
-            pass
-
-    assert options_of(Child, given=1) == {"depth": 3, "width": MISSING, "kind": "a"}
-    assert MISSING == omegaconf.MISSING
 
 
 def test_options_of_a_dataclass_have_values_of_their_own():
