@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.errors import InputError
-from r2flow.noise import PURPOSES, Draws, generator, standard_normal
+from r2flow.noise import PURPOSES, standard_normal
 
 
 def expected(seed: int, purpose: str, index: int, step: int = 0) -> torch.Tensor:
@@ -21,18 +20,3 @@ def expected(seed: int, purpose: str, index: int, step: int = 0) -> torch.Tensor
 )
 def test_a_draw_is_that_of_its_seed_purpose_index_and_step(purpose: str, seed: int, index: int, step: int):
     assert torch.equal(standard_normal((2, 4, 8), seed, purpose, index, step), expected(seed, purpose, index, step))
-
-
-@pytest.mark.parametrize("number", [-1, 2**64, 1.5])
-def test_a_seed_or_index_that_is_none_is_an_input_error(number):
-    for seed, index in ((number, 0), (0, number)):
-        with pytest.raises(InputError, match=f"found {number}"):
-            generator(seed, "evaluation", index)
-
-
-def test_scans_of_a_batch_are_drawn_by_their_numbers():
-    numbers = (4, 0, 2**40)
-    draws = Draws(7, numbers, "pairs")
-    assert torch.equal(draws.start((2, 4, 8)), torch.stack([expected(7, "pairs", i) for i in numbers]))
-    assert torch.equal(draws.step((2, 4, 8), 5), torch.stack([expected(7, "pairs", i, 5) for i in numbers]))
-    assert torch.equal(Draws(7, [3]).step((2, 4, 8), 5)[0], expected(7, "evaluation", 3, 5))
