@@ -109,15 +109,6 @@ def test_reflectance_that_was_not_given_is_completed():
     assert found[:, 1][returned].std() > 0
 
 
-def test_a_model_of_range_alone_leaves_reflectance_out():
-    images = scans()
-    found = network(reflectance=False).complete(images, halved(images), num=2)
-    assert found.shape == (2, 2, 1, *SHAPE)
-    assert torch.equal(found[:, 0, :, ::2], images[:, :1, ::2])
-    everything = network(reflectance=False).complete(images, ray_states(images))
-    assert torch.equal(everything[:, 0], images[:, :1])
-
-
 def test_without_states_a_ray_without_a_return_is_not_measured():
     images = scans()
     state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN))
