@@ -86,11 +86,8 @@ def lines_of(said: str) -> list[str]:
     return [line for line in said.splitlines() if not line.startswith(("INFO", "WARNING", "step "))]
 
 
-@pytest.mark.parametrize(("step", "workers"), [pytest.param(3, 0, marks=pytest.mark.slow), (6, 2)])
-def test_a_killed_run_ends_as_the_one_left_alone(
-    train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, step: int, workers: int
-):
-    options = ["name=killed", f"data.workers={workers}", *hold_at(step, tmp_path / "held")]
+def test_a_killed_run_ends_as_the_one_left_alone(train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path):
+    options = ["name=killed", "data.workers=2", *hold_at(6, tmp_path / "held")]
     stop_held(tmp_path / "held", signal.SIGKILL, tiny(scans, *options))
     done = train(*options)
     assert "resuming from" in done.stdout
