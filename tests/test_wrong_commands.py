@@ -6,7 +6,6 @@ command's own options, keys or values.
 
 import contextlib
 import inspect
-import logging
 import re
 import shlex
 import sys
@@ -227,15 +226,6 @@ def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
         assert listing(place) == before
 
     return check
-
-
-@pytest.fixture(autouse=True)
-def _quiet() -> Iterator[None]:
-    """What verbs set up for the whole process."""
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
-    yield
-    root.handlers[:], root.level = handlers, level
 
 
 @pytest.mark.parametrize("line", [*VERBS.strip().splitlines(), *wrong_places(), *wrong_values()])
