@@ -134,10 +134,11 @@ def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
         write_points(path, *image_to_points(image, SENSOR.rays()))
     said = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8).said
     assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [f"{i:03d}.ply" for i in range(4)]
+    rows = json.loads((out / "interpolation.json").read_text())["rows"]
     for index in range(4):
         image = np.load(out / "frames" / f"{index:03d}.npy")
-        assert len(read_points(out / "frames" / f"{index:03d}.ply").xyz) == (image[0] > 0).sum()
-    rows = json.loads((out / "interpolation.json").read_text())["rows"]
+        points = read_points(out / "frames" / f"{index:03d}.ply").xyz
+        assert len(points) == rows[index]["returns"] == (image[0] > 0).sum()
     assert [row["weight"] for row in rows] == pytest.approx([0, 1 / 3, 2 / 3, 1])
     assert [row["evaluations"] for row in rows] == [64, 32, 32, 64]  # the ends go there and back
     assert "4 scans" in said

@@ -1,6 +1,5 @@
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +7,7 @@ import torch
 
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
-from r2flow.inversion import interpolate_scans, real_scans
+from r2flow.inversion import Real, interpolate_scans, real_scans
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
@@ -26,24 +25,6 @@ def test_extreme_scans_are_drawn_too():
     figure_pixels(interpolation_figure(empty, empty, [0.0, 1.0], SENSOR.rays(), ["a", "b"]), dpi=40)
 
 
-@pytest.fixture
-def paths(tmp_path) -> list[Path]:
-    """Two range images."""
-    for name, image in zip(("one", "two"), scans(2).numpy(), strict=True):
-        np.save(tmp_path / f"{name}.npy", image)
-    return [tmp_path / "one.npy", tmp_path / "two.npy"]
-
-
-def test_a_page_says_what_was_measured(tmp_path, paths):
-    sampler = build_sampler("dopri5", tolerance=1e-4)
-    page = interpolation(flow(), real_scans(flow(), paths), 3, tmp_path / "o", sampler)
-    assert [row["frame"] for row in page.rows] == [0, 1, 2]
-    assert page.rows[1]["evaluations"] < page.rows[0]["evaluations"]
-    assert "one" in page.text[1]
-    middle = np.load(tmp_path / "o" / "frames" / "001.npy")
-    assert page.rows[1]["returns"] == (middle[0] > 0).sum()
-
-
 class LostBetween(GaussianFlow):
     """NaN after the evaluations of both round trips, in four steps of rk4."""
 
@@ -55,9 +36,9 @@ class LostBetween(GaussianFlow):
         return v if self.evaluations <= 2 * 16 else torch.full_like(v, math.nan)
 
 
-def test_a_frame_that_is_not_solved_is_reported(tmp_path, paths, caplog):
-    checkpoint = flow(LostBetween())
-    page = interpolation(checkpoint, real_scans(checkpoint, paths), 4, tmp_path / "o", build_sampler("rk4", steps=4))
+def test_a_frame_that_is_not_solved_is_reported(tmp_path, caplog):
+    checkpoint, pair = flow(LostBetween()), [Real(name, scan) for name, scan in zip("ab", scans(2), strict=True)]
+    page = interpolation(checkpoint, pair, 4, tmp_path / "o", build_sampler("rk4", steps=4))
     assert [row["converged"] for row in page.rows] == [True, False, False, True]
     assert "not solved, so no scans of this flow: 1, 2;" in caplog.text
     assert "| no |" in page.text[2]
