@@ -100,8 +100,3 @@ def run_of(family: Family, folders: pytest.TempPathFactory) -> Path:
         RUNS[family] = folders.mktemp(family.name) / "run"
         train(RUNS[family], family)
     return RUNS[family]
-
-
-@pytest.fixture(scope="session")
-def gan(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_of(GAN, tmp_path_factory)

@@ -109,8 +109,8 @@ CANNOT = {
 
 
 @pytest.mark.parametrize("verb", CANNOT)
-def test_what_a_gan_cannot_do_is_one_line(gan: Path, tmp_path: Path, verb: str):
-    arguments, said = CANNOT[verb]
+def test_what_a_gan_cannot_do_is_one_line(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, verb: str):
+    gan, (arguments, said) = run_of(GAN, tmp_path_factory), CANNOT[verb]
     for name, value in (("RUN", gan), ("SCAN", gan / "samples" / "000000.ply"), ("OUT", tmp_path / "out")):
         arguments = [one.replace(name, str(value)) for one in arguments]
     assert said in r2flow(*verb.split(), GAN.plugin, *arguments).refusal

@@ -21,7 +21,6 @@ HELD = Path("held")  # in the folder that a chain is started from
 CHAIN = ["experiment=demo", "preview=null", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8",
          "data.pairs.batch_size=4", *hold_at(5, HELD)]  # fmt: skip
 LINKS = ("rf1", "rf2", "td2")
-SCANS_ALONE = ("data=", "sensor", "backbone", "data.root")
 
 
 def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -36,7 +35,7 @@ def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatc
 
 def of_a_child(*overrides: str) -> list[str]:
     """The tiny run's overrides without what a child takes from its parent."""
-    return [one for one in TINY if not one.startswith(SCANS_ALONE)] + list(overrides)
+    return [one for one in TINY if not one.startswith(("data=", "sensor", "backbone", "data.root"))] + list(overrides)
 
 
 def train_child(cwd: Path, *overrides: str, check: bool = True) -> Done:

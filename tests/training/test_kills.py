@@ -19,14 +19,12 @@ from tests.training.test_train import assert_bit_equal
 
 pytestmark = pytest.mark.slow
 
-VERB = [sys.executable, "-m", "r2flow"]
 VERBS = {
     "simulate": ["--num", 40, "--size", "32x512", "--labels", "--workers", 2],
     "prepare": ["scans", "--shard-scans", 2, "--workers", 2],
     "pairs": ["run", "--num", 200, "--sampler", "midpoint", "--steps", 8, "--batch-size", 4, "--shard-mib", 0.05,
               "--device", "cpu"],
 }  # fmt: skip
-TIMES = 10
 
 
 def finish(cwd: Path, command: Sequence[object]) -> float:
@@ -45,7 +43,7 @@ def end_ten_times(cwd: Path, command: Sequence[object], seed: int, into: str = "
     """
     seconds = finish(cwd, [*command, f"{into}one"])
     command, draw, ended = [*command, f"{into}ended"], random.Random(seed), 0
-    for number in range(TIMES):
+    for number in range(10):
         by = (signal.SIGTERM, signal.SIGINT, signal.SIGKILL)[number % 3]
         process = start(cwd, command, command=[])
         time.sleep(draw.uniform(0.05, 0.6) * seconds)
@@ -73,7 +71,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_a_verb(saved, tmp_path: Path, seed: int, verb: str):
     for number in range(60):
         write_scan(tmp_path / "scans" / f"{number}.bin", number)
-    end_ten_times(tmp_path, [*VERB, verb, *VERBS[verb], "--out"], seed)
+    end_ten_times(tmp_path, [sys.executable, "-m", "r2flow", verb, *VERBS[verb], "--out"], seed)
     assert files(tmp_path / "ended") == files(tmp_path / "one")
 
 
