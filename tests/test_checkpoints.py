@@ -83,15 +83,6 @@ def test_compressed_tensors_are_refused_before_they_are_unpacked(saved):
         load_checkpoint(path)
 
 
-def test_a_config_that_contains_itself_is_refused(saved, tmp_path: Path):
-    path, _ = saved
-    config: dict = {**CONFIG, "data": dict(CONFIG["data"])}
-    config["data"]["scans"] = config
-    torch.save({**torch.load(path, weights_only=True), "config": config}, path)
-    with pytest.raises(InputError, match="is not a checkpoint"):
-        load_checkpoint(path)
-
-
 @pytest.mark.parametrize("notes", [json.dumps({"config": CONFIG, "step": math.inf}), "[" * 100_000, "[]", "3"])
 def test_notes_without_end_or_of_another_kind_are_refused(tmp_path: Path, notes: str):
     path = tmp_path / "model.safetensors"
