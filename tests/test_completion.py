@@ -59,6 +59,7 @@ def test_a_scan_of_which_nothing_is_known_is_the_sample_of_its_number():
     state = torch.zeros(3, *SHAPE, dtype=torch.uint8)
     found = checkpoint.complete(nothing, state, num=2, seed=5)
     assert torch.equal(found[:, 0], checkpoint.sample(3, seed=5))
+    assert not torch.equal(found[0, 1], found[1, 0])  # no two answers have one noise
     (later,) = complete(checkpoint, nothing[:1], state[:1], num=1, seed=5, first=2)
     assert torch.equal(later.images, found[2, :1])
 
