@@ -97,17 +97,17 @@ def test_the_stage_s_loss_is_the_formula_s_or_on_demand_the_published(shared):
 @torch.no_grad()
 def test_samplers_follow_the_published_trajectories(shared):
     case = load_case(shared, "r2dm_sampling.pt")
-    model = backbone_of("efficient_unet", case).eval()
-
-    def clean(z: Tensor, log_snr: Tensor) -> Tensor:
-        return PREDICTIONS["eps"].split(z, model(log_snr.float(), z), log_snr)[0].clamp(-1, 1)
-
+    generator = build_generator({**CONFIG, "sensor": {"name": "hdl64e", "rows": 16, "columns": 32}})
+    generator.backbone = backbone_of("efficient_unet", case).eval()
     for one in case["cases"].values():
-        eta = 1.0 if one["mode"] == "ddpm" else one["ddim_eta"]
+        eta, tolerance = (1.0, 1e-3) if one["mode"] == "ddpm" else (one["ddim_eta"], 2e-3)
         start, *draws = one["noise"]
-        log_snrs = Cosine()(torch.linspace(1, 0, one["num_steps"] + 1, dtype=torch.float64)).float()
-        states = torch.stack([start, *walk(clean, start, log_snrs, eta, lambda j: draws[j - 1])])  # noqa: B023
-        assert_near(states, one["trajectory"], 1e-3 if one["mode"] == "ddpm" else 2e-3)
+        log_snrs = generator.schedule(torch.linspace(1, 0, one["num_steps"] + 1))
+        states = torch.stack([start, *walk(generator.denoise, start, log_snrs, eta, lambda j: draws[j - 1])])  # noqa: B023
+        assert_near(states, one["trajectory"], tolerance)
+        given = SimpleNamespace(step=lambda shape, j: draws[j - 1])  # noqa: B023
+        made = generator(start, sampler=build_sampler("ddim", steps=one["num_steps"], eta=eta), draws=given)
+        assert_near(made.x, one["trajectory"][-1].clamp(-1, 1), tolerance)
 
 
 def test_a_scan_is_completed_by_the_published_repaint(shared):

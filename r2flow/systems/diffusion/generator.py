@@ -76,7 +76,7 @@ class Diffusion(NetworkFlow):
             progress()
             return self.denoise(z, log_snr)
 
-        log_snrs = self.schedule(1 - how.times()).to(z)
+        log_snrs = self.schedule((1 - how.times()).to(z))  # rounded as in training: at t = 1, x shows lambda's digits
         *_, z = repaint(denoise, z, image, known, log_snrs, noise, how.repeats, how.jump)
         return z if self.clip is None else z.clamp(-self.clip, self.clip)
 
@@ -96,7 +96,7 @@ class DDIM(OnGrid):
         return self.eta > 0
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        log_snrs = generator.schedule(1 - self.times()).to(noise)
+        log_snrs = generator.schedule((1 - self.times()).to(noise))  # rounded as in training, see `repaint`
         z = last_of(walk(generator.denoise, noise, log_snrs, self.eta, draws), progress)
         clip = generator.clip
         return Generated.after(z if clip is None else z.clamp(-clip, clip), self.steps, finite(z))
