@@ -3,7 +3,6 @@
 Most convolutions are circular in azimuth and elevation, as in the published weights, whose parameter names are kept.
 """
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from itertools import chain
 
@@ -17,9 +16,7 @@ from r2flow.registry import Count
 
 def torus_convolution(channels: int, out_channels: int, dilation: int = 1, bias: bool = True) -> nn.Conv2d:
     """A 3 x 3 convolution with circular padding in both directions."""
-    return nn.Conv2d(
-        channels, out_channels, 3, padding=dilation, dilation=dilation, bias=bias, padding_mode="circular"
-    )  # fmt: skip
+    return nn.Conv2d(channels, out_channels, 3, 1, dilation, dilation, bias=bias, padding_mode="circular")
 
 
 class InstanceNormPlus(nn.Module):
@@ -37,16 +34,21 @@ class InstanceNormPlus(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         wide = at_least_float32(x)
         means = wide.mean((2, 3), keepdim=True)
-        spread = (means.var(1, keepdim=True) + 1e-5).sqrt()
         alpha, gamma, beta = (p[:, None, None] for p in (self.alpha, self.gamma, self.beta))
-        centred = (means - means.mean(1, keepdim=True)) / spread
+        centred = (means - means.mean(1, keepdim=True)) / (means.var(1, keepdim=True) + 1e-5).sqrt()
         return (gamma * (F.instance_norm(wide) + alpha * centred) + beta).to(x.dtype)
 
 
-def pooled_convolution(channels: int, out_channels: int, size: int) -> nn.Module:
+class PooledConv2d(nn.Module):
     """A convolution with zero padding, then 2 x 2 average pooling."""
-    convolution = nn.Conv2d(channels, out_channels, size, padding=size // 2)
-    return nn.Sequential(OrderedDict(conv=convolution, pool=nn.AvgPool2d(2)))
+
+    def __init__(self, channels: int, out_channels: int, size: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, out_channels, size, padding=size // 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        # Sums columns first, as published: another rounding changes which pixel is the largest in `PoolChain`.
+        return F.avg_pool2d(self.conv(x).mT, 2).mT.contiguous()
 
 
 class ScoreBlock(nn.Module):
@@ -63,8 +65,7 @@ class ScoreBlock(nn.Module):
         self.shortcut: nn.Module = nn.Identity()
         self.conv2: nn.Module
         if changes and dilation == 1:
-            self.conv2 = pooled_convolution(channels, out_channels, 3)
-            self.shortcut = pooled_convolution(channels, out_channels, 1)
+            self.conv2, self.shortcut = (PooledConv2d(channels, out_channels, size) for size in (3, 1))
         else:
             self.conv2 = torus_convolution(out_channels, out_channels, dilation)
             if changes:
@@ -174,5 +175,4 @@ class RefineNet(nn.Module):
         third = self.res3(second)
         refined = self.refine2(third, self.refine1(self.res4(third)))
         refined = self.refine4(first, self.refine3(second, refined))
-        score = self.end_conv(F.elu(self.normalizer(refined)))
-        return score / self.sigmas[labels][:, None, None, None]
+        return self.end_conv(F.elu(self.normalizer(refined))) / self.sigmas[labels][:, None, None, None]
