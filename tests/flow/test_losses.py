@@ -3,15 +3,7 @@ import math
 import pytest
 import torch
 
-from r2flow.flow.losses import LOSSES, mse, pseudo_huber, pseudo_huber_elementwise
-
-
-def test_the_paper_s_pseudo_huber_is_per_sample():
-    v, u = torch.randn(3, 2, 8, 16, dtype=torch.float64), torch.randn(3, 2, 8, 16, dtype=torch.float64)
-    d = 2 * 8 * 16
-    c = 0.00054 * math.sqrt(d)
-    expected = (((v - u) ** 2).sum((1, 2, 3)) + c**2).sqrt() - c  # eq. 3
-    torch.testing.assert_close(pseudo_huber(v, u).double() * math.sqrt(d), expected, rtol=1e-5, atol=0)
+from r2flow.flow.losses import LOSSES, mse, pseudo_huber_elementwise
 
 
 def test_the_reference_pseudo_huber_is_per_element(shared):
@@ -24,23 +16,11 @@ def test_the_reference_pseudo_huber_is_per_element(shared):
 
 
 @pytest.mark.parametrize("name", list(LOSSES))
-class TestEveryLoss:
-    def test_has_one_value_per_sample_and_they_are_independent(self, name):
-        v, u = torch.randn(3, 2, 4, 8), torch.randn(3, 2, 4, 8)
-        together = LOSSES[name](v, u)
-        alone = torch.cat([LOSSES[name](v[i : i + 1], u[i : i + 1]) for i in range(3)])
-        torch.testing.assert_close(together, alone, rtol=1e-6, atol=0)
-
-    def test_gradient_is_that_of_finite_differences(self, name):
-        # float32 inside: differences over 1e-2 of a smooth function, compared to a percent.
-        v, u = torch.randn(1, 1, 2, 2), torch.randn(1, 1, 2, 2)
-        v.requires_grad_()
-        (gradient,) = torch.autograd.grad(LOSSES[name](v, u).sum(), v)
-        h = torch.zeros_like(v)
-        h[0, 0, 1, 1] = 1e-2
-        with torch.no_grad():
-            difference = (LOSSES[name](v + h, u) - LOSSES[name](v - h, u)).item() / 2e-2
-        assert gradient[0, 0, 1, 1].item() == pytest.approx(difference, rel=0.01, abs=1e-3)
+def test_a_loss_has_one_value_per_sample_and_they_are_independent(name):
+    v, u = torch.randn(3, 2, 4, 8), torch.randn(3, 2, 4, 8)
+    together = LOSSES[name](v, u)
+    alone = torch.cat([LOSSES[name](v[i : i + 1], u[i : i + 1]) for i in range(3)])
+    torch.testing.assert_close(together, alone, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("size", [1.0, 1e12, 1e18, 1e30])
@@ -75,13 +55,9 @@ class TestHalfPrecision:
         loss.sum().backward()
         assert loss.dtype == torch.float32
         assert loss.item() == pytest.approx(EXPECTED[name](residual), rel=1e-3)
-        if residual == 0:
-            assert v.grad.abs().max() == 0
-        if name == "mse" and residual == 1e6:
-            # d/dv r^2 / D = 2 r / D = 31250, which float16 holds
-            assert v.grad.float().abs().max().item() == pytest.approx(2 * residual / D, rel=1e-2)
-        assert v.grad.isfinite().all()
-        assert (v.grad <= 0).all()
+        h = residual / 1000 or 1e-9
+        slope = (EXPECTED[name](residual + h) - EXPECTED[name](residual - h)) / (2 * h)
+        torch.testing.assert_close(v.grad.float(), torch.full(v.shape, -slope / D), rtol=0.02, atol=1e-7)
 
     def test_infinity_and_nan_are_not_hidden(self, name, dtype):
         for value in (math.inf, math.nan):
