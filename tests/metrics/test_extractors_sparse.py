@@ -2,7 +2,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from r2flow.metrics.extractors.sparse import SparseConv3d, offsets
+from r2flow.metrics.extractors.sparse import SparseConv3d
 from r2flow.metrics.extractors.voxels import SPVCNN, MinkowskiNet
 
 
@@ -70,22 +70,12 @@ class Dense:
         return self.residuals(list(blocks), torch.cat([x, kept], 1), 4 - number)
 
     def to_points(self, x: torch.Tensor, level: int) -> torch.Tensor:
-        """Point by point: the eight voxels from its own on, by the share of the way to each, as far as they exist."""
-        scale, mask = 2**level, self.masks[level]
-        rows = []
-        for place in self.coords.tolist():
-            total, weights = torch.zeros(x.shape[1], dtype=x.dtype), 0.0
-            for ahead in offsets(2):
-                corner = [p // scale + a for p, a in zip(place, ahead, strict=True)]
-                weight = 1.0
-                for p, a in zip(place, ahead, strict=True):
-                    share = (p % scale) / scale
-                    weight *= share if a else 1 - share
-                if max(corner) < mask.shape[2] and mask[0, 0, corner[0], corner[1], corner[2]]:
-                    total += weight * x[0, :, corner[0], corner[1], corner[2]]
-                    weights += weight
-            rows.append(total / weights)
-        return torch.stack(rows)
+        """The eight voxels from a point's own on, by the share of the way to each, as far as they exist."""
+        mask = self.masks[level]
+        grid = 2 * self.coords.flip(1) / 2**level / (mask.shape[2] - 1) - 1  # -1 to 1, z first
+        held = torch.cat([x, mask], 1)
+        there = F.grid_sample(held, grid[None, None, None].double(), align_corners=True)[0, :, 0, 0].T
+        return there[:, :-1] / there[:, -1:]
 
     def to_voxels(self, points: torch.Tensor, level: int) -> torch.Tensor:
         held = to_dense(points, self.coords, self.masks[0].shape)
