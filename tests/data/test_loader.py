@@ -6,18 +6,11 @@ import pytest
 from r2flow.data.loader import MixedOrder, Mixture, Permutations, RunSampler
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
-from r2flow.lidar.sensors import SENSORS
-
-SENSOR = SENSORS["hdl64e"].resized(4, 8)
 
 
-def numbers(*values: float, size: tuple[int, int] = (1, 1)) -> InMemory:
-    """Scans whose ranges are these numbers, and whose reflectances a hundredth of them."""
-    images = np.array(values, np.float32)[:, None, None, None] * np.array([1, 0.01], np.float32)[:, None, None]
-    return InMemory(np.broadcast_to(images, (len(values), 2, *size)).copy(), [str(value) for value in values])
-
-
-SCANS = numbers(*range(2, 12), size=SENSOR.shape)
+def numbers(*values: float) -> InMemory:
+    """Scans of one pixel, whose ranges are these numbers."""
+    return InMemory(np.array(values, np.float32).reshape(-1, 1, 1, 1), [str(value) for value in values])
 
 
 def keys(**options) -> list[list[tuple[int, int]]]:
