@@ -157,35 +157,6 @@ def test_a_real_point_lies_within_half_a_bin_of_its_pixel_s_ray(shared, name, sc
         assert len(hit) > 0.25 * image.size
 
 
-def test_bin_centres_halve_the_reference_s_error_on_real_scans(shared):
-    def relative_error(convention):
-        errors = []
-        for path in sorted((shared / "real" / "kitti360").rglob("*.bin"))[:3]:
-            points = read_points(path)
-            image = project(points.xyz, None, HDL64E, convention=convention)
-            pixel = project(points.xyz, np.arange(len(points.xyz), dtype=np.float64), HDL64E, convention=convention)
-            true = points.xyz[pixel[1][image[0] > 0].astype(int)]
-            there = unproject(torch.from_numpy(image[None, :1]), HDL64E.rays(convention))[0].numpy()
-            errors.append(np.linalg.norm(there[:, image[0] > 0].T - true, axis=1) / image[0][image[0] > 0])
-        return np.concatenate(errors).mean()
-
-    # The reference's own figure, and half of it.
-    assert relative_error("reference") == pytest.approx(0.0053, abs=1e-4)
-    assert relative_error("centre") <= 0.0053 / 2
-
-
-def test_unfolded_real_scans_unproject_to_their_points(shared):
-    sensor = SENSORS["hdl64e_rings"]
-    # Another car than the rings were measured on.
-    for path in sorted((shared / "real" / "kitti360").rglob("*.bin"))[:3]:
-        points = read_points(path)
-        image = project(points.xyz, np.arange(len(points.xyz), dtype=np.float64), sensor, "unfolding")
-        seen = image[0] > 0
-        there = unproject(torch.from_numpy(image[None, :1]), sensor.rays())[0].numpy()[:, seen].T
-        height_error = np.abs(there[:, 2] - points.xyz[image[1][seen].astype(int), 2])
-        assert np.median(height_error) < 0.05
-
-
 def cloud(sensor: Sensor, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Points of a random image, (W, H, 3), a firing after the other, each from the top; a fifth without return."""
     image = random_image(sensor, seed)[0]
@@ -232,18 +203,6 @@ def test_rings_stored_from_behind_on_are_refused():
     from_behind = np.roll(xyz.reshape(16, 48, 3), 24, axis=1).reshape(-1, 3)
     with pytest.raises(InputError, match="from azimuth 0 on"):
         project(from_behind, None, sensor, "unfolding")
-
-
-def test_a_real_scan_unfolds_by_ring_and_by_firing_alike(shared):
-    (path,) = (shared / "real" / "other_sensors" / "nuscenes_hdl32e").glob("*.bin")
-    points = read_points(path)
-    by_ring, by_firing = (
-        project(points.xyz, None, SENSORS["hdl32e"], "unfolding", ring=ring) for ring in (points.ring, None)
-    )
-    np.testing.assert_array_equal(by_firing, by_ring)
-    # The file counts its rings from the lowest up.
-    within = (np.linalg.norm(points.xyz, axis=1) >= 1) & (points.ring == 31)
-    assert (by_ring[0, 0] > 0).sum() <= within.sum() < 1.8 * (by_ring[0, 0] > 0).sum()
 
 
 def test_lost_rays_of_whole_firings_may_be_nan(tmp_path):
