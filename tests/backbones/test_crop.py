@@ -30,9 +30,9 @@ X, T = torch.randn(2, 2, *SHAPE), torch.tensor([0.2, 0.9])
 @pytest.mark.parametrize("name", PUBLISHED)
 @pytest.mark.parametrize("part", PARTS, ids=str)
 def test_a_part_is_the_backbone_of_its_own_rays(name, part):
-    position = "none" if name == "hdit" else "polar"  # whose shapes do not depend on the image's
-    whole = backbone(name, position=position)
-    own = backbone(name, part.crop(RAYS), position=position, ring=part.width == 64)
+    # of positions whose shapes do not depend on the image's
+    options = {"position": "none", "detail": [2, 8]} if name == "hdit" else {"position": "polar"}
+    whole, own = backbone(name, **options), backbone(name, part.crop(RAYS), ring=part.width == 64, **options)
     weights = {key: value for key, value in whole.state_dict().items() if key != "coords"}
     own.load_state_dict({**weights, "coords": own.coords})
     with torch.no_grad():

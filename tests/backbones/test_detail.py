@@ -32,13 +32,6 @@ def test_the_path_sees_single_pixels():
     assert changed[:, 63].nonzero()[:, 0].tolist() == [6, 7, 8, 9, 10]
 
 
-def test_a_part_of_the_image_has_no_ring():
-    model = tiny("hdit", detail=[2, 8])
-    part = model.cropped(torch.arange(16), torch.arange(16, 48))
-    assert not any(getattr(module, "ring", False) for module in part.detail.modules())
-    assert part(0.5, image()[..., 16:48]).shape == (2, 2, 16, 32)
-
-
 @pytest.mark.parametrize("s", [0.3, 1.0, 2.0])
 def test_the_skip_is_the_velocity_of_a_gaussian(s):
     """Its flow is x_t = sigma(t) x_0 with sigma^2 = (1 - t)^2 + t^2 s^2, so that v = x d(log sigma) / dt."""
