@@ -80,19 +80,6 @@ def test_interpolation_keeps_what_is_measured_and_fills_the_rest(name):
     assert not INTERPOLATIONS[name](image, np.zeros(SHAPE, dtype=bool)).any()  # nothing is guessed from nothing
 
 
-def test_the_inverse_of_range_is_nearly_linear_on_the_ground():
-    image = ground(SENSOR)
-    measured = parse_mask("rows:2")(WHOLE, draws())
-    hidden = ~measured & (image[0] > 0)
-    hidden[: np.flatnonzero(measured.any(1) & (image[0] > 0).all(1))[0]] = False  # above the first known ground
-    hidden[15] = False  # beyond the last known row
-    # 1 / r = sin(-e) / h: the mean of two neighbours' is cos(step) of it, so that the range is 1 / cos(step) too long.
-    step = np.deg2rad(28 / 16)
-    direct, inverse = (interpolated(image, measured, rule)[0] for rule in ("linear", "inverse"))
-    assert inverse[hidden] == pytest.approx(image[0][hidden] / np.cos(step), rel=1e-5)
-    assert np.abs(inverse - image[0])[hidden].max() < 0.05 * np.abs(direct - image[0])[hidden].max()
-
-
 @pytest.mark.parametrize("rule", ["linear", "inverse"])
 def test_interpolation_follows_columns_and_then_the_ring(rule):
     """Against numpy.interp, where every ray returns: between the known rows of a column, else around its row."""
