@@ -32,15 +32,6 @@ def directions(rays):
     return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
-def test_a_sensor_above_flat_ground_measures_minus_h_over_sin_e():
-    _, r, rays = look()
-    e = rays.lasers.elevation[:, None]
-    exact = np.where(np.sin(e) < -0.02, -HEIGHT / np.sin(e), np.inf)
-    down = np.isfinite(exact[:, 0])
-    np.testing.assert_allclose(r[down], np.broadcast_to(exact, r.shape)[down], rtol=1e-5)
-    assert np.isinf(r[rays.lasers.elevation >= 0]).all()
-
-
 def test_lasers_above_the_origin_see_flat_ground_at_their_own_height():
     lasers = lasers_of(HDL64E)
     hits, _, _ = look(lasers=lasers)
