@@ -24,14 +24,6 @@ def positive(d, seed, rank=None):
     return a @ a.T / d
 
 
-def test_commuting_covariances_differ_by_the_roots_of_their_eigenvalues():
-    q = torch.linalg.qr(torch.randn(30, 30, dtype=torch.float64)).Q
-    a, b = torch.rand(2, 30, dtype=torch.float64) * 5
-    mean = torch.arange(30, dtype=torch.float64)
-    value = frechet_distance(mean, q @ a.diag() @ q.T, mean + 2, q @ b.diag() @ q.T)
-    assert value == pytest.approx(float(30 * 4 + (a.sqrt() - b.sqrt()).square().sum()), abs=1e-9)
-
-
 @pytest.mark.parametrize(
     ("d", "rank_1", "rank_t", "tolerance"),
     # Full rank, but eigenvalues down to 1e-13 of the largest, whose roots are known to that much less.
