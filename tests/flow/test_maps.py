@@ -1,7 +1,5 @@
 """Flow maps as mathematics: paths by their knots, jump times, objectives against exact maps."""
 
-import math
-
 import pytest
 import torch
 from torch import Tensor
@@ -43,15 +41,6 @@ def test_a_polynomial_path_is_known_exactly_from_its_knots(degree):
     begin, end = torch.tensor([[0.0, 0.41, 0.8], [1.0, 0.41, 0.81]], dtype=torch.float64)
     for row, mean in zip(paths.mean_velocity(begin, end), means, strict=True):
         torch.testing.assert_close(row, torch.full_like(row, float(mean)), rtol=0, atol=1e-11)
-
-
-def test_between_knots_the_error_is_of_fourth_order():
-    errors = []
-    for knots in (9, 33):
-        paths = paths_of(lambda x, t: x * torch.sin(3 * t), torch.linspace(0, 1, knots, dtype=torch.float64))
-        at = [t.expand(3) for t in torch.linspace(0, 1, 321, dtype=torch.float64)]
-        errors.append(max(float((paths.at(t) - X_0 * torch.sin(3 * t[0])).abs().max()) for t in at))
-    assert math.log2(errors[0] / errors[1]) / 2 == pytest.approx(4, abs=0.3)
 
 
 def test_jump_times_keep_their_shares():
