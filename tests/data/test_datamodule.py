@@ -116,7 +116,6 @@ def mixture(part) -> dict:
         (mixture(DRIVES), "has a standard split: give split, one of train, test, or null"),
         (mixture({**FOLDER, "weight": 1}), "every part a weight"),
         (mixture({"name": "simulated", "sensor": {"name": "vlp"}}), "no sensor named .vlp"),
-        (mixture({"name": "folder"}), "data.root=FOLDER"),
         (mixture({**FOLDER, "weight": 0}), "weight must be a finite number above 0 or null, found 0"),
         (mixture("folder"), "a list, each a group of keys"),
         (mixture({"name": "simulated", "scenes": 0}), "scenes must be a whole number from 1 to 10,000,000"),

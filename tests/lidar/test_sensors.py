@@ -110,9 +110,7 @@ def test_every_sensor_has_a_config_and_every_config_builds():
     [
         ({"elevations": [2, "a"]}, "each a finite number"),
         ({"elevations": [2, 10**400]}, "each a finite number"),
-        ({"elevations": [2, 1], "max_range": 10**400}, "max_range must be a finite number"),
         ({"elevations": [1, 2]}, "fall from the top"),
-        ({"elevations": [2, math.nan]}, "each a finite number"),
         ({"elevations": [90, 2]}, "within (-90, 90)"),
         ({"elevations": [2, 1], "firing": [0, 0]}, "firing must name"),
         ({"elevations": [2, 1], "firing": [0, 1.0]}, "each a whole number"),

@@ -154,7 +154,6 @@ GARBLED = [
     ("dusty2", garble(OUTPUT, act="os.system"), "ValueError: the activation 'os.system'"),
     ("r2dm", garble("data", min_depth=90.0), "found 90.0 and 80.0"),
     ("r2dm", garble("diffusion", timestep_type="discrete"), "only diffusions of range in continuous time"),
-    ("r2dm", garble("data", depth_format="disparity"), "KeyError: 'disparity'"),
     ("r2dm", garble("model", architecture="refinenet"), "no published architecture named 'refinenet'"),
     ("r2dm", garble("diffusion", noise_schedule="sigmoid"), "no log-SNR schedule named 'sigmoid'"),
     ("lidargen", None, "KeyError: 'sigmas'"),
