@@ -43,6 +43,13 @@ def test_a_polynomial_path_is_known_exactly_from_its_knots(degree):
         torch.testing.assert_close(row, torch.full_like(row, float(mean)), rtol=0, atol=1e-11)
 
 
+def test_between_knots_the_error_is_that_of_the_four_nearest():
+    paths = paths_of(lambda x, t: x * torch.sin(3 * t), torch.linspace(0, 1, 9, dtype=torch.float64))
+    for t in torch.linspace(0, 1, 81, dtype=torch.float64):
+        # The fourth derivative is at most 81, and between four knots h apart |(t - t_0) ... (t - t_3)| at most h^4.
+        assert (paths.at(t.expand(3)) - X_0 * torch.sin(3 * t)).abs().max() <= 2 * 81 / 24 / 8**4
+
+
 def test_jump_times_keep_their_shares():
     u = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     t, s = JumpTimes(steps=(1, 1, 4), share=0.6, diagonal=0.25)(u)
