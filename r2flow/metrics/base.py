@@ -113,7 +113,7 @@ class ScanMetric(Metric):
             return {self.name: float("nan")}, [f"{self.name} needs {self.fewest} or more scans of each set."]
         return {self.name: float(self.distance(self.kept("real"), self.kept("generated")))}, []
 
-    def distance(self, real: Tensor, generated: Tensor) -> Tensor:
+    def distance(self, real: Tensor, generated: Tensor) -> Tensor | float:
         """The value for the stored rows of two sets, (N, D) and (M, D) float32."""
         raise NotImplementedError
 
@@ -197,16 +197,17 @@ class ScanMetric(Metric):
         """Statistics of the real set, on the CPU and gathered from all processes, for a disk cache."""
         with self.sync_context():
             names = [name for name in self._defaults if name.startswith("real_")]
-            states = {name: self._numbered("real") if name == "real_rows" else getattr(self, name) for name in names}
-            return {name: state.detach().cpu().clone() for name, state in states.items()}
+            states = {name: getattr(self, name).detach().cpu().clone() for name in names if name != "real_rows"}
+            return states | ({"real_rows": self._numbered("real").detach()} if self.keeping else {})  # rows fill memory
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
         """Load the real set's statistics from `real_state`, after `reset`; only on the first process."""
         if place()[0] > 0:
             return
         for name, value in state.items():
-            copy = value.to(self.device, copy=True)
-            setattr(self, name, [copy.flatten()] if name == "real_rows" else copy)
+            rows = name == "real_rows"  # never changed in place, as sums are
+            moved = value.to(self.device, copy=not rows)
+            setattr(self, name, [moved.flatten()] if rows else moved)
 
     def set_dtype(self, dst_type: str | torch.dtype) -> Self:
         """Do nothing: states stay float64, since lower precision would lose digits."""

@@ -9,13 +9,8 @@ import torch
 from torch import nn
 
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.metrics.frechet import FrechetDistance, add_moments, frechet_distance, merge_moments, moments
+from r2flow.metrics.frechet import FrechetDistance, frechet_distance, gaussian
 from tests.metrics.conftest import Summary, measured, scans_of
-
-
-def zeros(d):
-    """Moments of no scan."""
-    return torch.zeros(1 + d, 1 + d, dtype=torch.float64)
 
 
 def positive(d, seed, rank=None):
@@ -49,26 +44,18 @@ def test_equal_and_degenerate_gaussians():
 def test_reference_figures(shared):
     cases = torch.load(shared / "oracle" / "distribution_metrics.pt", weights_only=True)
     for case in cases.values():
-        sides = []
-        for rows in (case["f1"], case["f2"]):
-            matrix = zeros(rows.shape[1])
-            for batch in rows.split(17):
-                add_moments(matrix, batch)
-            sides += [moments(matrix).mean, moments(matrix).covariance]
-        assert frechet_distance(*sides) == pytest.approx(case["frechet"], rel=1e-9)
+        found = frechet_distance(*gaussian(case["f1"]), *gaussian(case["f2"]))
+        assert found == pytest.approx(case["frechet"], rel=1e-9)
 
 
-def test_float32_features_far_from_zero_lose_nothing():
+def test_float32_features_far_from_zero_lose_nothing(monkeypatch):
+    monkeypatch.setattr("r2flow.metrics.frechet.BLOCK", 400)  # 999 rows in three blocks
     far = (1e4 + 1e-2 * torch.randn(999, 12, dtype=torch.float64)).float()
     x = far.double().numpy()
     expected = np.cov(x, rowvar=False)
-    parts = torch.stack([zeros(12) for _ in range(3)])
-    for k, batch in enumerate(far.split(10)):
-        add_moments(parts[k % 3], batch)
-    for found in (moments(merge_moments(parts)), moments(merge_moments(parts.flip(0)))):
-        assert found.n == 999
-        np.testing.assert_allclose(found.mean, x.mean(0), rtol=1e-14)
-        np.testing.assert_allclose(found.covariance, expected, rtol=0, atol=1e-10 * expected.max())
+    mean, covariance = gaussian(far)
+    np.testing.assert_allclose(mean, x.mean(0), rtol=1e-14)
+    np.testing.assert_allclose(covariance, expected, rtol=0, atol=1e-10 * expected.max())
 
 
 def test_fewer_scans_than_dimensions_is_exact_and_said(summary):
