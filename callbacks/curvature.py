@@ -2,7 +2,7 @@
 
 import lightning as L
 
-from r2flow.flow.straightness import curvature
+from r2flow.flow.straightness import paths
 from r2flow.generators import Flow
 from r2flow.noise import Draws
 from r2flow.registry import Count, Natural
@@ -14,8 +14,7 @@ class Curvature(Periodic):
     """Logs int s(t) dt (paper, eq. 6) of a few scans from fixed noise; of flows alone, and not of distilled ones.
 
     The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/bend`: an untrained flow
-    is straight because its paths have almost no length. One measurement is one pass of `steps` Euler steps;
-    `r2flow report curvature` computes s(t) itself, in two passes.
+    is straight because its paths have almost no length. `r2flow report curvature` writes s(t) itself.
 
     Args:
         every: Steps between two measurements; 0 for none.
@@ -32,8 +31,8 @@ class Curvature(Periodic):
         if not isinstance(flow, Flow) or not flow.draws or flow.fixed:
             return
         x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
-        result = curvature(flow.velocity, x_0, self.steps)
-        values = {"s": result.total.mean().item(), "bend": result.normalised.mean().item()}
+        result = paths(flow.velocity, x_0, self.steps)
+        values = {"s": result.s.mean().item(), "bend": result.s_normalised.mean().item()}
         for logger in trainer.loggers:
             # Lightning logs with the step before the one just finished
             logger.log_metrics({f"curvature/{name}": value for name, value in values.items()}, trainer.global_step - 1)

@@ -62,11 +62,11 @@ def curvature(
         flow = as_flow(checkpoint.generator, "curvature")
         check(not flow.fixed, f"{name} is distilled for {flow.sampler} alone: it has learned no other times.")
     prepare_folder(out)
-    with Bar("measuring", len(loaded) * math.ceil(draw.num / draw.batch_size) * 2 * steps, "evaluations") as advance:
-        flows = [
-            measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, progress=advance)
+    with Bar("measuring", len(loaded) * math.ceil(draw.num / draw.batch_size) * steps, "evaluations") as advance:
+        flows = {
+            label: measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, progress=advance)
             for label, checkpoint in loaded.items()
-        ]
+        }
     page = curvature_page(flows, draw.seed, where)
     finish(page, out, page.text)
 

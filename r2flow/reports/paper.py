@@ -103,7 +103,7 @@ def paper_page(
     figures["figure_7"] = scans_figure(runs, samples, scans)
     if solvable := [run for run in flows if not run.checkpoint.generator.fixed]:
         tracked = track(solvable, "following paths")
-        paths = [measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4) for run in tracked]
+        paths = {run.label: measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4) for run in tracked}
         figures |= {"figure_8a": curvature_figure(paths), "figure_8b": trajectories_figure(paths)}
         text += ["## Figure 8: straightness", *curvature_text(paths)]
     return Page(

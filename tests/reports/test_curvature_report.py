@@ -56,34 +56,33 @@ def test_the_figures_are_those_of_paths_kept_whole(batch_size):
     most = np.argsort(-bends.ravel())[:7]
     paths = x.transpose(0, 2, 1).reshape(-1, STEPS + 1)[most]
     np.testing.assert_allclose(found.trajectories, paths, atol=1e-5)
-    row = summary(found)
+    row = summary("falling", found)
     assert row["integral"] == pytest.approx(s.mean(), rel=1e-4)
     assert row["t_of_most"] == s.mean(0).argmax() / STEPS
     assert row["last_tenth"] == pytest.approx(s[:, 15].sum() / s.sum(), rel=1e-4)  # of 16 steps, one begins after .9
-    rows = curvature_rows([found])
+    rows = curvature_rows({"falling": found})
     assert [r["t"] for r in rows] == [k / STEPS for k in range(STEPS)]
     assert rows[3]["s"] == pytest.approx(s[:, 3].mean(), rel=1e-4)
 
 
 def test_the_page_compares_the_flows():
-    flows = [measure_paths(checkpoint(Falling(a)), name, 1, STEPS, 5) for name, a in (("slow", 0.5), ("fast", 4.0))]
+    slopes = {"slow": 0.5, "fast": 4.0}
+    flows = {name: measure_paths(checkpoint(Falling(a)), name, 1, STEPS, 5) for name, a in slopes.items()}
     page = curvature_page(flows, 5)
     said = " ".join(page.text)
     # s / |d|^2 does not change when a straight-line velocity is scaled; here the slower one is nearer to v = c t,
     # whose variance over squared mean is (1/12) / (1/4) = 1/3.
-    assert 0.9 / 3 < summary(flows[0])["integral_normalised"] < 1.2 / 3
-    for flow in flows:
-        assert (
-            f"| {flow.label} | {summary(flow)['integral']:.3g} | {summary(flow)['integral_normalised']:.3g} |" in said
-        )
+    assert 0.9 / 3 < summary("slow", flows["slow"])["integral_normalised"] < 1.2 / 3
+    for row in (summary(*flow) for flow in flows.items()):
+        assert f"| {row['checkpoint']} | {row['integral']:.3g} | {row['integral_normalised']:.3g} |" in said
     assert len(page.figures["curvature"].axes) == 2
     assert len(page.figures["trajectories"].axes) == 2
 
 
 def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
     flow = measure_paths(checkpoint(Falling(0.0)), "still", 1, 4, 5)
-    page = curvature_page([flow], 5)
-    assert math.isnan(summary(flow)["integral_normalised"])
+    page = curvature_page({"still": flow}, 5)
+    assert math.isnan(summary("still", flow)["integral_normalised"])
     assert "| still | 0 | - |" in page.text[1]
 
 
