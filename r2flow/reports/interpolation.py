@@ -11,22 +11,16 @@ from torch import Tensor
 from r2flow.data.sources import spread
 from r2flow.generators import Sampler
 from r2flow.inversion import TIGHT, Real, interpolate_scans, round_trip
-from r2flow.lidar.projection import image_to_points, write_scan
+from r2flow.lidar.projection import write_scan
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.sampling import warn_unsolved
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page
-from r2flow.reports.pictures import draw_birds_eye, draw_perspective, draw_range, draw_reflectance
+from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import table
 from r2flow.reports.view import Panel, most_images, write_page
 
 MOST = 8  # maximum number of frames in the figure, evenly spaced
-# Rows: points, then images.
-PANELS = {
-    "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
-    "reflectance": draw_reflectance,
-}  # fmt: skip
-REAL = "#c2410c"
 BETWEEN = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
 ENDS = {
     "scan": "scan", "rms": "RMS, model space", "median_m": "median, m", "dropped": "rays lost or gained",
@@ -75,26 +69,9 @@ def interpolation(
 def interpolation_figure(
     real: np.ndarray, frames: np.ndarray, weights: Sequence[float], rays: Tensor, names: Sequence[str]
 ) -> Figure:
-    """Figure with the real scans as outer columns and frames in between; perspective, bird's-eye view and images.
-
-    The first and last frames are round trips of the real scans.
-    """
+    """Contact sheet of the real scans with frames in between, of which the first and last are their round trips."""
     last = len(frames) - 1
     chosen = sorted({round(i) for i in np.linspace(0, last, MOST)})
-    between = [("round trip" if i in (0, last) else f"w = {weights[i]:.2f}", frames[i]) for i in chosen]
-    columns = [(f"real: {names[0]}", real[0]), *between, (f"real: {names[1]}", real[1])]
-    heights = [1.15, 1.6, *[0.5] * real.shape[1]]
-    figure = Figure((1.4 * len(columns), 0.9 * sum(heights) + 0.4), facecolor="white")
-    figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
-    panels = figure.subplots(len(heights), len(columns), squeeze=False, height_ratios=heights)
-    for place, (title, image) in enumerate(columns):
-        xyz, _ = image_to_points(image, rays)
-        colour = REAL if place in (0, len(columns) - 1) else "black"
-        for axes, (name, draw) in zip(panels[:, place], PANELS.items(), strict=False):
-            draw(axes, xyz if name in ("perspective", "bird's-eye view") else image, label=False)
-            if place == 0:
-                axes.set_ylabel(name, fontsize=7)
-            if colour == REAL:
-                axes.spines[:].set(visible=True, color=REAL, linewidth=1.2)
-        panels[0, place].set_title(title, color=colour, fontsize=7, pad=3)
-    return figure
+    between = {i: "round trip" if i in (0, last) else f"w = {weights[i]:.2f}" for i in chosen}
+    titles = [f"real: {names[0]}", *between.values(), f"real: {names[1]}"]
+    return contact_sheet([real[0], *frames[chosen], real[1]], rays, titles)

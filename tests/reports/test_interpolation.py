@@ -12,17 +12,11 @@ from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.interpolation import interpolation, interpolation_figure
-from r2flow.reports.pictures import figure_pixels
+from r2flow.reports.interpolation import interpolation
 from r2flow.samplers import build_sampler
 from r2flow.store import Store
 from tests.conftest import SENSOR
 from tests.test_sampling import GaussianFlow, flow, scans
-
-
-def test_extreme_scans_are_drawn_too():
-    empty = np.zeros((2, 2, 8, 64), np.float32)
-    figure_pixels(interpolation_figure(empty, empty, [0.0, 1.0], SENSOR.rays(), ["a", "b"]), dpi=40)
 
 
 class LostBetween(GaussianFlow):
