@@ -1,67 +1,51 @@
-"""Training progress, with rate and remaining time."""
+"""Training progress, with losses, rate and remaining time."""
 
-import math
-import sys
 import time
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.callbacks import RichProgressBar
+from lightning.pytorch.callbacks import ProgressBar
 
-from r2flow.progress import duration
+from r2flow.progress import Bar
 from r2flow.registry import NonNegative
 
+LOSSES = "train/loss", "val/loss"
 
-class Progress(RichProgressBar):
-    """Lightning's rich bar with scans per second; a line every `seconds` if standard output is not a terminal."""
+
+class Progress(ProgressBar):
+    """A bar of steps with losses and scans per second; a line every `seconds` if standard error is not a terminal."""
 
     def __init__(self, seconds: NonNegative = 15.0) -> None:
-        super().__init__(leave=True)
-        self.seconds = seconds
-        self._begin = -math.inf, 0  # time and step at which the run (re)started
-        self._last_line = 0.0
-        self._watched = sys.stdout.isatty()
-        if not self._watched:
-            self.disable()
+        super().__init__()
+        self.seconds, self.is_enabled = seconds, True
+        self._bar: Bar | None = None
+        self._noted = 0.0
 
-    def _get_train_description(self, current_epoch: int) -> str:
-        return "training"  # the base class counts epochs, but a run is one epoch
+    def disable(self) -> None:
+        self.is_enabled = False
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        super().on_train_start(trainer, pl_module)
-        self._begin = (time.monotonic(), trainer.global_step)
-        self._last_line = time.monotonic()
-        self._print(trainer, "begins")  # the first step of a large network can take minutes
+        shown = None if self.is_enabled else False
+        self._bar = Bar("training", trainer.max_steps, "steps", shown, every=self.seconds)
+        self._bar.live.transient = False
+        self._bar.start()
+        self._bar.set(trainer.global_step)
 
-    def _print(self, trainer: L.Trainer, text: str) -> None:
-        if not self._watched and trainer.is_global_zero:
-            print(f"step {trainer.global_step}/{trainer.max_steps}  {text}", flush=True)
+    def on_train_batch_end(self, trainer: L.Trainer, *given: Any) -> None:
+        assert self._bar is not None
+        if trainer.global_step >= trainer.max_steps:
+            self._noted = self._bar.every = 0.0  # the last figures are always written
+        note, now = None, time.monotonic()
+        if now - self._noted >= min(self.seconds, 1):  # reading a loss waits for the GPU
+            self._noted, metrics = now, trainer.callback_metrics
+            losses = [f"{key.removeprefix('train/')} {float(metrics[key]):.4f}" for key in LOSSES if key in metrics]
+            rate = self._bar.rate(trainer.global_step) * int(getattr(trainer.datamodule, "batch_size", 1))  # type: ignore[attr-defined]
+            note = "  ".join([*losses, f"{rate:.1f} scans/s"])
+        self._bar.set(trainer.global_step, note)
 
-    def _rate(self, trainer: L.Trainer) -> float:
-        """Scans per second since the run (re)started."""
-        seconds, steps = time.monotonic() - self._begin[0], trainer.global_step - self._begin[1]
-        return steps * int(getattr(trainer.datamodule, "batch_size", 1)) / max(seconds, 1e-9)  # type: ignore[attr-defined]
+    def on_train_end(self, trainer: L.Trainer, *given: Any) -> None:
+        if self._bar is not None:
+            self._bar.stop()
 
-    def get_metrics(self, trainer: L.Trainer, pl_module: L.LightningModule) -> dict[str, Any]:
-        items: dict[str, Any] = super().get_metrics(trainer, pl_module)
-        items.pop("v_num", None)
-        items["scans/s"] = f"{self._rate(trainer):.1f}"
-        return items
-
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
-        now = time.monotonic()
-        if trainer.global_step < trainer.max_steps and now - self._last_line < self.seconds:
-            return
-        self._last_line = now
-        per_step = (now - self._begin[0]) / max(trainer.global_step - self._begin[1], 1)
-        left = duration((trainer.max_steps - trainer.global_step) * per_step)
-        loss = float(trainer.callback_metrics.get("train/loss", math.nan))
-        self._print(trainer, f"loss {loss:.4f}  {self._rate(trainer):.1f} scans/s  {left} left")
-
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        super().on_validation_end(trainer, pl_module)
-        if not trainer.sanity_checking and (loss := trainer.callback_metrics.get("val/loss")) is not None:
-            self._print(trainer, f"val/loss {float(loss):.4f}")
+    def on_exception(self, trainer: L.Trainer, *given: Any) -> None:
+        self.on_train_end(trainer)

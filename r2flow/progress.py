@@ -21,9 +21,14 @@ class Bar(Progress):
     Args:
         shown: Whether to draw it; default: on a terminal, elsewhere a line every `EVERY` seconds.
         lines: Print lines also on a terminal, since bars of several processes would overwrite each other.
+        evaluations: Network evaluations of all units, for `evaluated`; 0: unknown, as for adaptive solvers.
+        every: Seconds between lines.
     """
 
-    def __init__(self, doing: str, total: int, unit: str = "", shown: bool | None = None, lines: bool = False) -> None:
+    def __init__(
+        self, doing: str, total: int, unit: str = "scans", shown: bool | None = None, lines: bool = False,
+        evaluations: int = 0, every: float = EVERY,
+    ) -> None:  # fmt: skip
         drawn = not lines and (sys.stderr is not None and sys.stderr.isatty() if shown is None else shown)
         super().__init__(
             TextColumn(doing), BarColumn(), MofNCompleteColumn(), TextColumn(unit), _Rate(), TimeRemainingColumn(),
@@ -31,7 +36,8 @@ class Bar(Progress):
             console=Console(stderr=True), transient=True, disable=not drawn,
         )  # fmt: skip
         self._task = self.add_task(unit, total=total, note="")
-        self._doing, self._unit = doing, unit
+        self._doing, self._unit, self.every = doing, unit, every
+        self._share, self._spent = total / evaluations if evaluations else 0.0, 0
         self._lines = lines or (shown is None and not drawn)
         self._printed = time.monotonic()
         self._first: tuple[float, float] | None = None  # units done at the first call, above 0 after resuming; its time
@@ -40,29 +46,40 @@ class Bar(Progress):
         self.advance(self._task, units)
         self._print()
 
+    def evaluated(self) -> None:
+        """Count an evaluation of the network."""
+        self._spent += 1
+        self.set(note=f"{self._spent} evaluations")
+        self(self._share)
+
     def set(self, done: float | None = None, note: str | None = None) -> None:
         """Set the number of finished units, and the note after the bar."""
+        if note is not None:
+            self.update(self._task, note=note)
         if done is not None:
             self.update(self._task, completed=done)
             self._print()
-        if note is not None:
-            self.update(self._task, note=note)
+
+    def rate(self, done: float) -> float:
+        """Units per second since the first call, for a number of finished units."""
+        now = time.monotonic()
+        before, began = self._first = self._first or (done, now)
+        return (done - before) / max(now - began, 1e-9)
 
     def _print(self) -> None:
         now, task = time.monotonic(), self.tasks[0]
-        before, began = self._first = self._first or (task.completed, now)
-        done = task.completed - before
-        if self._lines and done > 0 and now - self._printed >= EVERY:
-            self._printed, rate = now, done / (now - began)
-            left = duration(max((task.total or 0) - task.completed, 0) / rate)
+        rate = self.rate(task.completed)
+        if self._lines and rate > 0 and now - self._printed >= self.every:
+            self._printed, left = now, duration(max((task.total or 0) - task.completed, 0) / rate)
             counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
-            print(f"{counted}  {rate:.2f}/s  {left} left", file=sys.stderr, flush=True)
+            line = f"{counted}  {rate:.2f}/s  {left} left  {task.fields['note']}"
+            print(line.rstrip(), file=sys.stderr, flush=True)
 
 
 class _Rate(ProgressColumn):
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
-        return Text(f"{speed:.2f} {task.description or ''}/s" if speed else "")
+        return Text(f"{speed:.2f}/s" if speed else "")
 
 
 def track(items: Iterable[T], doing: str, unit: str = "", total: int | None = None, least: int = 0) -> Iterator[T]:

@@ -26,8 +26,8 @@ from r2flow.metrics.completion import common_mae
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.models import DEFAULT, DENSIFY
-from r2flow.progress import track
-from r2flow.reports.outputs import ScanBar, recipe_of
+from r2flow.progress import Bar, track
+from r2flow.reports.outputs import recipe_of
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import Panel, write_page
 from r2flow.store import Store, read_manifest
@@ -76,7 +76,7 @@ def write_completed(
     done: dict[str, np.ndarray | None] = {}
     used = kept = outside = blind = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
-    with ScanBar("completing", len(left) * job.num, len(left) * batches, "answers") as bar:
+    with Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches) as bar:
         for number in left:
             scan = scans[number]
             whole, given = hiding(scan, job, number)

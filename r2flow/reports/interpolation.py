@@ -14,7 +14,7 @@ from r2flow.inversion import TIGHT, Real, interpolate_scans, round_trip
 from r2flow.lidar.projection import write_scan
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.sampling import warn_unsolved
-from r2flow.reports.outputs import ScanBar
+from r2flow.progress import Bar
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import table
@@ -37,7 +37,7 @@ def interpolation(
 ) -> Page:
     """Write `frames` interpolated scans as `out/frames/NNN.ply` and `.npy`; return the page, not yet written."""
     pair, names, rays = torch.stack([scan.image for scan in scans]), [s.name for s in scans], checkpoint.sensor.rays()
-    with ScanBar("interpolating", frames, frames * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
+    with Bar("interpolating", frames, evaluations=frames * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
         result = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.set)
     warn_unsolved(result.converged)
     images, weights = result.images.nan_to_num(0.0).numpy(), result.weights.tolist()

@@ -62,7 +62,7 @@ def write_samples(
     store = FileStore(out, "samples", recipe_of(checkpoint, seed, sampler, **part), endings)
     stale = _stale(store, replace)
     shown: list[np.ndarray] = []
-    with ScanBar("sampling", num, math.ceil(num / batch_size) * (sampler.evaluations(generator) or 0)) as bar:
+    with Bar("sampling", num, evaluations=math.ceil(num / batch_size) * (sampler.evaluations(generator) or 0)) as bar:
         for first in range(0, num, batch_size):
             numbers = range(first, min(first + batch_size, num))
             if first < pictures or stale or store.missing(numbers):
@@ -114,23 +114,6 @@ def recipe_of(checkpoint: Checkpoint, seed: int, sampler: Sampler, **more: Any) 
         "sampler": sampler.asdict(), "step": checkpoint.step, "weights": weights_hash(checkpoint), "rays": "centre",
         **more,
     }  # fmt: skip
-
-
-class ScanBar(Bar):
-    """Progress bar of scans that also advances with network evaluations.
-
-    `evaluations` is their total, one per batch; 0: unknown, as for adaptive solvers.
-    """
-
-    def __init__(self, doing: str, num: int, evaluations: int = 0, unit: str = "scans") -> None:
-        super().__init__(doing, num, unit)
-        self._share = num / evaluations if evaluations else 0.0
-        self._spent = 0
-
-    def evaluated(self) -> None:
-        self._spent += 1
-        self(self._share)
-        self.set(note=f"{self._spent} evaluations")
 
 
 def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str) -> None:

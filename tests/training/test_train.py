@@ -68,7 +68,7 @@ def test_next_is_what_has_not_been_done(alone: tuple[Path, str]):
 def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
     before = weights(copied)
     done = train("name=copied")
-    assert "step 12/12" not in done.stdout  # the line of training's progress
+    assert "training 12/12" not in done.stderr  # the line of training's progress
     assert "checkpoint" in done.stdout
     assert "(single batches: too few to compare)" in done.stdout
     torch.testing.assert_close(weights(copied), before, rtol=0, atol=0)

@@ -22,7 +22,7 @@ from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
-from r2flow.reports.outputs import ScanBar
+from r2flow.progress import Bar
 from r2flow.reports.view import Panel, write_page
 from r2flow.samplers import OnGrid
 from r2flow.simulator import simulate
@@ -99,7 +99,7 @@ def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: 
     samplers = [flow.generator.choose(steps=count) for count in steps] or [flow.generator.sampler]
     evaluations = num * sum(sampler.evaluations(flow.generator) or 0 for sampler in samplers)
     sets = []
-    with ScanBar("sampling", num * len(samplers), evaluations) as bar:
+    with Bar("sampling", num * len(samplers), evaluations=evaluations) as bar:
         for sampler in samplers:
             images = flow.sample(num, seed, sampler=sampler, progress=bar.evaluated)
             sets.append(images.nan_to_num(0.0).numpy())
@@ -126,7 +126,7 @@ def way_panels(
     x = Draws(seed, range(num)).start(generator.noise_shape)
     grid = [i / (times - 1) for i in range(times)]
     decoded = [flow.encoding.decode(x)]
-    with ScanBar("solving", times - 1, (times - 1) * (solver.evaluations(generator) or 0)) as bar:
+    with Bar("solving", times - 1, evaluations=(times - 1) * (solver.evaluations(generator) or 0)) as bar:
         for t_0, t_1 in pairwise(grid):
             x = generator.solve(x, t_0, t_1, sampler=solver, progress=bar.evaluated).x
             decoded.append(flow.encoding.decode(x.cpu()))
