@@ -46,7 +46,7 @@ class LogScale(RangeFormat):
 
 
 class ShiftedLog(LogScale):
-    """log2(r + 1.0001) / scale, clipped to [0, 1], with scale = log2(r_max + 1) rounded up to hundredths.
+    """log2(r + 1.0001) / scale, with scale = log2(r_max + 1) rounded up to hundredths.
 
     Used by LiDARGen (r_max 63 m, scale 6) and LiDM (56 m, 5.84). A ray without return is log2(1.0001) / scale, not
     exactly 0; the inverse, 2^(scale y) - 1, keeps the offset of 0.1 mm.
@@ -56,7 +56,7 @@ class ShiftedLog(LogScale):
         self.scale = math.ceil(100 * math.log2(sensor.max_range + 1) - 1e-9) / 100
 
     def forward(self, r: Tensor) -> Tensor:
-        return super().forward(r.clamp(min=0) + 1e-4).clamp(0, 1)
+        return super().forward(r.clamp(min=0) + 1e-4)
 
     def inverse(self, y: Tensor) -> Tensor:
         return super().inverse(y.clamp(0, 1))
@@ -139,7 +139,7 @@ class Encoding:
     def encode(self, image: Tensor) -> Tensor:
         """Map range in metres and reflectance in [0, 1], (..., 2 or 1, H, W), to (..., channels, H, W).
 
-        A dropped ray, range 0, becomes exactly -1, or nearly under `shifted_log`.
+        A dropped ray, range 0, becomes exactly -1, or nearly under `shifted_log`; values are clipped to [-1, 1].
         """
         r = image[..., :1, :, :]
         if self.limits == "open":
@@ -148,7 +148,7 @@ class Encoding:
         if self.reflectance:
             assert image.shape[-3] > 1, "the model has a reflectance channel and the scan has none"
             y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)
-        return 2 * y - 1
+        return (2 * y - 1).clamp(-1, 1)
 
     def decode(self, x: Tensor) -> Tensor:
         """Map (..., channels, H, W) to range in metres and reflectance, (..., 2 or 1, H, W).
