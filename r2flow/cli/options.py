@@ -125,8 +125,8 @@ class ReadingOptions:
         Literal["spherical", "unfolding"] | None, typer.Option(help="Projection. Default: spherical.")
     ] = None
     convention: Annotated[
-        Literal["centre", "reference", "lidm"] | None,
-        typer.Option(help="reference, lidm: as in published models. Default: centre."),
+        Literal["centre", "reference", "lidargen", "lidm"] | None,
+        typer.Option(help="Default: centre; others: as in published models."),
     ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None

@@ -35,8 +35,9 @@ def project(
 
     `centre` keeps returns with min_range <= r <= max_range in the field of view. `reference` is the convention of the
     published R2Flow: elevations outside the view are clamped to the edge rows, and the range limits are applied after
-    the nearest return is chosen, so that a return nearer than min_range empties its pixel; `lidm`, that of
-    the published LiDM, applies them first.
+    the nearest return is chosen, so that a return nearer than min_range empties its pixel. `lidargen` and `lidm` are
+    those of the published LiDARGen and LiDM: azimuth -180 degrees is in the last column, of equal ranges the last in
+    NumPy's order is chosen, and `lidm` applies the limits first, min_range < r < max_range.
 
     Args:
         xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. Points that are not finite are rays without
@@ -87,14 +88,16 @@ def project_indices(
         points, r = np.where(finite[:, None], xyz, np.float32(0)), np.where(finite, r, np.float32(0))
     row = _rows(xyz if projection == "unfolding" else points, r, sensor, projection, convention, ring)
     pixel = row * columns
-    pixel += _columns(points, columns)
+    pixel += _columns(points, columns, convention)
     within = finite & (r >= sensor.min_range) & (r <= sensor.max_range)
     if convention != "centre":
-        pixel[~(within if convention == "lidm" else finite)] = rows * columns
+        if convention == "lidm":
+            finite = within = (r > sensor.min_range) & (r < sensor.max_range)
+        kept = np.flatnonzero(finite)
         # Points are written from far to near, the nearest last. Under 1 % of KITTI's pixels have two points of equal
         # range, in millimetres. The reference's choice depends on NumPy's unstable sort, so the same sort is used.
-        order = np.argsort(-r)
-        owner = np.full(rows * columns + 1, -1, dtype=np.int64)
+        order = kept[np.argsort(-r[kept]) if convention == "reference" else np.argsort(r[kept])[::-1]]
+        owner = np.full(rows * columns, -1, dtype=np.int64)
         owner[pixel[order]] = order
         hit = np.flatnonzero(owner >= 0)
         hit = hit[within[owner[hit]]]
@@ -116,7 +119,10 @@ def _rows(
     elevation = np.arcsin(xyz[:, 2] / np.maximum(r, np.float32(1e-12)))
     edges = np.deg2rad(sensor.row_edges)
     step = np.diff(edges)
-    if np.allclose(step, step[0], rtol=1e-6):  # evenly spaced: an affine map instead of a search
+    even = np.allclose(step, step[0], rtol=1e-6)
+    if even and convention in ("lidargen", "lidm"):  # their order of operations, in float32
+        row = np.floor((1 - (elevation - float(edges[-1])) / float(edges[0] - edges[-1])) * rows).astype(np.int64)
+    elif even:  # an affine map instead of a search
         place = edges[0] - elevation
         place /= edges[0] - edges[-1]
         place *= rows
@@ -126,12 +132,13 @@ def _rows(
     return row if convention == "centre" else np.clip(row, 0, rows - 1)
 
 
-def _columns(xyz: np.ndarray, columns: int) -> np.ndarray:
+def _columns(xyz: np.ndarray, columns: int, convention: Convention) -> np.ndarray:
     """Column of every point, (N,) int64."""
     turn = (1 - np.arctan2(xyz[:, 1], xyz[:, 0]) / np.float32(math.pi)) / 2  # of [0, 1], 1 at exactly -180 degrees
     column = (turn * np.float32(columns)).astype(np.int64)
     np.minimum(column, columns - 1, out=column)  # float32 may round the last bin up to W
-    column[turn == 1] = 0
+    if convention in ("centre", "reference"):
+        column[turn == 1] = 0
     return column
 
 

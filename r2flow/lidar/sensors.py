@@ -17,7 +17,7 @@ from r2flow.files import atomic_write, reading
 from r2flow.registry import Registry, UnknownName, check_options
 
 Rays = Literal["centre", "reference"]
-Convention = Literal[Rays, "lidm"]
+Convention = Literal[Rays, "lidargen", "lidm"]
 
 MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, but within memory
 ENDINGS = (".yaml", ".yml")

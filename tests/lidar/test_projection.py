@@ -63,7 +63,7 @@ def test_a_return_too_near_does_not_hide_what_is_behind_it():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("convention", ["centre", "reference", "lidm"])
+@pytest.mark.parametrize("convention", ["centre", "reference", "lidargen", "lidm"])
 @pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
 def test_points_that_are_not_finite_are_no_returns(convention, lost):
     """Neither in their own pixel nor in one that another point falls into, as the one at azimuth and elevation 0."""
@@ -86,6 +86,13 @@ def test_points_out_of_view_are_dropped_not_clamped():
     assert project(points, np.ones(2), HDL64E)[0].max() == 0
     clamped = project(points, np.ones(2), HDL64E, convention="reference")
     assert clamped[0, [0, 63], 512] == pytest.approx([10, 10], rel=1e-6)
+
+
+@pytest.mark.parametrize("convention", ["centre", "reference", "lidargen", "lidm"])
+def test_the_seam_is_where_the_convention_has_it(convention):
+    image = project(np.array([[-30, -0.0, 0], [80, 0, 0]]), None, HDL64E, convention=convention)[0]
+    assert image[:, 1023 if "lid" in convention else 0].max() == 30  # at -180 degrees
+    assert image[:, 512].max() == (0 if convention == "lidm" else 80)  # the limit itself
 
 
 def reference_rows_and_columns(points):

@@ -143,7 +143,7 @@ def test_ranges_and_intensities_are_encoded_and_decoded_as_published(shared: Pat
 def test_points_fall_into_the_published_pixels(shared: Path):
     case = load_case(shared, "lidargen_data.pt")
     sensor = build_sensor("hdl64e", 16, 64, 1e-3, 1e3)  # the published projection knows no limits
-    hit, chosen, r = project_indices(case["points"].numpy()[:, :3], sensor, convention="reference")
+    hit, chosen, r = project_indices(case["points"].numpy()[:, :3], sensor, convention="lidargen")
     found = np.full((2, 16 * 64), -1.0)
     found[:, hit] = chosen, r
     index, ranges = torch.from_numpy(found).view(2, 16, 64)

@@ -41,7 +41,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
             "sigma_last": float(f"{sigmas[-1]:.6g}"),
             "levels": len(sigmas),
         },
-        "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "reference"}},
+        "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "lidargen"}},
         "published": {"system": "LiDARGen"},
     }
     if averaged:
