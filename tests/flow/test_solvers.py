@@ -87,7 +87,7 @@ def test_solutions_of_a_network_are_the_published_ones(shared, by):
             how = {"steps": int(number)} if fixed else {"tolerance": float(number)}
             with torch.no_grad():
                 found = solve(model, x, float(back), float(not back), by + method, **how)
-            assert_near(found.x, end, 1e-4 if fixed else 2e-2)
+            assert_near(found.x, end, 1e-5 if fixed else 2e-2)
             assert not fixed or back or found.evaluations.tolist() == [published["nfe"]] * len(x)
 
 

@@ -111,7 +111,7 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
 
 
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):
-    quick = partial(checkpoint_subject, steps=16, tolerance=1e-3)
+    quick = partial(checkpoint_subject, steps=20, tolerance=1e-3)  # no step meets the random flow's pulse at t = 19/24
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     monkeypatch.setattr("r2flow.plugins._loaded", {"of/mine.py": "of/mine.py"})
     out = tmp_path / "reports"

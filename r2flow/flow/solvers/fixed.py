@@ -102,12 +102,12 @@ def heun2(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
 
 
 def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
-    """The classical Runge-Kutta method."""
+    """Kutta's 3/8 rule, as torchdiffeq's rk4, which published R2Flow samples with."""
     k_1 = v(t, x)
-    k_2 = v(t + h / 2, x + h / 2 * k_1)
-    k_3 = v(t + h / 2, x + h / 2 * k_2)
-    k_4 = v(t + h, x + h * k_3)
-    return x + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4)
+    k_2 = v(t + h / 3, x + h / 3 * k_1)
+    k_3 = v(t + h * 2 / 3, x + h * (k_2 - k_1 / 3))
+    k_4 = v(t + h, x + h * (k_1 - k_2 + k_3))
+    return x + h / 8 * (k_1 + 3 * (k_2 + k_3) + k_4)
 
 
 class Adams3:
