@@ -291,6 +291,14 @@ def test_sensor_and_angles_of_a_published_file_are_its_own_also_when_saved(share
     assert torch.equal(saved.sample(1), checkpoint.sample(1))
 
 
+def test_outputs_of_another_scale_are_refused(shared: Path, tmp_path: Path):
+    content = torch.load(shared / "oracle_baselines" / "dusty2_published.pth", weights_only=False)
+    content["cfg"]["model"]["generator"]["synthesis_kwargs"]["output_scale"] = 1.0
+    torch.save(content, tmp_path / "it.pth")
+    with pytest.raises(InputError, match="output_scale"):
+        load_checkpoint(tmp_path / "it.pth")
+
+
 def test_a_file_that_would_run_code_beside_its_config_is_refused(shared: Path, tmp_path: Path):
     content = torch.load(shared / "oracle_baselines" / "vanilla_published.pth", weights_only=False)
     content["optim_G"] = Trap()

@@ -295,6 +295,16 @@ def test_a_published_diffusion_without_its_config_has_the_published_size(shared:
     assert loaded.config["generator"]["beta_last"] == 0.0195
 
 
+@pytest.mark.parametrize("name", ["use_new_attention_order", "scale_by_std"])
+def test_an_option_that_changes_the_images_and_is_not_read_is_refused(published: tuple[Path, Any], name: str):
+    config = yaml.safe_load((notes := published[0].with_name("config.yaml")).read_text())
+    params = config["model"]["params"]
+    (params if name == "scale_by_std" else params["unet_config"]["params"])[name] = True
+    notes.write_text(yaml.safe_dump(config))
+    with pytest.raises(InputError, match=name):
+        load_checkpoint(published[0])
+
+
 def test_points_fall_into_the_published_pixels(published: tuple[Path, dict[str, Any]], shared: Path):
     case = load_case(shared, "lidm_data.pt")
     nearest, farthest = case["depth_range"]

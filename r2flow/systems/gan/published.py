@@ -61,8 +61,9 @@ def _generator(model: Mapping[str, Any], out: Mapping[str, Mapping[str, Any]]) -
     options["temperature"] = float(measurement["gumbel_temperature"])
     if name == "dusty1":
         return options
-    if synthesis["use_noise"] or synthesis["pe_type"] != "random" or set(synthesis["layers"]) != {2}:
-        raise ValueError("use_noise, pe_type or layers of a form that is not the published one")
+    scaled = synthesis.get("output_scale", 0.25) != 0.25
+    if scaled or synthesis["use_noise"] or synthesis["pe_type"] != "random" or set(synthesis["layers"]) != {2}:
+        raise ValueError("output_scale, use_noise, pe_type or layers of a form that is not the published one")
     deeper = {"code": int(mapping["out_ch"]), "depth": int(mapping["depth"]), "doublings": len(synthesis["layers"])}
     return {**options, **deeper}
 

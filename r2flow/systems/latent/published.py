@@ -26,6 +26,11 @@ UNET, AUTOENCODER, AVERAGE = "model.diffusion_model.", "first_stage_model.", "mo
 FIRST, CODES = "encoder.conv_in.weight", "quantize.embedding.weight"
 STRIDES = {kernel: list(stride) for stride, kernel in UP.items()}
 SIZE, RANGES, VIEW, HEAD = (64, 1024), (1.0, 56.0), (3, -25), 32
+# Options of config.yaml that would change the images, but no weight's shape; all published files have these.
+USUAL = {
+    "lib_name": "lidm", "num_heads": -1, "use_new_attention_order": False, "parameterization": "eps",
+    "beta_schedule": "linear", "scale_factor": 1.0, "scale_by_std": False,
+}  # fmt: skip
 
 
 def _state(content: Any) -> Mapping[str, Tensor]:
@@ -47,7 +52,11 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
     state, notes = _state(content), _notes(path)
     raw = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
     undotted = {name: AVERAGE + name.removeprefix("model.").replace(".", "") for name in raw}
-    unet = ((notes.get("model") or {}).get("params") or {}).get("unet_config", {}).get("params", {})
+    params = (notes.get("model") or {}).get("params") or {}
+    unet = params.get("unet_config", {}).get("params", {})
+    options = {**USUAL, **params, **unet}
+    if other := {name: options[name] for name, usual in USUAL.items() if options[name] != usual}:
+        raise InputError(f"{path}: its config.yaml has {other}, and only LiDM's own form is read.")
     generator = {
         "name": "latent_diffusion",
         "autoencoder": _autoencoder(_within(raw, AUTOENCODER)),
