@@ -1,6 +1,7 @@
 """r2flow report solvers: rows against closed forms, the choice among them, and the report."""
 
 import json
+import logging
 import math
 from functools import partial
 
@@ -110,7 +111,8 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
     assert set(page.figures) == {"solvers_problems"}
 
 
-def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):
+def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog):
+    caplog.set_level(logging.NOTSET, "r2flow.flow")  # which the verb raises; set back after the test
     quick = partial(checkpoint_subject, steps=20, tolerance=1e-3)  # no step meets the random flow's pulse at t = 19/24
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     monkeypatch.setattr("r2flow.plugins._loaded", {"of/mine.py": "of/mine.py"})
