@@ -40,7 +40,8 @@ class Progress(ProgressBar):
             self._noted, metrics = now, trainer.callback_metrics
             losses = [f"{key.removeprefix('train/')} {float(metrics[key]):.4f}" for key in LOSSES if key in metrics]
             rate = self._bar.rate(trainer.global_step) * int(getattr(trainer.datamodule, "batch_size", 1))  # type: ignore[attr-defined]
-            note = "  ".join([*losses, f"{rate:.1f} scans/s"])
+            fits = self._bar.disable or self._bar.console.width >= 100  # else the time left would be cut
+            note = "  ".join([*losses, *[f"{rate:.1f} scans/s"] * fits])
         self._bar.set(trainer.global_step, note)
 
     def on_train_end(self, trainer: L.Trainer, *given: Any) -> None:
