@@ -265,6 +265,7 @@ class Store:
                 lock.acquire()
             except Timeout:
                 return False
+            self.check()  # another command may have taken the folder, which held the manifest alone
             if not self.has(item):
                 work(item)
         finally:
