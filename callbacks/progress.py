@@ -9,8 +9,6 @@ from lightning.pytorch.callbacks import ProgressBar
 from r2flow.progress import Bar
 from r2flow.registry import NonNegative
 
-LOSSES = "train/loss", "val/loss"
-
 
 class Progress(ProgressBar):
     """A bar of steps with losses and scans per second; a line every `seconds` if standard error is not a terminal."""
@@ -37,8 +35,8 @@ class Progress(ProgressBar):
             self._noted = self._bar.every = 0.0  # the last figures are always written
         note, now = None, time.monotonic()
         if now - self._noted >= min(self.seconds, 1):  # reading a loss waits for the GPU
-            self._noted, metrics = now, trainer.callback_metrics
-            losses = [f"{key.removeprefix('train/')} {float(metrics[key]):.4f}" for key in LOSSES if key in metrics]
+            self._noted, shown = now, trainer.progress_bar_metrics  # logged with prog_bar=True
+            losses = [f"{key.removeprefix('train/')} {value:.4f}" for key, value in shown.items()]
             rate = self._bar.rate(trainer.global_step) * int(getattr(trainer.datamodule, "batch_size", 1))  # type: ignore[attr-defined]
             fits = self._bar.disable or self._bar.console.width >= 100  # else the time left would be cut
             note = "  ".join([*losses, *[f"{rate:.1f} scans/s"] * fits])

@@ -112,7 +112,7 @@ def test_the_first_process_of_a_training_writes_its_losses_and_scans_per_second(
     now = 100.0
     monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)
     trainer: Any = SimpleNamespace(max_steps=17, global_step=10, is_global_zero=first)  # resumed at step 10
-    trainer.datamodule, trainer.callback_metrics = SimpleNamespace(batch_size=4), {"train/loss": torch.tensor(0.25)}
+    trainer.datamodule, trainer.progress_bar_metrics = SimpleNamespace(batch_size=4), {"train/loss": 0.25}
     progress = Progress(seconds=15)
     progress.setup(trainer, Mock(), "fit")
     progress.on_train_start(trainer, Mock())
