@@ -54,7 +54,7 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
     undotted = {name: AVERAGE + name.removeprefix("model.").replace(".", "") for name in raw}
     params = (notes.get("model") or {}).get("params") or {}
     unet = params.get("unet_config", {}).get("params", {})
-    options = {**USUAL, **params, **unet}
+    options = {**USUAL, **({"lib_name": "ldm"} if unet else {}), **params, **unet}  # ldm: without circular convolutions
     if other := {name: options[name] for name, usual in USUAL.items() if options[name] != usual}:
         raise InputError(f"{path}: its config.yaml has {other}, and only LiDM's own form is read.")
     generator = {
