@@ -72,7 +72,7 @@ def parse_sampler(text: str) -> dict[str, Any]:
     """Parse `NAME[:FIELD=VALUE]...`, as `sde:steps=16:grid=power:2`, into name and fields."""
     from omegaconf import OmegaConf
 
-    name, *fields = re.split(r":(?=\w+=)", re.sub(r"=0+(?=\d)", "=", text))  # YAML's 010 is eight
+    name, *fields = re.split(r":(?=\w+=)", re.sub(r"=0+(?=\d+(?::|$))", "=", text))  # YAML's 010 is eight
     try:
         return {"name": name, **OmegaConf.to_object(OmegaConf.from_dotlist(fields))}  # type: ignore[dict-item]
     except Exception as error:  # of YAML, or of an interpolation
