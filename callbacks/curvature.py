@@ -2,7 +2,7 @@
 
 import lightning as L
 
-from r2flow.flow.straightness import paths
+from r2flow.flow.straightness import straightness
 from r2flow.generators import Flow
 from r2flow.noise import Draws
 from r2flow.registry import Count, Natural
@@ -31,7 +31,7 @@ class Curvature(Periodic):
         if not isinstance(flow, Flow) or not flow.draws or flow.fixed:
             return
         x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
-        result = paths(flow.velocity, x_0, self.steps)
+        result = straightness(flow.velocity, x_0, self.steps)
         values = {"s": result.s.mean().item(), "bend": result.s_normalised.mean().item()}
         for logger in trainer.loggers:
             # Lightning logs with the step before the one just finished

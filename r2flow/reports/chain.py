@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.flow.straightness import paths
+from r2flow.flow.straightness import straightness
 from r2flow.generators import Flow
 from r2flow.lidar.projection import write_scan
 from r2flow.metrics.panel import PANEL, distances, mean_distance, panel
@@ -102,4 +102,4 @@ def bend(flow: Checkpoint, num: int) -> float:
         return math.nan
     x_0 = Draws(0, range(num)).start(generator.noise_shape).to(generator.device)
     with torch.inference_mode():
-        return float(paths(generator.velocity, x_0, MANY).s_normalised.mean())
+        return float(straightness(generator.velocity, x_0, MANY).s_normalised.mean())

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from r2flow.flow.straightness import Paths, paths
+from r2flow.flow.straightness import Straightness, straightness
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint
@@ -34,7 +34,7 @@ def measure_paths(
     batch_size: int = 1,
     most_curved: int = MOST_CURVED,
     progress: Progress = None,
-) -> Paths:
+) -> Straightness:
     """s(t) over `steps` Euler steps of scans 0 to num - 1 of a seed, and the most curved paths.
 
     Each batch takes `steps` evaluations, with a call of `progress` after each, and keeps as many images per scan.
@@ -44,15 +44,15 @@ def measure_paths(
     for first in range(0, num, batch_size):
         x_0 = Draws(seed, range(first, min(first + batch_size, num))).start(flow.noise_shape).to(flow.device)
         with torch.inference_mode():
-            parts.append(paths(flow.velocity, x_0, steps, most_curved, progress))
+            parts.append(straightness(flow.velocity, x_0, steps, most_curved, progress))
     _, s, squared_length, bends, trajectories = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
     if broken := int((~s.isfinite().all(1)).sum()):
         log.warning("%s: s(t) is not finite for %d of %d scans.", label, broken, len(s))
     order = bends.argsort(descending=True, stable=True)[:most_curved]
-    return Paths(parts[0].t, s, squared_length, bends[order], trajectories[order])
+    return Straightness(parts[0].t, s, squared_length, bends[order], trajectories[order])
 
 
-def curvature_rows(flows: Mapping[str, Paths]) -> list[dict[str, Any]]:
+def curvature_rows(flows: Mapping[str, Straightness]) -> list[dict[str, Any]]:
     """s(t) per checkpoint and time, mean over scans, unnormalised and over |d|^2."""
     return [
         {"checkpoint": label, "t": float(t), "s": float(s), "s_normalised": float(normalised)}
@@ -61,7 +61,7 @@ def curvature_rows(flows: Mapping[str, Paths]) -> list[dict[str, Any]]:
     ]
 
 
-def summary(label: str, flow: Paths) -> dict[str, Any]:
+def summary(label: str, flow: Straightness) -> dict[str, Any]:
     mean = flow.s.mean(0)
     total = float(mean.sum()) or math.nan
     return {
@@ -81,7 +81,7 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def curvature_text(flows: Mapping[str, Paths]) -> list[str]:
+def curvature_text(flows: Mapping[str, Straightness]) -> list[str]:
     """Text: definition of s(t), and the table of flows."""
     first = next(iter(flows.values()))
     about = (
@@ -93,7 +93,7 @@ def curvature_text(flows: Mapping[str, Paths]) -> list[str]:
     return [about, table([summary(*flow) for flow in flows.items()], COLUMNS)]
 
 
-def curvature_figure(flows: Mapping[str, Paths]) -> Figure:
+def curvature_figure(flows: Mapping[str, Straightness]) -> Figure:
     """Plot s(t), unnormalised and over |d|^2: one line per checkpoint, with the range over scans."""
     figure = blank_figure(10, 4.2)
     panels = {"s": "s(t) = |(x_1 - x_0) - v_t|²", "s_normalised": "s(t) / |x_1 - x_0|²"}
@@ -110,7 +110,7 @@ def curvature_figure(flows: Mapping[str, Paths]) -> Figure:
     return figure
 
 
-def trajectories_figure(flows: Mapping[str, Paths]) -> Figure:
+def trajectories_figure(flows: Mapping[str, Straightness]) -> Figure:
     """Plot the most curved paths, one panel per checkpoint: the paper's figure 8 (b)."""
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
@@ -123,7 +123,7 @@ def trajectories_figure(flows: Mapping[str, Paths]) -> Figure:
     return figure
 
 
-def curvature_page(flows: Mapping[str, Paths], seed: int, device: str = "cpu") -> Page:
+def curvature_page(flows: Mapping[str, Straightness], seed: int, device: str = "cpu") -> Page:
     figures = {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)}
     return Page(
         "curvature", "Straightness of flows", curvature_text(flows), curvature_rows(flows), figures,

@@ -69,7 +69,7 @@ def interpolation(
 def interpolation_figure(
     real: np.ndarray, frames: np.ndarray, weights: Sequence[float], rays: Tensor, names: Sequence[str]
 ) -> Figure:
-    """Contact sheet of the real scans with frames in between, of which the first and last are their round trips."""
+    """Contact sheet of the real scans and the frames between them; the first and last frame are round trips."""
     last = len(frames) - 1
     chosen = sorted({round(i) for i in np.linspace(0, last, MOST)})
     between = {i: "round trip" if i in (0, last) else f"w = {weights[i]:.2f}" for i in chosen}

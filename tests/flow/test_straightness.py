@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from r2flow.flow.problems import Gaussian, Rotating
-from r2flow.flow.straightness import paths
+from r2flow.flow.straightness import straightness
 
 GAUSSIAN, ROTATION = Gaussian(), Rotating(turns=1 / math.pi)
 X_0 = torch.randn(3, 2, 2, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
@@ -17,7 +17,7 @@ def test_s_is_that_of_the_exact_path(problem):
     chord = problem.solution(X_0, 1.0) - X_0
     off = []
     for steps in (512, 1024):
-        found = paths(problem, X_0, steps=steps)
+        found = straightness(problem, X_0, steps=steps)
         assert found.s.shape == (3, steps)
         velocities = torch.stack([problem(t, problem.solution(X_0, t)) for t in found.t.double()], 1)
         exact = (chord[:, None] - velocities).square().flatten(2).sum(2)
@@ -32,7 +32,7 @@ def test_s_is_that_of_the_exact_path(problem):
 def test_a_small_variance_survives_float32():
     # v = 100 + a (t - 1/2): variance a^2 / 12 (1 - 1/n^2), nine digits below |v|^2.
     a, n = 1e-2, 64
-    found = paths(lambda t, x: torch.full_like(x, 100) + a * (t - 0.5), torch.zeros(1, 1), steps=n)
+    found = straightness(lambda t, x: torch.full_like(x, 100) + a * (t - 0.5), torch.zeros(1, 1), steps=n)
     assert found.s.mean().item() == pytest.approx(a**2 / 12 * (1 - 1 / n**2), rel=2e-3)
 
 
@@ -41,18 +41,18 @@ def test_a_path_that_is_not_finite_is_not_the_most_curved():
         spoiled = torch.tensor([False, True, False]).view(-1, 1, 1, 1)
         return torch.where(spoiled, math.nan, ROTATION(t, x))
 
-    found = paths(velocity, X_0, steps=8, most_curved=20)
+    found = straightness(velocity, X_0, steps=8, most_curved=20)
     assert found.trajectories.isfinite().all()
 
 
 def test_a_network_that_can_learn_is_followed_too():
     """Nothing is kept for a gradient."""
     layer = torch.nn.Linear(8, 8, dtype=torch.float64)
-    found = paths(lambda t, x: layer(x), X_0, 4, most_curved=1)
+    found = straightness(lambda t, x: layer(x), X_0, 4, most_curved=1)
     assert not any(part.requires_grad for part in found)
 
 
 def test_a_network_may_give_its_velocities_in_one_buffer():
     buffer = torch.empty_like(X_0)
-    found = paths(lambda t, x: buffer.copy_(ROTATION(t, x)), X_0, 8)
-    assert torch.equal(found.s, paths(ROTATION, X_0, 8).s)
+    found = straightness(lambda t, x: buffer.copy_(ROTATION(t, x)), X_0, 8)
+    assert torch.equal(found.s, straightness(ROTATION, X_0, 8).s)
