@@ -1,6 +1,5 @@
 """Batches of scans for metrics: checked, masked, with derived representations."""
 
-import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -10,12 +9,10 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError, check
+from r2flow.lidar.encoding import wrong_with
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Rays, Sensor
 from r2flow.metrics.birds_eye import birds_eye_histogram
-
-FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
-FAR = 300.0  # metres, above any scan's median range
 
 # Range limits of returns in metres, for both sets and all metrics, as in the published evaluation.
 MASK = (0.5, 63.0)
@@ -44,7 +41,7 @@ class Scans:
         check(fits, f"images of {sensor.name} have the shape (B, 2 or 1, {h}, {w}), not {found}.")
         images = images.float()
         for number, image in enumerate(images):
-            if wrong := _wrong_with(image):
+            if wrong := wrong_with(image):
                 raise InputError(f"scan {number if names is None else names[number]}: {wrong}.")
         self.rays, self._measured = rays, xyz
         r = images[:, :1]
@@ -93,19 +90,3 @@ def on_bin_corners(r: Tensor, sensor: Sensor) -> Tensor:
     degrees = np.meshgrid(sensor.row_edges[:-1], 180 - 360 * np.arange(sensor.columns) / sensor.columns, indexing="ij")
     e, a = (torch.from_numpy(angle).float().deg2rad().to(r.device) for angle in degrees)
     return torch.cat([r * e.cos() * a.cos(), r * e.cos() * a.sin(), r * e.sin()], 1)
-
-
-def _wrong_with(image: Tensor) -> str | None:
-    """Problem of an image, (2 or 1, H, W), with a hint; None if valid."""
-    low, high = torch.stack(image.flatten(1).aminmax(dim=1)).tolist()  # NaN if a channel contains NaN
-    for name, least, most in zip(("range", "reflectance"), low, high, strict=False):
-        if not math.isfinite(least) or not math.isfinite(most):
-            return f"its {name} is NaN or infinite in places; 0 stands for a ray without a return"
-        if least < 0:
-            hint = "is it in model space ([-1, 1])? Decode it" if max(-least, most) <= 1 else "0 stands for no return"
-            return f"its {name} goes down to {least:.4g}; {hint}"
-    if high[0] >= FAR and (median := float(image[0][image[0] > 0].median())) >= FAR:
-        return f"its median range is {median:.4g} m; are these millimetres? Give metres"
-    if max(high[1:], default=0) > FULL:
-        return f"its reflectance goes up to {high[1]:.4g}, not 1; divide by its full scale, often 255"
-    return None

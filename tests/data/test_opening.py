@@ -264,6 +264,9 @@ def test_scans_that_are_no_files_are_a_kind_of_their_own():
     (batch,) = data.val_dataloader()
     assert batch["x_1"].shape == (1, 1, 8, 32)
     assert data.names == [f"wall at {i} m" for i in range(2, 12)]
+    data = ScanDataModule(SENSOR, Encoding(SENSOR, reflectance=False), 0, name="walls", root=5000)
+    with pytest.raises(InputError, match=r"wall at \d+ m: its median range is .* millimetres\? Give metres"):
+        next(iter(data.val_dataloader()))
 
 
 @pytest.mark.parametrize("shape", [None, (5,)])
