@@ -36,19 +36,8 @@ OF_THE_MODEL = Key(inherited="always", links="scans")
 OF_SCANS = Key(links="scans")
 
 RULES: dict[str, Key] = {
-    "experiment": OF_THE_CHAIN,
-    "size": OF_THE_CHAIN,
-    "hydra": OF_THE_CHAIN,
-    "name": OF_THE_CHAIN,
-    "run_dir": OF_THE_CHAIN,
-    "chain": OF_THE_CHAIN,
-    "preview": OF_THE_CHAIN,
-    "plugins": FREE,
-    "loggers": FREE,
-    "samples": FREE,
-    "sampler": FREE,
-    "few": FREE,
-    "parent.path": FREE,
+    **dict.fromkeys(("experiment", "size", "hydra", "name", "run_dir", "chain", "preview"), OF_THE_CHAIN),
+    **dict.fromkeys(("plugins", "loggers", "samples", "sampler", "few", "parent.path", "stage.init"), FREE),
     "sensor": replace(OF_THE_MODEL, inherited="with_pairs"),
     "encoding": OF_THE_MODEL,
     "encoding.levels": replace(OF_THE_MODEL, inherited="unless_given"),
@@ -56,39 +45,21 @@ RULES: dict[str, Key] = {
     "backbone": OF_THE_MODEL,
     "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # does not affect the weights' shapes
     "backbone.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
-    "stage.init": FREE,
-    "data": OF_SCANS,
-    "data.root": replace(OF_SCANS, resume="free"),
-    "data.parts.*.root": replace(OF_SCANS, resume="free"),
-    "data.validation": Key(),
-    "data.validation.data": OF_SCANS,
-    "data.validation.data.root": replace(OF_SCANS, resume="free"),
-    "data.batch_size": Key(),
-    "data.workers": FREE,
-    "data.memory_gib": FREE,
-    "data.pairs": Key(links="pairs"),
-    "data.pairs.of": Key(links="pairs", resume="free"),  # data.pairs.parent identifies them
-    "data.scans": Key(links="pairs"),
-    "data.scans.root": Key(links="pairs", resume="free"),
-    "callbacks.reflow_pairs": FREE,
-    "callbacks.pictures": FREE,
-    "callbacks.curvature": FREE,
-    "callbacks.guard": FREE,
-    "callbacks.requeue": FREE,
-    "callbacks.checkpoint": FREE,
-    "callbacks.progress": FREE,
-    "trainer.accelerator": FREE,
-    "trainer.strategy": FREE,
-    "trainer.devices": FREE,
-    "trainer.num_nodes": FREE,
-    "trainer.precision": FREE,
-    "trainer.default_root_dir": FREE,
-    "trainer.enable_progress_bar": FREE,
-    "trainer.log_every_n_steps": FREE,
-    "trainer.max_time": FREE,
-    "trainer.profiler": FREE,
-    "trainer.val_check_interval": FREE,
-}
+    **dict.fromkeys(("data", "data.validation.data"), OF_SCANS),
+    **dict.fromkeys(
+        ("data.root", "data.parts.*.root", "data.validation.data.root"), replace(OF_SCANS, resume="free")
+    ),
+    **dict.fromkeys(("data.validation", "data.batch_size"), Key()),
+    **dict.fromkeys(("data.workers", "data.memory_gib"), FREE),
+    **dict.fromkeys(("data.pairs", "data.scans"), Key(links="pairs")),
+    # data.pairs.parent identifies the flow that draws them.
+    **dict.fromkeys(("data.pairs.of", "data.scans.root"), Key(links="pairs", resume="free")),
+    **{f"callbacks.{name}": FREE for name in
+       ("reflow_pairs", "pictures", "curvature", "guard", "requeue", "checkpoint", "progress")},
+    **{f"trainer.{name}": FREE for name in
+       ("accelerator", "strategy", "devices", "num_nodes", "precision", "default_root_dir", "enable_progress_bar",
+        "log_every_n_steps", "max_time", "profiler", "val_check_interval")},
+}  # fmt: skip
 
 
 def rule(key: str) -> Key:
