@@ -11,33 +11,13 @@ import numpy as np
 
 from r2flow.errors import InputError, check, warn_odd
 from r2flow.files import atomic_write, reading
-from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
+from r2flow.lidar.scan_files import clouds, tables
 from r2flow.lidar.scan_files.points import FARTHEST, Points, check_columns, check_xyz, column_points
 from r2flow.lidar.scan_files.points import NoPointsError as NoPointsError
-from r2flow.lidar.scan_files.tables import (
-    read_array,
-    read_arrow,
-    read_las,
-    read_npy,
-    read_npz,
-    read_rows,
-    read_text,
-    usual_names,
-)
+from r2flow.lidar.scan_files.tables import read_array, read_rows, usual_names
 
 _ROWS = (".pcd.bin", ".bin")  # rows of float32; the one that ends with the other first
-_READERS = {
-    ".pcd": read_pcd,
-    ".ply": read_ply,
-    ".npy": read_npy,
-    ".npz": read_npz,
-    ".csv": read_text,
-    ".xyz": read_text,
-    ".txt": read_text,
-    ".feather": read_arrow,
-    ".parquet": read_arrow,
-    ".las": read_las,
-}
+_READERS = clouds.READERS | tables.READERS
 # Formats that are not supported, with advice on conversion.
 ELSEWHERE = {
     **dict.fromkeys((".mcap", ".db3", ".bag"), "holds many scans: r2flow unpack {path} --out FOLDER writes them"),
@@ -163,7 +143,7 @@ def write_points(
         elif ending == ".bin":
             file.write(table.tobytes())
         else:
-            {".pcd": write_pcd, ".ply": write_ply}[ending](file, table, tuple(given))
+            clouds.WRITERS[ending](file, table, tuple(given))
 
 
 def scan_ending(name: str) -> str:

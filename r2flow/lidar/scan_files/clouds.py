@@ -147,6 +147,10 @@ def write_ply(file: IO[bytes], table: np.ndarray, names: tuple[str, ...]) -> Non
     file.write(table.tobytes())
 
 
+READERS = {".pcd": read_pcd, ".ply": read_ply}
+WRITERS = {".pcd": write_pcd, ".ply": write_ply}
+
+
 def text_table(lines: list[str], rows: int, width: int) -> np.ndarray:
     """Numbers in all lines that are not blank, float64 (rows, width)."""
     lines = [line for line in lines if line.strip()]

@@ -170,6 +170,12 @@ def read_las(path: Path) -> Table:
     return names, [np.asarray(points[name]) for name in names]
 
 
+READERS = {
+    ".npy": read_npy, ".npz": read_npz, **dict.fromkeys((".csv", ".xyz", ".txt"), read_text),
+    **dict.fromkeys((".feather", ".parquet"), read_arrow), ".las": read_las,
+}  # fmt: skip
+
+
 def check_unpacked(path: Path, size: int) -> None:
     """Refuse a compressed file that declares far more bytes than its size allows."""
     most = MOST_UNPACKED * path.stat().st_size + (1 << 20)

@@ -23,11 +23,8 @@ def offsets(size: int) -> list[tuple[int, int, int]]:
 
     Odd kernels are centred, with x fastest; even kernels start at the voxel, with z fastest.
     """
-    if size % 2:
-        along = range(-(size // 2), size // 2 + 1)
-        return [(x, y, z) for z, y, x in product(along, repeat=3)]
-    along = range(1 - size // 2, size // 2 + 1)
-    return [(x, y, z) for x, y, z in product(along, repeat=3)]
+    cells = product(range(-((size - 1) // 2), size // 2 + 1), repeat=3)
+    return [(c, b, a) if size % 2 else (a, b, c) for a, b, c in cells]
 
 
 class VoxelGrid:
