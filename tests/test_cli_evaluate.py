@@ -190,9 +190,7 @@ def test_an_evaluation_resumes(points, saved, monkeypatch):
 class MeanRange(SumMetric):
     """A metric of a user's: the difference of the mean ranges."""
 
-    name = "mine"
-    representation = "range image"
-    width = 2
+    name, representation, width, biased = "mine", "range image", 2, True
 
     def rows(self, scans):
         returns = scans.returned.sum((1, 2, 3)).double()
@@ -217,7 +215,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
     (a, s), (b, t) = ((x.mean(0), np.cov(x.T)) for x in rows)
     frechet = ((a - b) ** 2).sum() + np.trace(s + t) - 2 * np.sqrt(np.linalg.eigvals(s @ t).clip(0)).real.sum()
     found = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"]
-    assert found[0]["figures"] == {"mine": pytest.approx(abs(ranges[0] - ranges[1]), rel=1e-4)}
+    assert (found[0]["biased"], found[0]["figures"]) == (True, {"mine": pytest.approx(abs(np.subtract(*ranges)), 1e-4)})
     assert found[1]["figures"] == {"frechet_means": pytest.approx(frechet, rel=1e-4)}
     assert "kid_means" in said
 

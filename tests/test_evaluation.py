@@ -263,7 +263,7 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
     if equal is not None:
         cases.append(("a, as many", equal, (half, half), "reference"))
     comparisons = [
-        Comparison(name, *map(range, sizes), [MetricResult(metric, {metric: number}, {})], kind)
+        Comparison(name, *map(range, sizes), [MetricResult(metric, {metric: number}, {}, metric == "panel")], kind)
         for name, number, sizes, kind in cases
     ]
     first, second = verdict(comparisons)
@@ -279,12 +279,12 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
 )
 def test_a_figure_by_which_a_baseline_is_nearer_than_real_scans_ranks_nothing(noise, said):
     cases = ("a", 7.0, "judged"), ("real halves", 10.0, "reference"), ("noise", noise, "baseline")
-    results = [(name, [MetricResult("jsd", {"jsd": value}, {})], kind) for name, value, kind in cases]
+    results = [(name, [MetricResult("jsd", {"jsd": value}, {}, True)], kind) for name, value, kind in cases]
     assert _remarks([Comparison(name, range(9), range(9), one, kind) for name, one, kind in results]) == said
 
 
 def test_the_verdict_is_of_the_panel_if_measured():
-    results = [MetricResult(name, {name: value}, {}) for name, value in (("kid_x", 5.0), ("panel", 7.0))]
+    results = [MetricResult(name, {name: value}, {}, True) for name, value in (("kid_x", 5.0), ("panel", 7.0))]
     named = (("a", "judged"), ("real halves", "reference"))
     both = [Comparison(name, range(200), range(200), results, kind) for name, kind in named]
     assert verdict(both)[0].startswith("a: panel 7 (reference: real halves 7): not distinguishable")
@@ -295,6 +295,6 @@ def test_the_verdict_is_of_the_panel_if_measured():
 def test_panels_are_means_of_the_same_lines():
     lines = dict.fromkeys(PANEL, 0.2)
     panels = [{"panel": 0.2, **lines, REFLECTANCE: math.nan}, {"panel": 0.3, **lines, REFLECTANCE: 1.4}]
-    sets = [Comparison(str(i), [], [], [MetricResult("panel", one, {})]) for i, one in enumerate(panels)]
+    sets = [Comparison(str(i), [], [], [MetricResult("panel", one, {}, True)]) for i, one in enumerate(panels)]
     assert [c.measured[0].figures["panel"] for c in with_equal_panels(sets)] == pytest.approx([0.2, 0.2])
     assert with_equal_panels(sets[1:]) == sets[1:]

@@ -133,7 +133,7 @@ def copies_result(judged: Nearest, real: Nearest, training: int) -> MetricResult
     settings = {"cells": list(CELLS), "turned": True, "mirrored": True, "training scans": training}
     sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(judged.numbers)}
     protocol = {**asdict(Protocol("copies", "log-range of cells", settings=settings)), "sizes": sizes}
-    return MetricResult("copies", figures, protocol, remarks)
+    return MetricResult("copies", figures, protocol, None, remarks)
 
 
 def with_copies(

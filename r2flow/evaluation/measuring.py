@@ -100,6 +100,7 @@ class MetricResult:
     metric: str
     figures: Mapping[str, float]  # by name; NaN if undefined, with a remark
     protocol: Mapping[str, Any]  # the metric's, plus set sizes and choice of real scans
+    biased: bool | None  # as in `ScanMetric`
     remarks: Sequence[str] = ()
 
 
@@ -183,7 +184,7 @@ def measure(
             "generated": len(generated), "generated_empty": empty,
         }  # fmt: skip
         settings = {**described, **asdict(metric.protocol), "sizes": sizes}
-        results.append(MetricResult(name, figures, settings, remarks))
+        results.append(MetricResult(name, figures, settings, metric.biased, remarks))
     return results
 
 
@@ -197,7 +198,7 @@ def speed_result(real: ScanSet, generated: ScanSet) -> MetricResult:
         "seconds": statistics.median(source.seconds or [math.nan]),
     }
     sizes = {"real": len(real), "real_chosen": "none", "generated": len(generated)}
-    return MetricResult("speed", figures, {**asdict(Protocol("speed", "network and solver")), "sizes": sizes})
+    return MetricResult("speed", figures, {**asdict(Protocol("speed", "network and solver")), "sizes": sizes}, None)
 
 
 def _update(

@@ -64,6 +64,8 @@ class ScanMetric(Metric):
             used if present.
         keeping: Whether rows are stored in memory, float32.
         fewest: Minimum number of scans per set for `distance`.
+        biased: Whether the first value, a distance that is 0 for equal sets, is larger for fewer scans; an evaluation
+            ranks the sets by it. None: it is no distance, and gets no verdict.
 
     Args:
         sensor: Sensor of images passed to `update` as tensors.
@@ -81,6 +83,7 @@ class ScanMetric(Metric):
     uses_reflectance: ClassVar[bool] = False
     keeping: ClassVar[bool] = False
     fewest: ClassVar[int] = 2
+    biased: ClassVar[bool | None] = None
 
     def __init__(self, *, sensor: Sensor | str | None = None, name: str | None = None, **options: Any) -> None:
         # Not cached: torchmetrics would return the value from before `merge_state`.

@@ -66,6 +66,7 @@ class KernelDistance(FeatureMetric):
     kind = "kid"
     settings: ClassVar[Mapping[str, Any]] = {"kernel": "(a b / D + 1)^3", "estimate": "unbiased, all pairs"}
     keeping = True
+    biased = False
 
     def distance(self, real: Tensor, generated: Tensor) -> Tensor:
         return _mean(real, real) + _mean(generated, generated) - 2 * _mean(real, generated)

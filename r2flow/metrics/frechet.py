@@ -68,6 +68,7 @@ class FrechetDistance(FeatureMetric):
     names = FIELD_NAMES
     settings: ClassVar[Mapping[str, Any]] = {"covariance": "unbiased, n - 1"}
     keeping = True
+    biased = True
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         values, remarks = super().figures()

@@ -27,6 +27,7 @@ class JSD(SumMetric):
     representation = "bird's-eye histogram"
     settings: ClassVar[Mapping[str, Any]] = {**PROTOCOL, "logarithm": "natural", "root": True}
     width = BINS * BINS
+    biased = True
 
     def rows(self, scans: Scans) -> Tensor:
         return histograms(scans)
@@ -56,6 +57,7 @@ class MMD(ScanMetric):
     representation = "bird's-eye histogram"
     settings: ClassVar[Mapping[str, Any]] = {**PROTOCOL, "kernel": "Gaussian", "sigma": SIGMA, "estimate": "biased"}
     keeping = True
+    biased = True
     fewest = 1
 
     def rows(self, scans: Scans) -> Tensor:

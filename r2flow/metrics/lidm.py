@@ -74,6 +74,7 @@ class MMDLiDM(ScanMetric):
         "cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"
     }  # fmt: skip
     keeping = True
+    biased = True
     fewest = 1
 
     def rows(self, scans: Scans) -> Tensor:

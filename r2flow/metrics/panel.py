@@ -219,6 +219,7 @@ class Panel(SumMetric):
     }  # fmt: skip
     width = int(ENDS[-1])
     uses_reflectance = True
+    biased = True
 
     def rows(self, scans: Scans) -> Tensor:
         return nan_where_empty(panel_rows(scans), scans)

@@ -18,8 +18,6 @@ from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.pictures import draw_range
 from r2flow.reports.tables import print_table, shown, table, words
 
-DISTANCES = ("kid_", "frechet_", "panel", "jsd", "mmd", "frd", "frid", "fpd", "fpvd", "fsvd")  # 0: equal sets
-UNBIASED = ("kid_", "speed")  # do not depend on the number of scans
 ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
 MARGIN = 1.25  # sets of the same source differ by as much
 HEADLINE = "panel"  # metric of the verdict, if measured
@@ -67,11 +65,11 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
 def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     """One sentence per judged set, the nearest first: its panel next to those of real halves and the best baseline.
 
-    Without the panel the first distance is taken. Distances but KID are larger for fewer scans: a set is compared with
-    real halves in as many scans as they have, if measured.
+    Without the panel the first distance is taken. A biased one is larger for fewer scans: a set is compared with real
+    halves in as many scans as they have, if measured.
     """
-    distances = [m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)]
-    metric = HEADLINE if HEADLINE in distances else next(iter(distances), "")
+    biased = _distances(comparisons)
+    metric = HEADLINE if HEADLINE in biased else next(iter(biased), "")
     near = sorted((pair for pair in _first(comparisons, metric) if math.isfinite(pair[0])), key=lambda pair: pair[0])
     judged, baselines = ([pair for pair in near if pair[1].kind == kind] for kind in ("judged", "baseline"))
     references = {c.name: (value, c) for value, c in near if c.kind == "reference"}
@@ -80,10 +78,9 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     reference, halves = references[HALVES]
     best = baselines[0][0] if baselines else math.inf
     title, factor = heading(metric, metric)
-    unbiased = metric.startswith(UNBIASED)
     lines = []
     for value, comparison in judged:
-        as_many = None if unbiased else references.get(f"{comparison.name}{AS_MANY}")
+        as_many = references.get(f"{comparison.name}{AS_MANY}") if biased[metric] else None
         compared, pair = as_many or (value, comparison)
         scans, of_half = (min(len(c.real), len(c.generated)) for c in (pair, halves))
         farther = compared > MARGIN * max(reference, 0)
@@ -98,7 +95,7 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
             judgement = "no lower than a baseline"
         elif reference >= best:
             judgement = "undecided, as the real halves are above a baseline"
-        elif not unbiased and (scans < of_half if farther else scans > of_half):
+        elif biased[metric] and (scans < of_half if farther else scans > of_half):
             judgement = f"undecided, as the halves have other numbers of scans: give {of_half} generated scans"
         elif farther:
             judgement = "higher than between the real halves"
@@ -184,6 +181,11 @@ def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]
     return columns, lines
 
 
+def _distances(comparisons: Sequence[Comparison]) -> dict[str, bool]:
+    """Names of the metrics that are distances, and whether they are biased."""
+    return {m.metric: m.biased for m in comparisons[0].measured if m.biased is not None}
+
+
 def _first(comparisons: Sequence[Comparison], metric: str) -> list[tuple[float, Comparison]]:
     """The first figure of a metric, with its comparison."""
     return [(next(iter(m.figures.values())), c) for c in comparisons for m in c.measured if m.metric == metric]
@@ -192,10 +194,10 @@ def _first(comparisons: Sequence[Comparison], metric: str) -> list[tuple[float, 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     """Distinct remarks, with their metrics and comparisons."""
     lines = []
-    biased = any(not m.metric.startswith(UNBIASED) for m in comparisons[0].measured)
-    if biased and len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:
+    distances = _distances(comparisons)
+    if any(distances.values()) and len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:
         lines.append("Distances of fewer scans are larger: compare only sets of equal sizes.")
-    for metric in (m.metric for m in comparisons[0].measured if m.metric.startswith(DISTANCES)):
+    for metric in distances:
         first = _first(comparisons, metric)
         reference = next((value for value, c in first if (c.kind, c.name) == ("reference", HALVES)), -math.inf)
         if below := [c.name for value, c in first if c.kind == "baseline" and value < reference]:
