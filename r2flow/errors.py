@@ -35,6 +35,13 @@ def require(what: str, extra: str, *packages: str) -> None:
         check(find_spec(package), f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.")
 
 
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that cannot be written to or created, before any work; nothing is written."""
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    usable = there.is_dir() and os.access(there, os.W_OK)
+    check(usable, f"{there} is not a folder that can be written to; give another one.")
+
+
 # System errors that a user can fix; others (a lost connection, a broken pipe) keep their traceback.
 MENDABLE = {
     errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,

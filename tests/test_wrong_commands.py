@@ -51,6 +51,7 @@ export run --what all
 export run --to safetensors --what network # --what network is for
 export run --what network --steps 4 # takes no sampler: leave sampler, steps
 export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx
+export run --to pt2 --out empty/a.pt2 # --to pt2 writes a .pt2, found --out empty/a.pt2
 report backbones --size ²x²
 report backbones --only hdit,adm_unet --size 31x64 --repeats 0 # height 31 cannot be used
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels
@@ -183,7 +184,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_checkpoint(place / "run" / "checkpoints" / "step-00000007.ckpt", CONFIG)
     (place / "run" / "config.yaml").write_text(yaml.safe_dump(CONFIG))
     save_checkpoint(load_checkpoint(place / "run"), place / "flow.safetensors")
-    (place / "empty").mkdir()
+    (place / "empty" / "a.pt2").mkdir(parents=True)
     np.save(place / "image.npy", np.stack([np.full((8, 64), 9.0), np.full((8, 64), 0.5)]).astype(np.float32))
     (place / "bad.bin").write_bytes(b"\0" * 30)
     (place / "bad.yaml").write_text("name: mine\nelevations: [3]\n")

@@ -25,7 +25,7 @@ from r2flow.cli.options import (
     parsed,
     rows_and_columns,
 )
-from r2flow.errors import check
+from r2flow.errors import check, check_folder
 
 if TYPE_CHECKING:
     from r2flow.data.partial import PartialScan
@@ -113,7 +113,7 @@ def interpolate(
     from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.interpolation import interpolation
-    from r2flow.reports.pages import prepare_folder, write_page
+    from r2flow.reports.pages import write_page
     from r2flow.samplers import Adaptive, build_sampler
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
@@ -123,7 +123,7 @@ def interpolate(
     sampler.check(flow)
     ends = real_scans(loaded, [first, last], reflectance_scale)
     check(len(ends) == 2, f"give two scans, found {len(ends)}.")
-    prepare_folder(out)
+    check_folder(out)
     written = write_page(interpolation(loaded, ends, frames, out, sampler), out)
     pages = ", ".join(map(str, [*written, out / "interpolation.html"]))
     print(f"{frames} scans in {out / 'frames'}; {pages}")

@@ -21,7 +21,7 @@ from r2flow.cli.options import (
     numbers,
     separate,
 )
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError, check, check_folder
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
@@ -121,7 +121,6 @@ def evaluate(
     from r2flow.metrics import METRICS
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.processes import joined, place
-    from r2flow.reports.pages import prepare_folder
 
     named = list(dict.fromkeys(generated or []))
     sampled = [name for name in named if is_checkpoint(name)]
@@ -147,9 +146,8 @@ def evaluate(
         metrics = chosen or _build_possible(all(s.about["reflectance"] for s in sets), options, device)
         check_reflectance(metrics, sets)
         training = None if options.train is None else _open(options.train, reading, options.train_split, None)
-        for folder in (options.out, options.json.parent if options.json else None):
-            if folder is not None:
-                prepare_folder(folder)
+        for folder in filter(None, (options.out, options.json and options.json.parent)):
+            check_folder(folder)
         _compare(truth, metrics, device, judged, training, options)
 
 

@@ -10,7 +10,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import SamplerOptions, grouped
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError, check, check_folder
 
 
 @app.command(epilog="Example: r2flow export runs/NAME --to onnx --steps 8 --out flow.onnx")
@@ -37,11 +37,10 @@ def export(
     from r2flow.generators import RectifiedFlow
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
-    from r2flow.reports.pages import prepare_folder
 
     name = checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name
     out = out or Path(f"{name}{'-network' * (what == 'network')}.{to}")
-    check(out.suffix == f".{to}", f"--to {to} writes a .{to}, found --out {out}.")
+    check(out.suffix == f".{to}" and not out.is_dir(), f"--to {to} writes a .{to}, found --out {out}.")
     check(not half or to == "safetensors", "--half is for --to safetensors.")
     check(what == "sampler" or to != "safetensors", "--what network is for --to onnx and --to pt2.")
     if (to == "safetensors" or what == "network") and how != SamplerOptions():
@@ -55,7 +54,7 @@ def export(
         return
     flow = isinstance(loaded.generator, RectifiedFlow)  # others are refused whatever their sampler
     sampler = loaded.generator.choose(**how.given) if flow else None
-    prepare_folder(out.parent)
+    check_folder(out.parent)
     logging.getLogger("r2flow.model.export").setLevel(logging.INFO)
     written = writing.export(loaded, out, sampler, what == "network")
     batch = "any batch" if written.any_batch else "batch of one scan (torch could not export a variable batch)"

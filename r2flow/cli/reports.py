@@ -28,7 +28,7 @@ from r2flow.cli.options import (
     rows_and_columns,
     separate,
 )
-from r2flow.errors import check
+from r2flow.errors import check, check_folder
 
 if TYPE_CHECKING:
     from r2flow.reports.pages import Page
@@ -54,14 +54,13 @@ def curvature(
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
     from r2flow.reports.curvature import curvature_page, measure_paths
-    from r2flow.reports.pages import prepare_folder
 
     where = choose_device(draw.device)
     loaded = {name: load_checkpoint(name, where) for name in dict.fromkeys(models)}
     for name, checkpoint in loaded.items():
         flow = as_flow(checkpoint.generator, "curvature")
         check(not flow.fixed, f"{name} is distilled for {flow.sampler} alone: it has learned no other times.")
-    prepare_folder(out)
+    check_folder(out)
     with Bar("measuring", len(loaded) * math.ceil(draw.num / draw.batch_size) * steps, "evaluations") as advance:
         flows = {
             label: measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, progress=advance)
@@ -92,7 +91,6 @@ def solvers(
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
     from r2flow.reports import solvers as measuring
-    from r2flow.reports.pages import prepare_folder
 
     where = choose_device(draw.device)
     methods = samplers.split(",") if samplers else measuring.METHODS
@@ -103,7 +101,7 @@ def solvers(
     loaded = None if model is None else load_checkpoint(model, where)
     if loaded is not None:
         as_flow(loaded.generator, "report solvers")
-    prepare_folder(out)
+    check_folder(out)
     logging.getLogger("r2flow.flow").setLevel(logging.ERROR)  # the report counts failed scans
     if loaded is not None:
         with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
@@ -176,7 +174,6 @@ def completion(
     from r2flow.progress import Bar
     from r2flow.reports.compare import labels
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, measured_by, pictured
-    from r2flow.reports.pages import prepare_folder
 
     paths = [Path(name) for name in models or [DENSIFY]]
     loaded = {
@@ -206,7 +203,7 @@ def completion(
     scans = real_scans(first, [real], reflectance_scale, num, need_reflectance=False)
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
     check(truths, f"{real}: no scan has a return, so there is nothing to hide.")
-    prepare_folder(out)
+    check_folder(out)
     cost = sum(sampler.evaluations(model.generator) or 0 for model, sampler in ways.values()) * len(masks)
     with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
         shown = list(completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, progress=advance))
@@ -233,7 +230,6 @@ def paper(
     from r2flow.data.opening import open_scans, reading_for
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.compare import labels
-    from r2flow.reports.pages import prepare_folder
     from r2flow.reports.paper import PaperRun, paper_page, read_results, role_of
 
     where = choose_device(device)
@@ -244,7 +240,7 @@ def paper(
         check(checkpoint.generator.draws, f"{model} does not generate scans from noise.")
         runs.append(PaperRun(role or role_of(checkpoint, label), model, checkpoint))
     scans = None if real is None else open_scans(real, reading_for([real], runs[0].checkpoint))
-    prepare_folder(out)
+    check_folder(out)
     page = paper_page(runs, rows, scans, num, steps, where)
     finish(page, out, page.text[:1])
 
@@ -259,13 +255,13 @@ def compare(
 ) -> None:
     """Compare runs: loss, bend, parameters, cost."""
     from r2flow.reports.compare import compare_page, group_runs, read_runs, tables
-    from r2flow.reports.pages import prepare_folder, write_page
+    from r2flow.reports.pages import write_page
     from r2flow.reports.tables import print_table
 
     compared = read_runs(runs)
     groups = group_runs(compared) if group else {run.label: [run] for run in compared}
     if out is not None:
-        prepare_folder(out)
+        check_folder(out)
     for title, (cells, headings) in tables(groups).items():
         print_table(cells, headings, title)
         print()

@@ -18,7 +18,6 @@ import torch
 from matplotlib.figure import Figure
 
 import r2flow
-from r2flow.errors import check
 from r2flow.files import write_file
 from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row, words
@@ -73,12 +72,6 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
 def write_json(page: Page, path: Path) -> None:
     """Write only the JSON of a page."""
     write_file(path, _json(page, provenance(page)))
-
-
-def prepare_folder(out: Path) -> None:
-    """Create the folder, to fail before measuring if it is not writable."""
-    out.mkdir(parents=True, exist_ok=True)
-    check(os.access(out, os.W_OK), f"{out} cannot be written to; give another --out.")
 
 
 def provenance(page: Page) -> dict[str, Any]:
