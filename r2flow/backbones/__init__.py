@@ -12,6 +12,7 @@ from r2flow.backbones.base import Backbone
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
+from r2flow.errors import check
 from r2flow.registry import Registry
 
 BACKBONES: Registry[type[Backbone]] = Registry(
@@ -35,7 +36,9 @@ def build_backbone(
         arguments["out_channels"] = out_channels
     if second_time:
         arguments["second_time"] = True
-    return BACKBONES.build({**options, **arguments}, rays)
+    built: Backbone = BACKBONES.build({**options, **arguments}, rays)
+    check(any(True for _ in built.parameters()), f"a {type(built).__name__} has no weights to learn.")
+    return built
 
 
 def configurations() -> Registry[dict[str, Any]]:

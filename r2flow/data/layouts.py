@@ -12,7 +12,7 @@ from pathlib import Path
 from r2flow.data.options import SourceOptions
 from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
-from r2flow.errors import InputError, warn_odd
+from r2flow.errors import InputError, check, warn_odd
 from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS, scan_ending
 from r2flow.store import manifest_of
 
@@ -89,13 +89,11 @@ class Layout(SourceKind):
         """The drives of the split and the names in `options`, without empty drives."""
         name, split, root = options.name, options.split, Path(options.folder).expanduser()
         self.chosen([], split, None)  # refuses an unknown split before any search
-        if not root.is_dir():
-            raise InputError(
-                f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb {name}:FOLDER)."
-            )
+        found = root.is_dir()
+        check(found, f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb {name}:FOLDER).")
         nonempty = [drive for drive in self.find(root) if drive.scans]
         if not nonempty:
-            where = (self.find.__doc__ or "").splitlines()[0]
+            where = (self.find.__doc__ or "scan files").splitlines()[0]
             raise InputError(f"{root} holds no scan. Looked for ({name}): {where}{_elsewhere(root)}")
         drives = self.chosen(nonempty, split, None)
         if not drives:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.metrics.scans import MASK, Scans
 from r2flow.processes import place
@@ -142,7 +142,10 @@ class ScanMetric(Metric):
         if self.needs_reflectance and not scans.has_reflectance:
             raise InputError(f"'{self.name}' needs reflectance, which these scans do not have; leave it out.")
         if len(scans):
-            self.add_rows(self.rows(scans), side, first)
+            rows = self.rows(scans)
+            shape = tuple(rows.shape) if isinstance(rows, Tensor) else type(rows).__name__
+            check(shape[:-1] == (len(scans),), f"rows of '{self.name}' must be ({len(scans)}, D), found {shape}.")
+            self.add_rows(rows, side, first)
 
     def add_rows(self, rows: Tensor, side: Side, first: int = 0) -> None:
         """Add the rows of scans `first`, `first + 1`, ... to the statistics of a side."""

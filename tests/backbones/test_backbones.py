@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
 
-from r2flow.backbones import build_backbone, configurations
+from r2flow.backbones import BACKBONES, Backbone, build_backbone, configurations
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
 from r2flow.reports.backbones import count_macs
@@ -227,6 +227,12 @@ def test_configurations_are_what_hydra_composes(config):
 
 def test_a_backbone_without_a_file_is_configured_by_its_defaults():
     assert configurations()["plain"] == {"name": "plain"}
+
+
+def test_a_backbone_without_weights_is_refused(monkeypatch):
+    monkeypatch.setitem(BACKBONES._entries, "bare", Backbone)
+    with pytest.raises(InputError, match="a Backbone has no weights to learn"):
+        build_backbone({"name": "bare"}, torch.zeros(2, ROWS, COLUMNS), 2)
 
 
 @pytest.mark.parametrize("config", [path.stem for path in (CONF / "backbone").glob("*.yaml")])

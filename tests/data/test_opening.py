@@ -207,6 +207,9 @@ def find_weeks(root: Path) -> list[Drive]:
 
 @pytest.mark.usefixtures("own_table")
 def test_a_function_that_finds_drives_and_one_line_are_a_data_set(tmp_path: Path):
+    SOURCES.add("bare", Layout(lambda root: []))
+    with pytest.raises(InputError, match=r"holds no scan\. Looked for \(bare\): scan files$"):
+        open_scans(f"bare:{tmp_path}", READING)
     SOURCES.add("weeks", Layout(find_weeks, {"train": ("week-1", "week-2"), "test": ("week-3",)}))
     for number in range(9):
         write_scan(tmp_path / f"week-{1 + number // 3}" / f"{number}.bin", number)

@@ -77,12 +77,9 @@ def test_figures_do_not_depend_on_processes_or_the_order_of_scans(build, sets, p
 
 def test_an_empty_scan_is_left_out_with_a_remark(build, sets):
     expected = give(build(), sets).compute()
-    with_empty = dict(sets)
     more = torch.cat([sets["generated"].images, torch.zeros(2, 2, 8, 32)])
-    with_empty["generated"] = Scans(more, sets["real"].sensor)
-    metric = give(build(), with_empty)
-    values = metric.compute()
-    assert values == pytest.approx(expected, rel=1e-9)
+    metric = give(build(), {**sets, "generated": Scans(more, SMALL)})
+    assert metric.compute() == pytest.approx(expected, rel=1e-9)
     assert any("2 of 11 generated scans are left out" in remark for remark in metric.remarks())
 
 
@@ -91,7 +88,7 @@ def test_a_figure_that_does_not_exist_comes_with_a_remark(build, sets, case):
     few = {"all empty": 0 * sets["generated"].images, "one alone": sets["generated"].images[:1]}
     chosen = {"real": sets["real"]}
     if case != "none":
-        chosen["generated"] = Scans(few[case], sets["real"].sensor)
+        chosen["generated"] = Scans(few[case], SMALL)
     metric = give(build(), chosen)
     missing = [math.isnan(value) for value in metric.compute().values()]
     assert metric.remarks() or not any(missing)
@@ -113,8 +110,7 @@ def test_equal_sets_are_at_no_distance(build, sets):
 
 def test_statistics_of_the_real_set_replace_its_scans(build, sets):
     whole = give(build(), sets)
-    kept = build()
-    give(kept, {"real": sets["real"]})
+    kept = give(build(), {"real": sets["real"]})
     state = {name: value.clone() for name, value in kept.real_state().items()}
     again = build()
     for _ in range(2):
@@ -181,6 +177,14 @@ def test_what_is_no_batch_of_scans_is_refused_in_one_line(build, sets):
     with pytest.raises(InputError, match=r"a tensor of images once it has their sensor: .*; found ndarray\.$"):
         METRICS["jsd"](sensor=SMALL).update(images().numpy(), real=True)
     assert METRICS["jsd"](sensor="hdl64e").sensor.shape == (64, 1024)
+
+
+@pytest.mark.parametrize("rows", [None, torch.ones(REAL), torch.ones(1, 3), torch.ones(REAL, 3, 3)])
+def test_a_metric_must_give_a_row_for_each_scan(rows, sets, monkeypatch):
+    monkeypatch.setattr(metric := METRICS["jsd"](), "rows", lambda scans: rows)
+    with pytest.raises(InputError, match=rf"rows of 'jsd' must be \({REAL}, D\), found (NoneType|\({REAL},\)|.*3\))"):
+        metric.update(sets["real"], real=True)
+    assert metric.given("real") == 0
 
 
 # What torchmetrics promises of every metric
@@ -282,5 +286,4 @@ def test_points_lie_on_the_rays_that_are_named_or_where_they_were_measured():
         assert torch.allclose(torch.sin(azimuth), torch.sin(expected), atol=1e-5)
     measured = torch.randn(3, 3, 8, 32)
     far = torch.cat([torch.where(r > 30, 70, r), images()[:, 1:]], 1)  # beyond the mask
-    scans = Scans(far, SMALL, xyz=measured)
-    assert torch.equal(scans.xyz, measured * (r <= 30))
+    assert torch.equal(Scans(far, SMALL, xyz=measured).xyz, measured * (r <= 30))
