@@ -210,7 +210,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("", "empty"),
         ("# nothing\n", "no line of numbers"),
         ("x,y,z\n", "no line"),
-        ("1,5;2,5;3,5\n" * 3, "no field"),  # decimal commas
+        ("x;y;z\n" + "1,5;2,5e0;3\n" * 3, "decimal commas"),
         ("1 2\n3 4\n", "2 columns without names"),
         ("1,2,,4\n" * 3, "NaN"),
         ("time,lat,lon\n1,2,3\n", "no field x, y, z; it has: time, lat, lon"),
@@ -240,8 +240,7 @@ def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):
 
 
 def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Path):
-    kinds = [(name, "f4") for name in ("x", "y", "z", "reflectivity", "intensity")]
-    table = np.zeros(500, kinds)
+    table = np.zeros(500, [(name, "f4") for name in ("x", "y", "z", "reflectivity", "intensity")])
     for name, column in zip("xyz", F4.T, strict=True):
         table[name] = column
     sevens = np.full(500, 7)
