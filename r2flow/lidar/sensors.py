@@ -41,9 +41,9 @@ class Sensor:
     def __post_init__(self) -> None:
         e, near, far, scale = self.elevations, self.min_range, self.max_range, self.reflectance_scale
         rows = [*range(len(e))]
-        fall = len(e) >= 2 and all(a > b for a, b in pairwise(e)) and e[0] < 90 and e[-1] > -90
+        wrong = next((pair for pair in pairwise(e) if not 90 > pair[0] > pair[1] > -90), None if len(e) > 1 else e)
         for holds, rule, value in (
-            (fall, "elevations must be two or more, fall from the top row down, within (-90, 90) degrees", [*e[:4]]),
+            (not wrong, "elevations must be two or more, fall from the top row down, within (-90, 90) degrees", wrong),
             (self.columns >= 1, "columns must be at least 1", self.columns),
             (len(e) * self.columns <= MOST_PIXELS, f"at most {MOST_PIXELS:,} pixels", f"{len(e)} x {self.columns}"),
             (0 < near < far < math.inf, "needs 0 < min_range < max_range in metres", f"{near} and {far}"),
@@ -101,10 +101,8 @@ class Sensor:
         old = len(self.elevations)
         if rows is None or rows == old:
             return sensor
-        if not 2 <= rows <= MOST_PIXELS // sensor.columns:
-            raise InputError(
-                f"sensor {self.name!r}: rows must be 2 or more, at most {MOST_PIXELS:,} pixels; found {rows}."
-            )
+        fits = 2 <= rows <= MOST_PIXELS // sensor.columns
+        check(fits, f"sensor {self.name!r}: rows must be 2 or more, at most {MOST_PIXELS:,} pixels; found {rows}.")
         if rows > old and rays == "centre":
             e, beam = self.elevations, np.arange(-1, old + 1)  # with a step beyond the first and the last beam
             beams = [min(2 * e[0] - e[1], e[0] / 2 + 45), *e, max(2 * e[-1] - e[-2], e[-1] / 2 - 45)]
