@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from r2flow.data.loader import Further
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError, check, naming
 from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator
-from r2flow.model.checkpoint import COMPILED
+from r2flow.model.checkpoint import COMPILED, check_weights
 from r2flow.noise import seed_torch
 from r2flow.processes import average_gradients
 from r2flow.registry import Count, Natural, NonNegative, Portion
@@ -151,6 +151,10 @@ class Stage(L.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["config"] = self.config
         checkpoint |= self.generator.drawing()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        with naming("the checkpoint to resume from"):  # a plug-in may have changed
+            check_weights(self, checkpoint["state_dict"])
 
 
 class SingleLoss(Stage):
