@@ -172,7 +172,6 @@ def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):
     data = {"name": "pairs", "root": None, "pairs": {}, "reading": {**dict.fromkeys(read), "projection": "spherical"}}
     config = {**child(parent, False), "data": data}
     there = Parent({**CONFIG, "data": {"reading": read}}, parent)
-    found = inherit(config, [], there)["data"]["reading"]
-    assert {key: found[key] for key in read} == read
+    assert {key: inherit(config, [], there)["data"]["reading"][key] for key in read} == read
     with pytest.raises(InputError, match=r"data\.reading\.projection"):
         inherit(config, ["data.reading.projection"], there)

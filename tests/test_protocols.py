@@ -94,8 +94,7 @@ def test_real_points_are_the_measured_ones_and_generated_ones_bin_corners(measur
 def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(kitti_360, monkeypatch):
     monkeypatch.setattr("r2flow.evaluation.measuring.REAL_SCANS", 5)
     scans = open_scans(f"kitti_360:{kitti_360}", READING)
-    order = [name.split("/")[1][17:21] for name in scans.source.names]
-    assert order[:6] == ["0000"] * 3 + ["0002"] * 3
+    assert [name.split("/")[1][17:21] for name in scans.source.names][:6] == ["0000"] * 3 + ["0002"] * 3
     place = list(range(15))
     random.Random(0).shuffle(place)
     theirs = [*range(6, 15), *range(6)]  # drives 3, 4, 10, then 0, 2

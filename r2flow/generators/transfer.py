@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.backbones import build_backbone
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
 from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator, parts_of
@@ -104,10 +104,8 @@ class TransferFlow(Flow):
         self.sigma = sigma
         inputs = space.shape[0] + FEATURES + RowFeatures.FEATURES
         self.backbone = build_backbone(backbone, space.rays, inputs, 3 * CANDIDATES + 2)
-        if not self.backbone.any_size:
-            raise InputError(
-                f"a transfer flow needs a backbone for any size: give backbone=local, not {backbone['name']}."
-            )
+        fits = self.backbone.any_size
+        check(fits, f"a transfer flow needs a backbone for any size: give backbone=local, not {backbone['name']}.")
         self.rows = RowFeatures(space.rays[0, :, 0])
         self.elevations, self.numbered = space.rays[0, :, 0], True
         self.foreign = False  # whether the scans are of another sensor than the training scans

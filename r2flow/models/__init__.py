@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from r2flow.errors import InputError, check
+from r2flow.errors import check
 from r2flow.registry import Registry
 
 FOLDER = Path(__file__).parent
@@ -50,10 +50,8 @@ def find_model(name: str) -> Path:
     check(path.is_file(), f"the model {name} is not here (no {path}): install r2flow again.")
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if digest != MODELS[name].sha256:
-        raise InputError(
-            f"{path} is not the model {name}, or damaged: its SHA-256 is {digest[:16]}...; install r2flow again."
-        )
+    same = digest == MODELS[name].sha256
+    check(same, f"{path} is not the model {name}, or damaged: its SHA-256 is {digest[:16]}...; install r2flow again.")
     return path
 
 

@@ -142,8 +142,7 @@ def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
         hit = (x - bad).abs().amax((1, 2, 3), keepdim=True) < 1e-6
         return torch.where(hit, torch.nan, 0.0) * x
 
-    made = make_pairs(store_in(tmp_path, num=8), Field(broken, SHAPE))
-    assert made.unusable == 1
+    assert make_pairs(store_in(tmp_path, num=8), Field(broken, SHAPE)).unusable == 1
     source = PairSource(store_in(tmp_path, num=8))
     assert source.indices.tolist() == [0, 1, 2, 3, 4, 6, 7]
     assert all(source[i]["x_1"].isfinite().all() for i in range(7))

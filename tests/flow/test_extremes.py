@@ -60,8 +60,7 @@ def test_the_last_finite_state_is_kept():
     def velocity(t, x):
         return torch.where(expand_time(t, x) >= 0.5, math.nan, torch.ones_like(x))
 
-    solution = solve(velocity, torch.zeros(1, 2), steps=8)
-    assert solution.x.tolist() == [[0.5, 0.5]]
+    assert solve(velocity, torch.zeros(1, 2), steps=8).x.tolist() == [[0.5, 0.5]]
     stuck = solve(velocity, torch.zeros(1, 2), method="dopri5")
     assert stuck.x[0, 0].item() == pytest.approx(0.5, abs=1e-5)
     assert not stuck.converged.any()

@@ -41,8 +41,7 @@ def test_a_path_that_is_not_finite_is_not_the_most_curved():
         spoiled = torch.tensor([False, True, False]).view(-1, 1, 1, 1)
         return torch.where(spoiled, math.nan, ROTATION(t, x))
 
-    found = straightness(velocity, X_0, steps=8, most_curved=20)
-    assert found.trajectories.isfinite().all()
+    assert straightness(velocity, X_0, steps=8, most_curved=20).trajectories.isfinite().all()
 
 
 def test_a_network_that_can_learn_is_followed_too():

@@ -183,8 +183,7 @@ def test_one_damaged_row_does_not_make_a_cut_sector_measured():
     lost[:, 300:1200] = True
     some = wall(firing, lost)
     clean = points_through(some, firing, TARGET).state
-    damaged = replace(some, dropped=1)
-    assert (points_through(damaged, firing, TARGET).state == clean).all()
+    assert (points_through(replace(some, dropped=1), firing, TARGET).state == clean).all()
     within = replace(some, dropped=len(some.xyz) // 10)  # lost rays of the half turn alone
     assert (points_through(within, firing, TARGET).state == clean).all()
     assert (clean == Ray.UNKNOWN).sum() > (clean == Ray.EMPTY).sum()

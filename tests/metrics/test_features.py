@@ -57,8 +57,7 @@ def test_the_kernel_distance_of_two_gaussians_is_that_of_their_moments():
     quantiles = torch.special.ndtri((torch.arange(4000, dtype=torch.float64) + 0.5) / 4000)[:, None]
     moments = [np.array([m, m**2 + s**2, m**3 + 3 * m * s**2]) for m, s in ((0.5, 1.0), (0.0, 1.5))]
     expected = float(np.array([3, 3, 1]) @ (moments[0] - moments[1]) ** 2)
-    found = kernel_distance(0.5 + quantiles, 1.5 * quantiles[::2])
-    assert found == pytest.approx(expected, rel=0.02)
+    assert kernel_distance(0.5 + quantiles, 1.5 * quantiles[::2]) == pytest.approx(expected, rel=0.02)
 
 
 def test_the_kernel_distance_is_the_mean_over_all_subsets_in_blocks_of_any_size(monkeypatch):
@@ -95,8 +94,7 @@ def test_gaussians_have_the_area_of_their_distance(apart):
     x, y = torch.randn(4000, 3, generator=draw), torch.randn(4000, 3, generator=draw)
     y[:, 1] += apart
     # P(N(apart, 1) > N(0, 1)) = Phi(apart / sqrt 2); the error of an area of 2 x 4,000 scores is below 0.007
-    expected = (1 + math.erf(apart / 2)) / 2
-    assert auc(x, y) == pytest.approx(expected, abs=0.02)
+    assert auc(x, y) == pytest.approx((1 + math.erf(apart / 2)) / 2, abs=0.02)
 
 
 def test_halves_are_blocks_so_that_neighbours_do_not_help():

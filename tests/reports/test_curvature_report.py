@@ -98,8 +98,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):
     how = ("-o", out, "--steps", 4, "--num", 2)
     said = r2flow("report", "curvature", path, copy, *how).said
     figures = {f"{name}.{end}" for name in ("curvature", "trajectories") for end in ("png", "pdf")}
-    names = figures | {"curvature.json", "curvature.md"}
-    assert {file.name for file in out.iterdir()} == names
+    assert {file.name for file in out.iterdir()} == figures | {"curvature.json", "curvature.md"}
     assert str(out / "curvature.md") in said
     content = json.loads((out / "curvature.json").read_text())
     assert len(content["rows"]) == 2 * 4

@@ -115,5 +115,4 @@ def test_a_pixel_keeps_the_nearest_of_several_lasers():
     b = SceneBuilder(Ground(), ScalarDraws(np.random.default_rng(0)))
     b.add(Boxes(20, 0, 0, 1, 200, -1, 50), "building", "plaster", 0.4)
     b.add(Cylinders(10, 0, 0.5, 1.6, 1.7), "pole", "plaster", 0.4)  # a bar seen by two lasers at most
-    scan = observe(b.build(), coarse, np.random.default_rng(1))
-    assert (scan.labels[:, 512] == LABELS["pole"]).any()
+    assert (observe(b.build(), coarse, np.random.default_rng(1)).labels[:, 512] == LABELS["pole"]).any()

@@ -124,8 +124,7 @@ def test_a_killed_system_ends_as_the_one_left_alone(tmp_path: Path, family: str)
     code, said = stop_held(held, signal.SIGKILL, killed)
     assert code == -signal.SIGKILL, said
     assert checkpoints_of(tmp_path / "killed")[0].name == "step-00000004.ckpt"
-    done = in_process(tmp_path, killed)
-    assert "resuming from" in done.stdout
+    assert "resuming from" in in_process(tmp_path, killed).stdout
     one, other = (read_checkpoint(checkpoints_of(tmp_path / name)[0]) for name in ("alone", "killed"))
     assert one["global_step"] == other["global_step"]
     for part in {"state_dict", "current_model_state", "optimizer_states"} & one.keys():  # not all runs have an average
