@@ -1,7 +1,6 @@
 """Non-finite numbers: what is skipped, what stops, and what is never written."""
 
 import lightning as L
-import numpy as np
 import pytest
 import torch
 from lightning.pytorch.callbacks import LambdaCallback
@@ -68,14 +67,6 @@ def test_a_skipped_step_is_as_if_it_had_never_been(tmp_path, value: float, offse
     fit(without, batches(1.0, 2.0, -1.0, 0.5), tmp_path)
     assert_equal_weights(skipped, without)
     assert (guard.total, guard.in_a_row) == (1, 0)
-
-
-def test_the_guard_changes_nothing_where_all_is_well(tmp_path):
-    guarded, free = Line(), Line()
-    values = [float(v) for v in np.random.default_rng(0).standard_normal(30)]
-    fit(guarded, batches(*values), tmp_path, Guard(tmp_path), accumulate_grad_batches=2)
-    fit(free, batches(*values), tmp_path, accumulate_grad_batches=2)
-    assert_equal_weights(guarded, free)
 
 
 def test_only_steps_in_a_row_end_a_run(tmp_path):
@@ -150,8 +141,8 @@ def test_a_loss_scale_that_finds_no_place_ends_the_run(tmp_path):
 
 def test_a_loss_that_is_no_number_is_a_defect_whatever_the_scale(tmp_path):
     guard = Guard(tmp_path)
-    fit(Line(), batches(1.0, NAN, 1.0), tmp_path, guard, plugins=[half(2.0**8)])
-    assert guard.total == 1
+    fit(Line(), batches(NAN, *[1.0] * 9), tmp_path, guard, plugins=[half(2.0**20)])
+    assert guard.total == 1  # and not the steps behind it, which lower the scale
 
 
 @pytest.mark.parametrize("averaged", [False, True])
