@@ -41,18 +41,6 @@ def test_a_scan_without_a_return_is_one_of_a_batch_without_reflectance():
     assert not found[0].any()
 
 
-@pytest.mark.parametrize("name", ["transfer_flow", "rectified_flow"])  # the second was not trained to complete
-@pytest.mark.parametrize("batch_size", [1, 4])
-def test_known_rays_come_back_to_the_bit(name, batch_size):
-    images = scans()
-    state = halved(images)
-    found = network(name).complete(images, state, num=3, batch_size=batch_size)
-    assert found.shape == (2, 3, 2, *SHAPE)
-    known = (state != Ray.UNKNOWN)[:, None, None].expand_as(found)
-    assert torch.equal(found[known], images[:, None].expand_as(found)[known])
-    assert not torch.equal(found[:, 0], found[:, 1])  # the rest is drawn
-
-
 def test_a_scan_of_which_nothing_is_known_is_the_sample_of_its_number():
     checkpoint = network("rectified_flow")
     nothing = torch.zeros(3, 2, *SHAPE)
