@@ -8,7 +8,6 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve, usual_grid
-from r2flow.flow.solvers.fixed import weights
 from r2flow.samplers import build_sampler
 from tests.fields import Field
 from tests.reference import assert_near, backbone_of, load_case
@@ -52,13 +51,6 @@ def test_an_adaptive_method_of_equal_steps_has_its_order(method):
         return (solution.x - logistic_solution(X_0, 1)).abs().max().item()
 
     assert math.log2(error(32) / error(64)) == pytest.approx(SOLVERS[method].order, abs=0.35)
-
-
-@pytest.mark.parametrize("nodes", [[0.3], [0.9, 0.2], [0.1, 0.11, 0.7], [1.0, 0.5, 0.4999, -3.0]])
-def test_the_weights_integrate_every_polynomial_of_their_degree(nodes):
-    for degree in range(len(nodes)):
-        found = sum(w * node**degree for w, node in zip(weights(nodes, 0.2, 0.8), nodes, strict=True))
-        assert found == pytest.approx((0.8 ** (degree + 1) - 0.2 ** (degree + 1)) / (degree + 1), rel=1e-9)
 
 
 @pytest.mark.parametrize("method", FIXED)
