@@ -25,18 +25,6 @@ def test_the_columns_are_those_that_the_sector_touches_from_left_to_right(sector
         assert (column in chosen) == touched
 
 
-def test_cropping_and_placing_are_inverse():
-    part = region(SENSOR.shape, (150, -120), (3, 9))
-    image = torch.arange(2.0 * 16 * 72).view(2, 16, 72) + 1
-    crop = part.crop(image)
-    assert crop.shape == (2, 7, part.width)
-    assert crop[0, 0, 0] == image[0, 3, part.left]
-    placed = part.place(crop)
-    assert torch.equal(part.crop(placed), crop)
-    assert (placed != 0).sum() == crop.numel()
-    assert torch.equal(placed[placed != 0], image[placed != 0])
-
-
 def test_rounding_goes_outward_to_whole_units():
     part = Region((16, 72), 3, 2, 70, 4)  # over the seam
     outer = part.widened((4, 8))
