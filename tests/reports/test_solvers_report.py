@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from r2flow.flow.problems import PROBLEMS
-from r2flow.inversion import metres_apart
 from r2flow.reports.solvers import (
     Subject,
     best_within,
@@ -38,19 +37,6 @@ def test_a_row_is_what_the_solver_did():
         assert row["error"] == pytest.approx(np.median(errors))
         assert row["error_worst"] == pytest.approx(errors.max())
         assert 0 < row["seconds"] < 1
-
-
-def test_metres_are_taken_where_both_return():
-    image = torch.tensor([[[[10.0, 20.0, 0.0, 5.0]], [[0.1, 0.1, 0.0, 0.1]]]])
-    other = torch.tensor([[[[13.0, 24.0, 7.0, 0.0]], [[0.1, 0.1, 0.1, 0.0]]]])
-    median, rms, dropped = metres_apart(image, other)
-    assert rms.tolist() == [pytest.approx(math.sqrt((9 + 16) / 2))]
-    assert median.tolist() == [3.0]
-    assert dropped.tolist() == [0.5]
-    median, rms, dropped = metres_apart(torch.zeros(1, 1, 1, 2), torch.ones(1, 1, 1, 2))
-    assert rms.isnan().all()
-    assert median.isnan().all()
-    assert dropped.tolist() == [1.0]
 
 
 class Trained:
