@@ -17,20 +17,9 @@ from r2flow.generators import build_generator
 from r2flow.reports.compare import cell, compare_page, configuration, find_runs, group_runs, labels, read_runs, rows_of
 from r2flow.reports.pages import write_page
 from r2flow.reports.training import curves_figure, read_curves, smooth
+from tests.conftest import CONFIG as FLOW
 
-CONFIG: dict[str, Any] = {
-    "name": "small",
-    "seed": 0,
-    "sensor": {"name": "hdl64e", "rows": 8, "columns": 64},
-    "encoding": {"format": "logscale"},
-    "backbone": {
-        "name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16, "patch": [1, 4],
-    },
-    "data": {"name": "simulated", "batch_size": 4, "scenes": 8},
-    "stage": {"name": "rectify", "learning_rate": 1e-3},
-    "trainer": {"max_steps": 40},
-    "scans": "8 of 8 scans, abc",
-}  # fmt: skip
+CONFIG: dict[str, Any] = {**FLOW, "name": "small", "trainer": {"max_steps": 40}, "scans": "8 of 8 scans, abc"}
 
 
 def make_run(
