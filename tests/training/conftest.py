@@ -1,4 +1,4 @@
-"""A run small enough for a test: 8 x 64 images of random walls, a flow of a few thousand weights."""
+"""A run small enough for a test: 8 x 64 images, a flow of a few thousand weights."""
 
 import contextlib
 import functools
@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -20,6 +19,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.runs.launch import main
 from r2flow.signals import LATER
+from r2flow.simulator import simulate
 from r2flow.training import build, compose, fit
 from tests.conftest import ROOT, Done, captured, draw_quickly
 from tests.killing import wait_until
@@ -55,19 +55,10 @@ TINY = [
 
 @pytest.fixture(scope="session")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of 12 scans: ground with a wall at a random distance."""
-    folder = tmp_path_factory.mktemp("scans")
-    sensor = SENSORS["hdl64e"].resized(32, 256)
-    rays = sensor.rays()
-    e, a = rays.numpy()
+    """A folder of 12 simulated scans."""
+    folder, sensor = tmp_path_factory.mktemp("scans"), SENSORS["hdl64e"].resized(32, 256)
     for index in range(12):
-        draw = np.random.default_rng(index)
-        ground = np.where(e < 0, -1.73 / np.sin(np.minimum(e, -1e-3)), np.inf)
-        wall = draw.uniform(5, 40) / np.maximum(np.cos(a - draw.uniform(-3, 3)), 1e-3)
-        r = np.minimum(ground, wall)
-        hit = (r > 2) & (r < 75)
-        image = np.stack([np.where(hit, r, 0), np.where(hit, 0.2 + 0.5 * (r == wall), 0)]).astype(np.float32)
-        write_points(folder / f"{index:06d}.bin", *image_to_points(image, rays))
+        write_points(folder / f"{index:06d}.bin", *image_to_points(simulate(sensor, 0, index).image, sensor))
     return folder
 
 
