@@ -220,13 +220,6 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
     assert "kid_means" in said
 
 
-def test_a_scan_is_no_place_for_figures(r2flow, real, generated):
-    scan = min(real.iterdir())
-    before = scan.read_bytes()
-    assert "--json must be a file" in r2flow("evaluate", real, generated, *QUICK, "--json", scan).refusal
-    assert scan.read_bytes() == before
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path, ranks):

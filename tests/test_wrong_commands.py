@@ -93,6 +93,7 @@ evaluate scans --reference --train-split test # --train; found none
 evaluate scans --reference --steps 4 # found none
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans scans --json file.txt/a.json
+evaluate scans scans --json image.npy # --json must be a file
 evaluate scans run --sampler euler,heun2 --tolerance 0.1 # tolerance
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
 report solvers -o out --problems none # nothing to measure
