@@ -74,8 +74,6 @@ def test_lasers_fire_in_the_order_of_the_manual(name, lasers):
 @pytest.mark.parametrize(
     ("name", "beams", "top", "bottom", "finest"),
     [
-        ("hdl32e", 32, 10.67, -30.67, 1.333),
-        ("vlp16", 16, 15, -15, 2),
         ("vlp32c", 32, 15, -25, 0.333),
         ("os1_64", 64, 16.6, -16.6, 0.527),
         ("os1_128", 128, 22.5, -22.5, 0.354),
