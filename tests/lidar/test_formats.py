@@ -53,13 +53,6 @@ def test_columns_of_text(tmp_path: Path, ending: str, options: dict):
     same(read_points(path), intensity=None)
 
 
-def test_a_table_of_pandas(tmp_path: Path):
-    """With its index, a column without a name."""
-    header = f";{';'.join(NAMES)}"
-    np.savetxt(tmp_path / "a.csv", np.c_[np.arange(500), WIDE], "%.6g", ";", header=header, comments="")
-    same(read_points(tmp_path / "a.csv"), RING)
-
-
 def test_columns_are_named_where_the_file_does_not(tmp_path: Path):
     WIDE.tofile(tmp_path / "a.bin")
     np.save(tmp_path / "a.npy", WIDE.astype(np.float64))
@@ -237,6 +230,9 @@ def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):
     same(read_points(tmp_path / "b.csv"), intensity=np.full(500, 7))
     (tmp_path / "c.csv").write_text("x,y,z,class\n" + "".join(f'"{x}","{y}","{z}","a car"\n' for x, y, z in F4))
     same(read_points(tmp_path / "c.csv"), intensity=None)
+    index = np.c_[np.arange(500), WIDE]  # of pandas, a column without a name
+    np.savetxt(tmp_path / "d.csv", index, "%.6g", ";", header=f";{';'.join(NAMES)}", comments="")
+    same(read_points(tmp_path / "d.csv"), RING)
 
 
 def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Path):
