@@ -11,7 +11,6 @@ from safetensors import safe_open
 
 import r2flow
 from r2flow.config import learned
-from r2flow.data.pairs import default_folder
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import is_checkpoint
 from r2flow.lidar.interpolation import interpolated
@@ -156,10 +155,6 @@ def test_a_written_config_says_what_was_learned_and_no_folder():
         "data": {"name": "mixed", "parts": [{"name": "folder"}], "scans": {"name": "simulated"}},
         "parent": {"step": 7},
     }
-
-
-def test_pairs_of_a_model_lie_outside_the_package():
-    assert default_folder(find_model("street")) == Path("runs/street-pairs")
 
 
 def test_torch_hub_gives_the_model_of_the_package():

@@ -19,6 +19,7 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairSource, PairStore, default_folder, make_pairs
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
+from r2flow.models import find_model
 from r2flow.noise import standard_normal
 from r2flow.runs.lineage import pairs_of
 from r2flow.samplers import build_sampler
@@ -209,6 +210,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     said = r2flow("pairs", path, *QUICK).said
     folder = path.parent.parent / "pairs"
     assert default_folder(Path("models/flow.pth")) == Path("models/flow-pairs")
+    assert default_folder(find_model("street")) == Path("runs/street-pairs")  # not in the package
     for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
         assert words in said
     flow = load_checkpoint(path)
