@@ -41,9 +41,9 @@ class Sensor:
     def __post_init__(self) -> None:
         e, near, far, scale = self.elevations, self.min_range, self.max_range, self.reflectance_scale
         rows = [*range(len(e))]
-        wrong = next((pair for pair in pairwise(e) if not 90 > pair[0] > pair[1] > -90), None if len(e) > 1 else e)
+        odd = next((pair for pair in pairwise(e) if not 90 > pair[0] > pair[1] > -90), None if len(e) > 1 else e)
         for holds, rule, value in (
-            (not wrong, "elevations must be two or more, fall from the top row down, within (-90, 90) degrees", wrong),
+            (odd is None, "elevations must be two or more, fall from the top row down, within (-90, 90) degrees", odd),
             (self.columns >= 1, "columns must be at least 1", self.columns),
             (len(e) * self.columns <= MOST_PIXELS, f"at most {MOST_PIXELS:,} pixels", f"{len(e)} x {self.columns}"),
             (0 < near < far < math.inf, "needs 0 < min_range < max_range in metres", f"{near} and {far}"),

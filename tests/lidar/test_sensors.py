@@ -109,6 +109,7 @@ def test_every_sensor_has_a_config_and_every_config_builds():
         ({"elevations": [2, "a"]}, "each a finite number"),
         ({"elevations": [2, 10**400]}, "each a finite number"),
         ({"elevations": [9, 6, 5, 4, 3, 7, 1]}, "from the top row down, within (-90, 90) degrees; found (3.0, 7.0)"),
+        ({"elevations": []}, "must be two or more"),
         ({"elevations": [90, 2]}, "within (-90, 90)"),
         ({"elevations": [2, 1], "firing": [0, 0]}, "firing must name"),
         ({"elevations": [2, 1], "firing": [0, 1.0]}, "each a whole number"),
@@ -132,8 +133,7 @@ def test_an_impossible_sensor_of_a_user_is_refused(options, words):
 
 
 def written(folder: Path, text: str) -> Path:
-    path = folder / "mine.yaml"
-    path.write_text(text, errors="surrogateescape")
+    (path := folder / "mine.yaml").write_text(text, errors="surrogateescape")
     return path
 
 
