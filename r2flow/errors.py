@@ -37,8 +37,8 @@ def require(what: str, extra: str, *packages: str) -> None:
 
 def check_folder(folder: Path) -> None:
     """Refuse a folder that cannot be written to or created, before any work; nothing is written."""
-    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    usable = there.is_dir() and os.access(there, os.W_OK)
+    there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+    usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
     check(usable, f"{there} is not a folder that can be written to; give another one.")
 
 
