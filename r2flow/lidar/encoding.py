@@ -179,7 +179,7 @@ class Encoding:
 
 def wrong_with(image: Tensor) -> str | None:
     """Problem of a range image, (2 or 1, H, W), with a hint; None if its values are metres and [0, 1]."""
-    low, high = torch.stack(image.flatten(1).aminmax(dim=1)).tolist()  # NaN if a channel contains NaN
+    low, high = image.amin((1, 2)).tolist(), image.amax((1, 2)).tolist()  # NaN if a channel contains NaN
     for name, least, most in zip(("range", "reflectance"), low, high, strict=False):
         if not math.isfinite(least) or not math.isfinite(most):
             return f"its {name} is NaN or infinite in places; 0 stands for a ray without a return"
