@@ -206,7 +206,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("x;y;z\n" + "1,5;2,5e0;3\n" * 3, "decimal commas"),
         ("1 2\n3 4\n", "2 columns without names"),
         ("1,2,,4\n" * 3, "NaN"),
-        ("time,lat,lon\n1,2,3\n", "no field x, y, z; it has: time, lat, lon"),
+        ("time;lat;rgb\n1;2;0,0,255\n", "no field x, y, z; it has: time, lat, rgb"),
         ("1 2 3\n4 5\n", "number of columns changed"),
         ("1 2 3\nfour 5 6\n", "four"),
         ("1 2 \xe9\n", "convert"),

@@ -99,7 +99,7 @@ def read_text(path: Path) -> Table:
         del rows[0]
     check(rows, "it holds no line of numbers.")
     apart = next((mark for mark in ";\t," if mark in rows[-1]), None)
-    commas = apart != "," and "." not in rows[-1] and re.search(r"\d,\d", rows[-1])
+    commas = apart != "," and "." not in rows[-1] and re.search(r"(^|[;\t] *)-?\d+,\d+ *($|[;\te])", rows[-1], re.I)
     check(not commas, "its numbers have decimal commas: write them with points.")
 
     def words(line: str) -> list[str]:
