@@ -12,7 +12,7 @@ from r2flow import noise
 from r2flow.data.augment import Augmentation
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError, check
-from r2flow.lidar.encoding import Encoding, wrong_with
+from r2flow.lidar.encoding import FAR, Encoding, wrong_with
 from r2flow.lidar.sensors import Sensor
 
 Item = dict[str, Tensor]
@@ -58,11 +58,11 @@ class FlowDataset(Dataset[Item]):
         x_0 = torch.from_numpy(draw.standard_normal(self.noise_shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))
         image = self.source[index]
-        if wrong := wrong_with(torch.from_numpy(image)):
+        encoding = self.encodings[self.source.locate(index)[0]]
+        if wrong := wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range)):
             raise InputError(f"{self.source.names[index]}: {wrong}.")
         if self.augment:
             image = self.augment(image, self.seed, k)
-        encoding = self.encodings[self.source.locate(index)[0]]
         x_1 = encoding.encode(torch.from_numpy(image))
         item = {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
         if self.further is None:

@@ -18,7 +18,7 @@ from r2flow.registry import Positive, Registry, check_options, construct
 # Relative tolerance of range limits in decoding, for float32's rounding.
 LIMIT_TOLERANCE = 1e-5
 FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
-FAR = 300.0  # metres, above any scan's median range
+FAR = 300.0  # metres, above any scan's median range, unless its sensor has a larger limit
 
 
 class RangeFormat:
@@ -177,7 +177,7 @@ class Encoding:
         return (r > self.sensor.min_range) & (r < self.sensor.max_range)
 
 
-def wrong_with(image: Tensor) -> str | None:
+def wrong_with(image: Tensor, far: float = FAR) -> str | None:
     """Problem of a range image, (2 or 1, H, W), with a hint; None if its values are metres and [0, 1]."""
     low, high = image.amin((1, 2)).tolist(), image.amax((1, 2)).tolist()  # NaN if a channel contains NaN
     for name, least, most in zip(("range", "reflectance"), low, high, strict=False):
@@ -186,7 +186,7 @@ def wrong_with(image: Tensor) -> str | None:
         if least < 0:
             hint = "is it in model space ([-1, 1])? Decode it" if max(-least, most) <= 1 else "0 stands for no return"
             return f"its {name} goes down to {least:.4g}; {hint}"
-    if high[0] >= FAR and (median := float(image[0][image[0] > 0].median())) >= FAR:
+    if high[0] >= far and (median := float(image[0][image[0] > 0].median())) >= far:
         return f"its median range is {median:.4g} m; are these millimetres? Give metres"
     if max(high[1:], default=0) > FULL:
         return f"its reflectance goes up to {high[1]:.4g}, not 1; divide by its full scale, often 255"

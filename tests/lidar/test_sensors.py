@@ -91,8 +91,7 @@ def test_every_sensor_has_a_config_and_every_config_builds():
     built = []
     for path in CONF.glob("*.yaml"):
         options = yaml.safe_load(path.read_text())
-        base = options.pop("defaults", None)
-        if base:
+        if base := options.pop("defaults", None):
             options = {**yaml.safe_load((CONF / f"{base[0]}.yaml").read_text()), **options}
         assert options.get("rays", "centre") == "centre"
         sensor = build_sensor(**options)
