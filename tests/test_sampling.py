@@ -97,14 +97,14 @@ def test_round_trip_errors_are_what_they_say():
     found = invert(checkpoint, images, build_sampler("rk4", steps=8))
     changed = images.clone()
     changed[0, :, 0, :16] = 0  # 16 columns of the first row lost
-    changed[0, 0, 1, :] += 0.5 * (images[0, 0, 1] > 0)
+    changed[0, 0, 3:] += 0.5 * (images[0, 0, 3:] > 0)  # most of the others
     changed[0, 0, 2, :] += 9 * (images[0, 0, 2] == 0)  # and what was lost in the third one returns
     x = checkpoint.encoding.encode(changed)
     errors = round_trip(checkpoint, found._replace(again=x))
     other = ((images > 0) != (changed > 0))[0, 0].sum() / (8 * 64)
-    moved, kept = (images[0, 0, 1] > 0).sum(), ((images > 0) & (changed > 0))[0, 0].sum()
+    moved, kept = (images[0, 0, 3:] > 0).sum(), ((images > 0) & (changed > 0))[0, 0].sum()
     assert errors["dropped"].item() == pytest.approx(other.item())
-    assert errors["median_m"].item() == pytest.approx(0, abs=1e-5)
+    assert errors["median_m"].item() == pytest.approx(0.5, rel=1e-4)
     assert errors["rms_m"].item() == pytest.approx(0.5 * (moved / kept).sqrt().item(), rel=1e-3)
     assert errors["rms"].item() == pytest.approx((x - found.x_1).square().mean().sqrt().item(), rel=1e-6)
 
