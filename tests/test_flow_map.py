@@ -131,7 +131,7 @@ def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
     count = found.numel()  # 32,768 values of N(0.7, 0.25^2)
     assert float(found.mean()) == pytest.approx(0.7, abs=5 * 0.25 / count**0.5)
     assert float(found.std()) == pytest.approx(0.25, abs=5 * 0.25 / (2 * count) ** 0.5)
-    twice = exact(x_0, sampler=build_sampler("renoise", steps=2), draws=draws).x
+    twice = exact(x_0, sampler=build_sampler("renoise", steps=2, grid="uniform"), draws=draws).x
     between = 0.5 * draws.step(exact.noise_shape, 1) + 0.5 * (0.7 + 0.25 * x_0)
     expected = 0.7 + 0.25 / (0.25 + 0.25 * 0.25**2) ** 0.5 * (between - 0.5 * 0.7)
     torch.testing.assert_close(twice, expected, rtol=0, atol=1e-5)
@@ -159,10 +159,12 @@ def test_fewer_steps_alone_go_over_to_the_sampler_for_few(grown, asked, expected
     assert grown.choose(**asked) == expected
 
 
-def test_the_chord_s_own_grid_is_late():
+def test_the_own_grids_of_chord_and_renoise_are_late():
     torch.testing.assert_close(build_sampler("chord", steps=2).times(), torch.tensor([0, 31 / 32, 1]).double())
     expected = [0, 1 - 2**0.75 / 32, 1 - 2**0.25 / 32, 1 - 2**-0.25 / 32, 1 - 2**-0.75 / 32, 1]
     torch.testing.assert_close(build_sampler("chord", steps=5).times(), torch.tensor(expected).double())
+    expected = [0, *(1 - 2.0 ** -(1 + 5 * (j + 0.5) / 4) for j in range(4)), 1]
+    torch.testing.assert_close(build_sampler("renoise", steps=5).times(), torch.tensor(expected).double())
 
 
 def test_a_run_notes_the_sampler_for_few(grown):

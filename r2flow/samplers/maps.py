@@ -27,10 +27,7 @@ class Jump(OnGrid):
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         u, x, alive, times = generator.map(condition), noise, finite(noise), self.times().to(noise)
         for j, (t, s) in enumerate(pairwise(times), start=1):
-            e = x.new_zeros(())
-            if self.draws and s < 1:
-                assert draws is not None
-                e = draws(j)
+            e = draws(j) if draws and self.draws and s < 1 else x.new_zeros(())
             x, alive = stepped(x, self.step(u, t, x, s, e), alive)
             progress()
         return Generated.after(x, self.steps, alive)
@@ -48,21 +45,23 @@ class Chord(Jump):
     steps: Steps = 2
     grid: Grid | None = None  # type: ignore[assignment]  # None: `late`
 
-    def times(self, *args: Any, **options: Any) -> Tensor:
-        return late(self.steps) if self.grid is None else super().times(*args, **options)
+    def times(self, *args: Any, **how: Any) -> Tensor:
+        return late(self.steps, 1 / 2 if self.draws else 1 / 16) if self.grid is None else super().times(*args, **how)
 
     def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
         return x + (s - t) * u(t, x, torch.ones_like(t))
 
 
 @dataclass(frozen=True)
-class Renoise(Jump):
+class Renoise(Chord):
     """x_s = (1 - s) e + s X_{t->1}(x_t) with fresh noise e (Song et al. 2023, consistency models, algorithm 1).
 
     If the map is exact, x_1 has the right distribution, but is not the end of the path of x_0.
     """
 
     draws: ClassVar[bool] = True
+
+    steps: Steps = 8
 
     def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
         return s * jump(u, t, x, torch.ones_like(t)) + (1 - s) * e
@@ -83,10 +82,10 @@ class Transport(Sampler):
         return Generated.after(x, 1)
 
 
-def late(steps: int) -> Tensor:
-    """Time grid of one long step and short steps near t = 1: 1 - t_j is log-spaced between 1 / 16 and 1 / 64.
+def late(steps: int, widest: float) -> Tensor:
+    """Time grid with 1 - t_j log-spaced between `widest` and 1 / 64, at the middles of N - 1 equal parts:
 
-    1 - t_j = 2^(1 - (2 j - 1) / (N - 1)) / 32 for j = 1 to N - 1 of N steps.
+    1 - t_j = widest (1 / (64 widest))^((j - 1/2) / (N - 1)) for j = 1 to N - 1 of N steps.
     """
-    share = (2 * torch.arange(1, steps, dtype=torch.float64) - 1) / max(steps - 1, 1)
-    return torch.cat([torch.zeros(1), 1 - 2 ** (1 - share) / 32, torch.ones(1)])
+    share = (torch.arange(1, steps, dtype=torch.float64) - 0.5) / max(steps - 1, 1)
+    return torch.cat([torch.zeros(1), 1 - widest * (64 * widest) ** -share, torch.ones(1)])

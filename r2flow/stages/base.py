@@ -154,7 +154,7 @@ class Stage(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         with naming("the checkpoint to resume from"):  # a plug-in may have changed
-            check_weights(self, checkpoint["state_dict"])
+            check_weights(self, checkpoint.get("state_dict", self.state_dict()))  # a sharded one has none
 
 
 class SingleLoss(Stage):
