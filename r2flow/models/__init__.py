@@ -27,7 +27,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "46045d4971b4a487bd9ee885691c0076fb2ae928b0dff605f73df5b18c651f67",
+        "7b7a4e7e94ba60e73a7f822a3b695cd6e27326ec19341fe151fa519cf7affe09",
     ),
     densify=Model(
         "scans of few beams or points completed to all, in one evaluation, learned from simulated scans",
