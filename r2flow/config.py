@@ -46,9 +46,7 @@ RULES: dict[str, Key] = {
     "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # does not affect the weights' shapes
     "backbone.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
     **dict.fromkeys(("data", "data.validation.data"), OF_SCANS),
-    **dict.fromkeys(
-        ("data.root", "data.parts.*.root", "data.validation.data.root"), replace(OF_SCANS, resume="free")
-    ),
+    **dict.fromkeys(("data.root", "data.parts.*.root", "data.validation.data.root"), replace(OF_SCANS, resume="free")),
     **dict.fromkeys(("data.validation", "data.batch_size"), Key()),
     **dict.fromkeys(("data.workers", "data.memory_gib"), FREE),
     **dict.fromkeys(("data.pairs", "data.scans"), Key(links="pairs")),

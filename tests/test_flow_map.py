@@ -161,10 +161,9 @@ def test_fewer_steps_alone_go_over_to_the_sampler_for_few(grown, asked, expected
 
 def test_the_own_grids_of_chord_and_renoise_are_late():
     torch.testing.assert_close(build_sampler("chord", steps=2).times(), torch.tensor([0, 31 / 32, 1]).double())
-    expected = [0, 1 - 2**0.75 / 32, 1 - 2**0.25 / 32, 1 - 2**-0.25 / 32, 1 - 2**-0.75 / 32, 1]
-    torch.testing.assert_close(build_sampler("chord", steps=5).times(), torch.tensor(expected).double())
-    expected = [0, *(1 - 2.0 ** -(1 + 5 * (j + 0.5) / 4) for j in range(4)), 1]
-    torch.testing.assert_close(build_sampler("renoise", steps=5).times(), torch.tensor(expected).double())
+    for name, log in (("chord", (4.25, 4.75, 5.25, 5.75)), ("renoise", (1.625, 2.875, 4.125, 5.375))):
+        expected = torch.tensor([0, *(1 - 2**-part for part in log), 1]).double()  # equal parts of 4 to 6, 1 to 6
+        torch.testing.assert_close(build_sampler(name, steps=5).times(), expected)
 
 
 def test_a_run_notes_the_sampler_for_few(grown):

@@ -65,7 +65,7 @@ class ScanMetric(Metric):
         keeping: Whether rows are stored in memory, float32.
         fewest: Minimum number of scans per set for `distance`.
         biased: Whether the first value, a distance that is 0 for equal sets, is larger for fewer scans; an evaluation
-            ranks the sets by it. None: it is no distance, and gets no verdict.
+            ranks the sets by it. None: not a distance, and without a verdict.
 
     Args:
         sensor: Sensor of images passed to `update` as tensors.

@@ -153,8 +153,9 @@ class Stage(L.LightningModule):
         checkpoint |= self.generator.drawing()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        with naming("the checkpoint to resume from"):  # a plug-in may have changed
-            check_weights(self, checkpoint.get("state_dict", self.state_dict()))  # a sharded one has none
+        if "state_dict" in checkpoint:  # a sharded strategy reads its own
+            with naming("the checkpoint to resume from"):  # a plug-in may have changed
+                check_weights(self, checkpoint["state_dict"])
 
 
 class SingleLoss(Stage):
