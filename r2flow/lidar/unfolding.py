@@ -14,17 +14,19 @@ def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring:
 
     Lasers are found by the first of three ways that works: ring numbers; whole firings of H points each, including rays
     without return, in a fixed order of lasers; or ring after ring (`rings_from_order`), aligned at the bottom because
-    rings that see only sky are missing at the top. `reference` and `lidm` use the last way only.
+    rings that see only sky are missing at the top. Other conventions than `centre` use the last way as published: the
+    ring above the top row is in the bottom row; those above it, and points before the first ring's start, in the top.
     """
     rows = sensor.shape[0]
     if ring is not None:
         return rows_from_field(xyz, np.asarray(ring, dtype=np.int64), sensor)
-    if convention == "centre" and (row := rows_from_firings(xyz, sensor)) is not None:
+    if convention != "centre":
+        ring = np.cumsum(_starts(xyz))
+        row = ring - ring.max(initial=0) + rows - 1
+        return np.where((ring > 0) & (row >= -1), row % rows, 0)
+    if (row := rows_from_firings(xyz, sensor)) is not None:
         return row
     order = rings_from_order(xyz)
-    row = order - (order.max(initial=0) + 1) + rows
-    if convention != "centre":
-        return np.maximum(row, 0)
     rings = int(order.max(initial=-1)) + 1
     if not rows / 2 <= rings <= rows + 1:
         raise InputError(
@@ -40,7 +42,7 @@ def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring:
         ahead >= behind / 3,
         "elevations jump behind and not ahead: rings must be stored from azimuth 0 on. Use the spherical projection.",
     )
-    return row
+    return order - rings + rows
 
 
 def rings_from_order(xyz: np.ndarray) -> np.ndarray:
@@ -49,18 +51,18 @@ def rings_from_order(xyz: np.ndarray) -> np.ndarray:
     In a scan stored ring after ring, azimuth increases from 0; a new ring starts where it passes from the 4th to the
     1st quadrant. Points at the origin are rays without return (-1).
     """
-    x, y = xyz[:, 0], xyz[:, 1]
-    returned = np.flatnonzero((x != 0) | (y != 0))
+    returned = np.flatnonzero(xyz[:, :2].any(axis=1))
     ring = np.full(len(xyz), -1, dtype=np.int64)
-    if len(returned) == 0:
-        return ring
-    x, y = x[returned], y[returned]
-    first = (x >= 0) & (y >= 0)
-    fourth = (x >= 0) & (y < 0)
-    starts = first & np.roll(fourth, 1)
-    starts[0] = True
+    starts = _starts(xyz[returned])
+    starts[:1] = True
     ring[returned] = np.cumsum(starts) - 1
     return ring
+
+
+def _starts(xyz: np.ndarray) -> np.ndarray:
+    """Whether each point is in the 1st quadrant and the one before it, of the first the last, in the 4th; (N,) bool."""
+    x, y = xyz[:, 0], xyz[:, 1]
+    return (x >= 0) & (y >= 0) & np.roll((x >= 0) & (y < 0), 1)
 
 
 def rows_from_field(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> np.ndarray:

@@ -95,42 +95,35 @@ def test_the_seam_is_where_the_convention_has_it(convention):
     assert image[:, 512].max() == (0 if convention == "lidm" else 80)  # the limit itself
 
 
-def reference_rows_and_columns(points):
+def assert_the_reference_s(points, projection, h=None):
     """facts of the reference, written as they read, in float64 where it matters little."""
-    d = np.linalg.norm(points[:, :3], axis=1)
-    h = np.floor((1 - (np.arcsin(points[:, 2] / d) + np.deg2rad(25)) / np.deg2rad(28)) * 64)
-    w = np.floor((-np.arctan2(points[:, 1], points[:, 0]) / np.pi + 1) / 2 % 1 * 1024)
-    return d, h.clip(0, 63).astype(int), w.clip(0, 1023).astype(int)
+    d, (x, y, z, reflectance) = np.linalg.norm(points[:, :3], axis=1), points.T
+    if h is None:
+        h = np.floor((1 - (np.arcsin(z / d) + np.deg2rad(25)) / np.deg2rad(28)) * 64).clip(0, 63).astype(int)
+    w = np.floor((-np.arctan2(y, x) / np.pi + 1) / 2 % 1 * 1024).clip(0, 1023).astype(int)
+    expected, order = np.zeros((2, 64, 1024), np.float32), np.argsort(-d)
+    expected[:, h[order], w[order]] = d[order], reflectance[order]
+    expected *= (expected[0] >= 1.45) & (expected[0] <= 80)
+    ours = project(points[:, :3], reflectance, HDL64E, projection, "reference")
+    assert (ours != expected).any(0).mean() < 1e-3
 
 
 def test_the_reference_s_convention_on_real_scans(shared):
     for path in sorted((shared / "real" / "kitti360").rglob("*.bin"))[:4]:
-        points = np.fromfile(path, np.float32).reshape(-1, 4)
-        d, h, w = reference_rows_and_columns(points)
-        expected = np.zeros((2, 64, 1024), np.float32)
-        order = np.argsort(-d)
-        expected[0, h[order], w[order]], expected[1, h[order], w[order]] = d[order], points[order, 3]
-        expected *= (expected[0] >= 1.45) & (expected[0] <= 80)
-        ours = project(points[:, :3], points[:, 3], HDL64E, convention="reference")
-        assert (ours != expected).any(0).mean() < 1e-3
+        assert_the_reference_s(np.fromfile(path, np.float32).reshape(-1, 4), "spherical")
 
 
 def test_the_reference_s_unfolding_on_real_scans(shared):
     for path in sorted((shared / "real" / "raw").rglob("*.bin"))[:3]:
-        points = np.fromfile(path, np.float32).reshape(-1, 4)
-        d, _, w = reference_rows_and_columns(points)
-        x, y = points[:, 0], points[:, 1]
-        quadrant = np.select([(x >= 0) & (y >= 0), (x < 0) & (y >= 0), (x < 0) & (y < 0)], [0, 1, 2], 3)
-        starts = [i for i in range(len(x)) if quadrant[i] == 0 and quadrant[i - 1] == 3]
-        h = np.zeros(len(x), int)
-        for row, (end, start) in zip(range(63, -1, -1), pairwise([len(x), *starts[::-1]]), strict=True):
-            h[start:end] = row
-        expected = np.zeros((64, 1024), np.float32)
-        order = np.argsort(-d)
-        expected[h[order], w[order]] = d[order]
-        expected *= (expected >= 1.45) & (expected <= 80)
-        ours = project(points[:, :3], points[:, 3], HDL64E, "unfolding", "reference")[0]
-        assert (ours != expected).mean() < 1e-3
+        whole = np.fromfile(path, np.float32).reshape(-1, 4)
+        for points in (whole, whole[9000:-100], np.concatenate([whole[90000:], whole])):
+            x, y = points[:, 0], points[:, 1]
+            quadrant = np.select([(x >= 0) & (y >= 0), (x < 0) & (y >= 0), (x < 0) & (y < 0)], [0, 1, 2], 3)
+            ends = [len(x), *np.flatnonzero((quadrant == 0) & (np.roll(quadrant, 1) == 3))[::-1]]
+            h = np.zeros(len(x), int)  # also before the first ring, and from the 66th on
+            for row, (end, start) in zip([*range(63, -1, -1), 63], pairwise(ends), strict=False):
+                h[start:end] = row
+            assert_the_reference_s(points, "unfolding", h)
 
 
 @pytest.mark.parametrize(
