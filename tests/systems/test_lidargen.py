@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project_indices
@@ -41,6 +42,11 @@ def test_output_and_gradients_are_the_published_network_s(shared: Path):
 def test_the_full_network_has_the_published_names_and_shapes(shared: Path):
     with torch.device("meta"):
         assert shapes_of(RefineNet(torch.empty(232))) == published_names(shared, "lidargen")
+
+
+def test_an_image_smaller_than_the_dilation_is_refused():
+    with pytest.raises(InputError, match="at least 8, found 6 x 16"):
+        build_generator({**TINY, "sensor": {**TINY["sensor"], "rows": 6}})
 
 
 def test_instance_norm_plus_gives_channels_their_means_back():

@@ -114,7 +114,7 @@ class ScoreModel(Generator):
         self.run_by(Langevin())
         self.rate, self.pull = rate, pull
         channels, rows, columns = space.shape
-        halved("RefineNet", (rows, columns), 1)
+        halved("RefineNet", (rows, columns), 1, least=4)
         self.network = RefineNet(noise_levels(sigma_first, sigma_last, levels, spacing), channels, width)
 
 
