@@ -29,7 +29,7 @@ from r2flow.samplers import Noise, build_sampler
 from r2flow.systems.diffusion.process import PREDICTIONS, noised, square_root_linear, walk
 from r2flow.systems.latent.autoencoder import Autoencoder, Quantiser
 from r2flow.systems.latent.generator import LatentDiffusion, some_of
-from r2flow.systems.latent.published import _autoencoder, _unet
+from r2flow.systems.latent.published import _autoencoder, _unet, _within
 from r2flow.systems.latent.stage import (
     PatchDiscriminator,
     adaptive_weight,
@@ -70,17 +70,13 @@ def unet_of(cfg: dict[str, Any]) -> LatentUNet:
     )  # fmt: skip
 
 
-def within(state: dict[str, Any], prefix: str) -> dict[str, Any]:
-    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-
-
 @pytest.fixture(scope="module")
 def diffusion(shared: Path) -> dict[str, Any]:
     case = load_case(shared, "lidm_diffusion.pt")
     case["unet"] = unet_of(case["unet_cfg"])
     case["autoencoder"] = autoencoder_of(case["cfg"]["first_stage_config"]["params"])
-    case["unet"].load_state_dict(within(case["state_dict"], "model.diffusion_model."))
-    case["autoencoder"].load_state_dict(within(case["state_dict"], "first_stage_model."))
+    case["unet"].load_state_dict(_within(case["state_dict"], "model.diffusion_model."))
+    case["autoencoder"].load_state_dict(_within(case["state_dict"], "first_stage_model."))
     case["log_snr"] = square_root_linear(0.0015, 0.0195, 1000)
     return case
 
@@ -140,7 +136,7 @@ def test_the_full_networks_have_the_published_names_and_shapes(shared: Path):
         autoencoder, unet = Autoencoder(), LatentUNet((8, 16, 128))
     names = published_names(shared, "lidm")
     for prefix, model in (("first_stage_model.", autoencoder), ("model.diffusion_model.", unet)):
-        assert shapes_of(model) == within(names, prefix)
+        assert shapes_of(model) == _within(names, prefix)
 
 
 def test_a_learned_bias_is_added_after_the_first_convolution():
@@ -334,7 +330,7 @@ def test_callback_states_keyed_by_their_class_are_read(shared: Path, tmp_path: P
     [
         ({}, {}),
         (
-            {"multipliers": (1, 1, 2), "strides": ((1, 2), (1, 2)), "blocks": 3, "attention": (1,), "mask": True},
+            {"multipliers": (2, 1, 2), "strides": ((1, 2), (1, 2)), "blocks": 3, "attention": (1,), "mask": True},
             {"multipliers": (1, 2, 3), "blocks": 1, "attention": (2,), "width": 64},
         ),
     ],
@@ -362,9 +358,14 @@ def test_a_published_config_that_contradicts_is_one_line(published: tuple[Path, 
             load_checkpoint(path)
 
 
-def test_a_published_autoencoder_gives_its_codes(shared: Path):
-    io = load_case(shared, "lidm_ae_published_io.pt")
-    model = load_checkpoint(shared / "oracle_baselines" / "lidm_ae_published.ckpt").generator.first_stage_model
+@pytest.mark.parametrize("averaged", [False, True])
+def test_a_published_autoencoder_gives_its_codes(shared: Path, tmp_path: Path, averaged: bool):
+    io, content = (load_case(shared, f"lidm_ae_published{end}") for end in ("_io.pt", ".ckpt"))
+    if averaged:
+        averages = {f"model_ema.{name.replace('.', '')}": value for name, value in content["state_dict"].items()}
+        content["state_dict"] = {name: 2 * value for name, value in content["state_dict"].items()} | averages
+    torch.save(content, tmp_path / "model.ckpt")
+    model = load_checkpoint(tmp_path / "model.ckpt").generator.first_stage_model
     with torch.no_grad():
         made, quantised = model(io["x"])
         assert_near(model.encode(io["x"]), io["prequant"], 5e-5)

@@ -222,19 +222,19 @@ class Autoencoder(nn.Module):
         self.mask, self.code_channels = mask, code_channels
         finest, coarsest = widths[0], widths[-1]
         down = (
-            Level([before, *[width] * blocks], SQUARE, i in attention, down=stride)
-            for i, (before, width, stride) in enumerate(
-                zip([finest, *widths[:-1]], widths, [*self.strides, None], strict=True)
+            Level([before, *[after] * blocks], SQUARE, i in attention, down=stride)
+            for i, (before, after, stride) in enumerate(
+                zip([width, *widths[:-1]], widths, [*self.strides, None], strict=True)
             )
         )
         up = (
-            Level([before, *[width] * (blocks + 1)], BLOCK[stride or (1, 2)], i in attention, up=stride)
-            for i, (before, width, stride) in enumerate(
+            Level([before, *[after] * (blocks + 1)], BLOCK[stride or (1, 2)], i in attention, up=stride)
+            for i, (before, after, stride) in enumerate(
                 zip([*widths[1:], coarsest], widths, [None, *self.strides], strict=True)
             )
         )
         self.encoder = nn.Sequential(OrderedDict(
-            conv_in=CircularConv2d(channels, finest), down=nn.Sequential(*down), mid=_middle(coarsest),
+            conv_in=CircularConv2d(channels, width), down=nn.Sequential(*down), mid=_middle(coarsest),
             norm_out=GroupNorm(coarsest, GROUPS), silu=nn.SiLU(), conv_out=CircularConv2d(coarsest, latent_channels),
         ))  # fmt: skip
         self.decoder = nn.Sequential(OrderedDict(

@@ -33,9 +33,12 @@ USUAL = {
 }  # fmt: skip
 
 
-def _state(content: Any) -> Mapping[str, Tensor]:
-    state = content.get("state_dict") if isinstance(content, Mapping) else None
-    return state if isinstance(state, Mapping) else {}
+def _state(content: Any, averaged: bool = False) -> Mapping[str, Tensor]:
+    """Weights, or their averages where a file has them; names of averages have no dots."""
+    found = content.get("state_dict") if isinstance(content, Mapping) else None
+    state = found if isinstance(found, Mapping) else {}
+    averages = {name: AVERAGE + name.removeprefix("model.").replace(".", "") for name in state if averaged}
+    return {name: state.get(averages.get(name), value) for name, value in state.items()}
 
 
 def holds_diffusion(content: Any) -> bool:
@@ -48,10 +51,9 @@ def holds_autoencoder(content: Any) -> bool:
 
 
 def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
-    """Read a published latent diffusion; names of averaged weights have no dots."""
-    state, notes = _state(content), _notes(path)
-    raw = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
-    undotted = {name: AVERAGE + name.removeprefix("model.").replace(".", "") for name in raw}
+    """Read a published latent diffusion."""
+    state, notes = _state(content, averaged), _notes(path)
+    weights = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
     params = (notes.get("model") or {}).get("params") or {}
     unet = params.get("unet_config", {}).get("params", {})
     options = {**USUAL, **({"lib_name": "ldm"} if unet else {}), **params, **unet}  # ldm: without circular convolutions
@@ -59,29 +61,26 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
         raise InputError(f"{path}: its config.yaml has {other}, and only LiDM's own form is read.")
     generator = {
         "name": "latent_diffusion",
-        "autoencoder": _autoencoder(_within(raw, AUTOENCODER)),
-        "unet": {**_unet(_within(raw, UNET)), "head_channels": int(unet.get("num_head_channels", HEAD))},
+        "autoencoder": _autoencoder(_within(weights, AUTOENCODER)),
+        "unet": {**_unet(_within(weights, UNET)), "head_channels": int(unet.get("num_head_channels", HEAD))},
         "beta_first": float(f"{state['betas'][0]:.6g}"),
         "beta_last": float(f"{state['betas'][-1]:.6g}"),
         "diffusion_steps": len(state["betas"]),
     }
-    weights = {name: state.get(undotted[name], value) for name, value in raw.items()} if averaged else raw
-    return Published(_config(generator, path, notes), weights, _step(content), {"name": "latent_ddim"})
+    step = int(content.get("global_step", 0))
+    return Published(_config(generator, path, notes), weights, step, {"name": "latent_ddim"})
 
 
 def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
     """Read a published autoencoder, without its discriminator."""
-    raw = {name: value for name, value in _state(content).items() if not name.startswith("loss.")}
-    config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(raw)}, path, _notes(path))
-    return Published(config, {AUTOENCODER + name: value for name, value in raw.items()}, _step(content))
+    state = _state(content, averaged)
+    config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(state)}, path, _notes(path))
+    named = {AUTOENCODER + name: value for name, value in state.items() if not name.startswith(("loss.", AVERAGE))}
+    return Published(config, named, int(content.get("global_step", 0)))
 
 
 def _within(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-
-
-def _step(content: Mapping[str, Any]) -> int:
-    return int(content.get("global_step", 0))
 
 
 def _counted(names: Mapping[str, Tensor], form: str) -> int:
@@ -152,9 +151,7 @@ def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> 
     expected = ShiftedLog(build_sensor(**sensor)).scale if logarithmic else farthest  # type: ignore[arg-type]
     scale = float(images.get("depth_scale", expected))
     if abs(scale - expected) > 1e-6:
-        raise InputError(
-            f"{path}: ranges up to {farthest:g} m have the scale {expected:g}, its config.yaml has {scale:g}."
-        )
+        raise InputError(f"{path}: ranges to {farthest:g} m have the scale {expected:g}, config.yaml has {scale:g}.")
     return {
         "sensor": sensor,
         "encoding": {"format": "shifted_log" if logarithmic else "metric", "reflectance": False, "limits": "open"},
