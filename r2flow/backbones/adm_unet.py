@@ -27,6 +27,8 @@ class ADMUNet(UNet):
     The bottleneck also has attention. For the options see `UNet`.
     """
 
+    multiplied = True
+
     def build_levels(self, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions) -> None:
         deepest = self.levels - 1
         width, *widths = widths
@@ -38,8 +40,7 @@ class ADMUNet(UNet):
                 width = out
                 skips.append(width)
             if level != deepest:
-                halve = Resample(FILTER, up=False, ring=options.ring)
-                self.down_blocks.append(ADMBlock(width, width, options, halve))
+                self.down_blocks.append(ADMBlock(width, width, options, Resample(FILTER, up=False, ring=options.ring)))
                 skips.append(width)
         self.mid_blocks = nn.ModuleList([ADMBlock(width, width, options, heads=heads), ADMBlock(width, width, options)])
         self.up_blocks = nn.ModuleList()
@@ -49,8 +50,7 @@ class ADMUNet(UNet):
                 step = nn.ModuleList([ADMBlock(width + skips.pop(), widths[level], options, heads=attention)])
                 width = widths[level]
                 if level > 0 and index == counts[level]:
-                    double = Resample(FILTER, up=True, ring=options.ring)
-                    step.append(ADMBlock(width, width, options, double))
+                    step.append(ADMBlock(width, width, options, Resample(FILTER, up=True, ring=options.ring)))
                 self.up_blocks.append(step)
         head = zero_initialised(RingConv2d(width, self.out_channels, options.ring))
         self.out_conv = nn.Sequential(GroupNorm(width, options.groups, options.eps), nn.SiLU(), head)

@@ -184,6 +184,7 @@ class UNet(Backbone, ABC):
 
     takes_second_time = True
     croppable = True
+    multiplied = False  # whether the first convolution has the width of the first level, as the published ADM U-Net's
     features: Tensor
 
     def __init__(
@@ -212,8 +213,8 @@ class UNet(Backbone, ABC):
         extra = self.coords_encoding.channels if self.coords_encoding else 0
         width = time_channels or 4 * base_channels
         self.time_embedding = time_embedding(base_channels, width)
-        self.in_conv = RingConv2d(self.in_channels + extra, base_channels, ring)
-        widths = [base_channels * multiplier for multiplier in (1, *multipliers)]
+        widths = [base_channels * n for n in (multipliers[0] if self.multiplied else 1, *multipliers)]
+        self.in_conv = RingConv2d(self.in_channels + extra, widths[0], ring)
         self.build_levels(widths, counts, num_heads, BlockOptions(width, ring, dropout, groups, eps))
         if self.second_time:
             self.interval_embedding = time_embedding(base_channels, width, bias=False)

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from r2flow.backbones import BACKBONES, build_backbone
+from r2flow.backbones import build_backbone
 from r2flow.backbones.convolutions import Resample
 from r2flow.errors import InputError
-from r2flow.registry import check_options
 from tests.reference import load_case
 
 
@@ -33,6 +32,8 @@ def test_resampling_keeps_a_constant_ring_constant(window):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"base_channels": 2}, "base_channels must be .* of at least 4 that is even, found 2"),
+        ({"base_channels": 9}, "base_channels must be .* of at least 4 that is even, found 9"),
         ({"base_channels": 12}, "12 channels cannot be shared by 8 groups: give a multiple of 8"),
         ({"base_channels": 8, "num_heads": 3}, "cannot be shared by 3 attention heads"),
         ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
@@ -45,9 +46,7 @@ def test_options_that_cannot_work_say_why(name, options, message):
         build_backbone({"name": name, **options}, torch.zeros(2, 16, 64), 2)
 
 
-@pytest.mark.parametrize(("name", "key", "value"), [
-    ("adm_unet", "base_channels", 2), ("efficient_unet", "base_channels", 9),
-])  # fmt: skip
-def test_widths_without_a_time_embedding_are_refused(name, key, value):
-    with pytest.raises(InputError, match=rf"{key} must be .* of at least (4 that is even|2), found {value}"):
-        check_options("backbone", BACKBONES[name], {key: value})
+@pytest.mark.parametrize(("name", "width"), [("adm_unet", 16), ("efficient_unet", 8)])
+def test_the_first_convolution_has_its_published_width(name, width):
+    options = {"name": name, "base_channels": 8, "channel_multiplier": [2, 2], "num_residual_blocks": 1}
+    assert len(build_backbone(options, torch.zeros(2, 16, 64), 2).in_conv.weight) == width
