@@ -17,6 +17,7 @@ from r2flow.lidar.sensors import Convention, Sensor, named_sensor
 from r2flow.lidar.unfolding import unfolded_rows
 
 Projection = Literal["spherical", "unfolding"]
+TIE = 1e-3  # of a pixel: points on an edge, as of coarser images, are in the lower row and in the later column
 
 
 def project(
@@ -31,7 +32,8 @@ def project(
 
     The row is that of the elevation asin(z / r) in `spherical`, and that of the laser in `unfolding`, from `ring` or
     the order of the points (`unfolded_rows`). The column is floor(W (1 - a / pi) / 2) with azimuth a = atan2(y, x):
-    column 0 begins at +180 degrees and azimuth decreases with w.
+    column 0 begins at +180 degrees and azimuth decreases with w. In `centre` both include 0.001 of a pixel, so that
+    points on an edge are in one pixel whatever their rounding.
 
     `centre` keeps returns with min_range <= r <= max_range in the field of view. `reference` is the convention of the
     published R2Flow: elevations outside the view are clamped to the edge rows, and the range limits are applied after
@@ -119,25 +121,28 @@ def _rows(
     elevation = np.arcsin(xyz[:, 2] / np.maximum(r, np.float32(1e-12)))
     edges = np.deg2rad(sensor.row_edges)
     step = np.diff(edges)
-    even = np.allclose(step, step[0], rtol=1e-6)
+    even, tie = np.allclose(step, step[0], rtol=1e-6), TIE if convention == "centre" else 0.0
     if even and convention in ("lidargen", "lidm"):  # their order of operations, in float32
         row = np.floor((1 - (elevation - float(edges[-1])) / float(edges[0] - edges[-1])) * rows).astype(np.int64)
     elif even:  # an affine map instead of a search
         place = edges[0] - elevation
         place /= edges[0] - edges[-1]
         place *= rows
+        place += tie
         row = np.floor(place, out=place).astype(np.int64)
     else:
-        row = np.searchsorted(-edges, -elevation, side="right") - 1
+        row = np.searchsorted(-edges, tie * float(-step.max()) - elevation, side="right") - 1
     return row if convention == "centre" else np.clip(row, 0, rows - 1)
 
 
 def _columns(xyz: np.ndarray, columns: int, convention: Convention) -> np.ndarray:
     """Column of every point, (N,) int64."""
     turn = (1 - np.arctan2(xyz[:, 1], xyz[:, 0]) / np.float32(math.pi)) / 2  # of [0, 1], 1 at exactly -180 degrees
+    if convention == "centre":
+        return (turn * np.float32(columns) + np.float32(TIE)).astype(np.int64) % columns
     column = (turn * np.float32(columns)).astype(np.int64)
     np.minimum(column, columns - 1, out=column)  # float32 may round the last bin up to W
-    if convention in ("centre", "reference"):
+    if convention == "reference":
         column[turn == 1] = 0
     return column
 

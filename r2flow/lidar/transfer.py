@@ -12,13 +12,12 @@ import numpy as np
 from r2flow.errors import InputError
 from r2flow.lidar.estimation import estimate_sensor, steps_of_a_turn
 from r2flow.lidar.known import Ray
-from r2flow.lidar.projection import Convention, Projection, nearest, project_indices, scatter
+from r2flow.lidar.projection import TIE, Convention, Projection, nearest, project_indices, scatter
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.scan_files.points import NEAREST
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.unfolding import elevations_of
 
-TIE = 1e-3  # of a column, or degrees: rays on the edge of a pixel are in the lower row and in the later column
 BLIND = 5.0  # degrees: a wider sector without any return counts as not measured, as in a cropped scan
 WHOLE = 0.9  # minimum share of the rays of a turn that a file with all lost rays stores
 

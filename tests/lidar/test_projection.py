@@ -54,6 +54,14 @@ def test_a_range_that_is_none_is_no_point(r):
     np.testing.assert_array_equal(np.sort(reflectance), image[1, 0, ::2])
 
 
+def test_points_on_the_edges_of_pixels_go_to_the_lower_row_and_the_later_column():
+    coarse = HDL64E.resized(32, 256)
+    image, expected = random_image(coarse), np.zeros((2, 64, 1024), np.float32)
+    expected[:, 1::2, 2::4] = image
+    made = project(*image_to_points(image, coarse), HDL64E)
+    np.testing.assert_allclose(made, expected, rtol=1e-6)
+
+
 def test_a_return_too_near_does_not_hide_what_is_behind_it():
     points = np.array([point(1.0, -5, 20), point(30, -5, 20)])
     assert project(points, np.ones(2), HDL64E)[0].max() == pytest.approx(30, rel=1e-6)
