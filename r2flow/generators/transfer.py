@@ -165,18 +165,20 @@ class TransferFlow(Flow):
         x_1 = torch.where(condition[KNOWN] > 0, condition[IMAGE], (self._chosen if last else self._mean)(answers)).to(x)
         return ((x_1 - x) / (1 - expand_time(t, x)).clamp(min=LAST)).to(x)
 
-    def transported(self, x_0: Tensor, condition: Condition) -> Tensor:
+    def transported(self, x_0: Tensor, condition: Condition, residual: float = 1.0) -> Tensor:
         """x_1 in one evaluation, by the monotone map of a normal number z per ray to its density: log r = F^-1(Phi(z)).
 
         This is the optimal transport between the two in one dimension. z is the noise, smoothed so that neighbouring
-        rays agree on an edge or a gap (a Gaussian copula).
+        rays agree on an edge or a gap (a Gaussian copula). The deviation of log r from the candidate that most likely
+        produced it is multiplied by `residual`.
         """
         answers = self._answered(torch.zeros((), device=x_0.device), x_0, condition)
         e = (x_0 - condition["start"])[:, :1].float() / max(self.sigma, 1e-6)
         u = torch.special.ndtr(smoothed(e, condition[KNOWN][:, :1] < 1, self.elevations))
         p = answers.returns.sigmoid()
         log_r = answers.quantile((u / p).clamp(1e-6, 1 - 1e-6))
-        strength = answers.strengths.gather(1, answers.likeliest(log_r))
+        k = answers.likeliest(log_r)
+        log_r, strength = answers.ranges.gather(1, k).lerp(log_r, residual), answers.strengths.gather(1, k)
         x_1 = encoded(self.space, self._within(log_r) * (u < p), strength * (u < p))
         return torch.where(condition[KNOWN] > 0, condition[IMAGE], x_1)
 

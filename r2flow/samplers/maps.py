@@ -9,6 +9,7 @@ from torch import Tensor
 
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.solvers.solution import finite, stepped
+from r2flow.registry import NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Sampler, Steps
 
 
@@ -74,11 +75,13 @@ class Transport(Sampler):
 
     needs: ClassVar[str] = "transported"
 
+    residual: NonNegative = 1.0  # factor of a ray's deviation from its drawn candidate: less is sharper, but too sure
+
     def evaluations(self, generator: Any = None) -> int:
         return 1
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        x = generator.transported(noise, condition)
+        x = generator.transported(noise, condition, self.residual)
         progress()
         return Generated.after(x, 1)
 

@@ -184,11 +184,15 @@ def test_transported_answers_return_as_often_as_expected_and_keep_what_is_known(
     seen: list[Answers] = []
     given, flow.answers = flow.answers, lambda *args: seen.append(given(*args)) or seen[-1]
     flow(torch.zeros(1, *flow.noise_shape), condition, sampler=build_sampler("transport"))
+    sharp = flow(draws.start(flow.noise_shape)[:1], condition, sampler=build_sampler("transport:residual=0"))
     del flow.answers
     hidden = (state[0] == Ray.UNKNOWN) & (share > 0)
     off = (share - seen[0].returns.sigmoid()[0, 0])[hidden]
     assert off.abs().max() < 0.15  # six standard errors of 400 draws
     assert off.mean().abs() < 0.01
+    r = flow.space.decode(sharp.x)[:, :1]
+    near = (seen[1].ranges - r.clamp(min=1e-3).log()).abs().amin(1, keepdim=True)
+    assert near[(r > 0) & (state[:1, None] == Ray.UNKNOWN)].max() < 1e-4  # each ray is one of its candidates
 
 
 def test_smoothed_noise_is_standard_normal_and_agrees_within_the_correlation_length():
