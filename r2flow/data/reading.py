@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -68,17 +68,11 @@ class Reading:
         return described and cls.of(described)
 
 
-class Projected(NamedTuple):
-    """A projected scan file, and the point of each pixel."""
+def read_projected(path: str | Path, reading: Reading) -> tuple[np.ndarray, Points, np.ndarray, np.ndarray]:
+    """A file of points as an image, (2 or 1, H, W), and all its points.
 
-    image: np.ndarray  # (2 or 1, H, W)
-    points: Points  # all points of the file
-    pixels: np.ndarray  # pixels with a point, h W + w, (M,)
-    chosen: np.ndarray  # indices of their points, (M,)
-
-
-def read_projected(path: str | Path, reading: Reading) -> Projected:
-    """Read a file of points as an image with the points of its pixels."""
+    Also the pixels that have a point, h W + w, (M,), and the indices of these points, (M,).
+    """
     sensor = reading.sensor
     try:
         points = read_points(path, reading.columns)
@@ -95,7 +89,7 @@ def read_projected(path: str | Path, reading: Reading) -> Projected:
             raise
         points, (pixels, chosen) = Points(np.zeros((0, 3), np.float32)), np.zeros((2, 0), np.int64)
         image = np.zeros((1 + bool(reading.reflectance), *sensor.shape), np.float32)
-    return Projected(image, points, pixels, chosen)
+    return image, points, pixels, chosen
 
 
 def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:
@@ -113,12 +107,12 @@ def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, 
 
     The ids are None if the scan has no label file.
     """
-    projected = read_projected(path, reading)
+    image, points, pixels, chosen = read_projected(path, reading)
     file = labels_beside(path)
     if file is None:
-        return projected.image, None
-    labels = read_labels(file, path, projected.points)[projected.chosen].astype(np.uint16)
-    return projected.image, scatter(reading.sensor, projected.pixels, [labels])[0].astype(np.uint16)
+        return image, None
+    labels = read_labels(file, path, points)[chosen].astype(np.uint16)
+    return image, scatter(reading.sensor, pixels, [labels])[0].astype(np.uint16)
 
 
 def _no_reflectance(path: str | Path) -> InputError:
@@ -171,7 +165,7 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     channels = 1 + bool(reading.reflectance)
     image = read_range_image(path)
     if image is None:
-        return read_projected(path, reading).image
+        return read_projected(path, reading)[0]
     if image.shape[1:] != reading.sensor.shape:
         size, expected = ("x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape))
         raise InputError(
@@ -202,8 +196,8 @@ def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarra
 
 def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
     """Read points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for no return."""
-    projected = read_projected(path, reading)
-    return projected.image, scatter(reading.sensor, projected.pixels, projected.points.xyz[projected.chosen].T)
+    image, points, pixels, chosen = read_projected(path, reading)
+    return image, scatter(reading.sensor, pixels, points.xyz[chosen].T)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from r2flow.data.partial import open_partial
-from r2flow.data.reading import Reading, read_projected
+from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.beams import find_beams
 from r2flow.lidar.estimation import steps_of_a_turn
@@ -219,8 +219,8 @@ def test_lost_rays_of_whole_firings_may_be_nan(tmp_path):
     xyz = firings[:, packet_order(sensor, "firing")].reshape(-1, 3)
     xyz[~xyz.any(axis=1)] = np.nan
     np.save(tmp_path / "0.npy", xyz)
-    found = read_projected(tmp_path / "0.npy", Reading(sensor, "unfolding", reflectance=False))
-    np.testing.assert_allclose(found.image[0], image, rtol=1e-6)
+    found = read_image(tmp_path / "0.npy", Reading(sensor, "unfolding", reflectance=False))
+    np.testing.assert_allclose(found[0], image, rtol=1e-6)
     assert find_beams(read_points(tmp_path / "0.npy")).firing is not None
     (scan,), _ = open_partial([str(tmp_path / "0.npy")], Reading(sensor, "unfolding"), sensor)  # as complete reads it
     np.testing.assert_allclose(scan.read().image[0], image, rtol=1e-6)
