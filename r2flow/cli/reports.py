@@ -87,7 +87,6 @@ def solvers(
     The page lists the best sampler for each error as a command.
     """
     from r2flow.flow.problems import PROBLEMS
-    from r2flow.generators import as_flow
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
     from r2flow.reports import solvers as measuring
@@ -98,16 +97,12 @@ def solvers(
     most = numbers("budgets", budgets)
     chosen, subjects, flow = measuring.configurations(methods, most), measuring.problem_subjects(names), None
     check(chosen and (names or model), "nothing to measure: give a model or more --budgets, or no --problems none.")
-    loaded = None if model is None else load_checkpoint(model, where)
-    if loaded is not None:
-        as_flow(loaded.generator, "report solvers")
     check_folder(out)
     logging.getLogger("r2flow.flow").setLevel(logging.ERROR)  # the report counts failed scans
-    if loaded is not None:
+    if model is not None:
+        loaded = load_checkpoint(model, where)
         with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
-            flow = measuring.checkpoint_subject(
-                loaded, str(model), draw.num, draw.seed, draw.batch_size, progress=advance
-            )
+            flow = measuring.checkpoint_subject(loaded, model, draw.num, draw.seed, draw.batch_size, progress=advance)
         subjects.append(flow)
     with Bar("measuring", len(subjects) * len(chosen), "solutions") as advance:
         rows = measuring.measure(subjects, chosen, advance)

@@ -91,7 +91,7 @@ def checkpoint_subject(
 
     `floor` is three times the largest distance to dopri5 at a tight tolerance, inf if either did not converge.
     """
-    flow = as_flow(checkpoint.generator, "this report")
+    flow = as_flow(checkpoint.generator, "report solvers")
     x_0 = Draws(seed, range(num)).start(flow.noise_shape).to(flow.device)
     ends, apart = [], []
     with torch.inference_mode():
