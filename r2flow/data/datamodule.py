@@ -76,8 +76,8 @@ class ScanDataModule(L.LightningDataModule):
             return
         if self.pairs is not None:
             _ = self.pair_store  # refuses other pairs in the folder early; missing pairs are made later
-            if self.options.next_to_pairs is not None:
-                source = Mixture([self._open(self.options.next_to_pairs)])
+            if self.options.scans is not None:
+                source = Mixture([self._open(SourceOptions(**self.options.scans))])
                 self.names, self.opened = list(source.names), [source]
                 self.scans = self._kept(source, "scans next to the pairs", [self.sensor])
             return

@@ -142,8 +142,3 @@ class DataOptions(SourceOptions):
         """The set of `validation.data`."""
         other = self.validation_options.data
         return None if other is None or self.name == PAIRS else SourceOptions(**other)
-
-    @property
-    def next_to_pairs(self) -> SourceOptions | None:
-        """The set of `scans`."""
-        return None if self.scans is None else SourceOptions(**self.scans)
