@@ -23,7 +23,7 @@ from r2flow import simulator
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.errors import InputError, check, warn_odd
 from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
-from r2flow.lidar.scan_files import Points, read_points, read_range_image, scan_ending
+from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST, manifest_of
 
@@ -42,15 +42,12 @@ class ScanSource(ABC):
     Attributes:
         slow: Whether reading an image is slow, so that images are kept in memory if they fit.
         drawn: Whether a network draws the images on access: only in this process, and each image once if possible.
-        measured: Whether the measured points of the pixels are available; they are not for range images, prepared
-            shards, samples and simulated scans.
         drives: Numbers of the scans of each recording, by its name, if known.
         contents: Digest of what is cheaply known of the scans, equal for a copy of the data set.
     """
 
     slow = False
     drawn = False
-    measured = False
     drives: Mapping[str, Sequence[int]] = {}
     contents = ""
 
@@ -180,11 +177,6 @@ class ScanFiles(ScanSource):
         self.paths, self.reading, self.root = list(paths), reading, root
         self.drives, self.described = drives or {}, about or {}
         self.bad: set[int] = set()
-
-    @cached_property
-    def measured(self) -> bool:  # type: ignore[override]
-        arrays = (path for path in self.paths if str(path).lower().endswith((".npy", ".npz")))
-        return next((read_range_image(path) is None for path in arrays), True)
 
     @property
     def names(self) -> list[str]:

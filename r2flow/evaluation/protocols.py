@@ -44,11 +44,14 @@ class Rules:
 
     def check(self, real: ScanSet) -> None:
         """Refuse a real set without the measured coordinates that the protocol needs."""
-        if self.real == "measured" and not real.source.measured:
+        try:
+            if self.real == "measured":
+                real.source.with_points(0)
+        except InputError:
             raise InputError(
                 f"{real.label} lacks the measured coordinates of its points, which the protocol '{self.name}' compares:"
                 " only point files have them (KITTI's .bin). Or give --protocol r2flow."
-            )
+            ) from None
 
 
 def published_choice(scans: ScanSet, most: int) -> list[int]:
