@@ -56,14 +56,12 @@ class ScanDataModule(L.LightningDataModule):
         self.opened: list[Mixture] = []  # as found, before they are read
         self.training_source: Mixture | PairSource | None = None
         self.validation_source: Mixture | PairSource | None = None
-        self.pairs = self._pair_options() if self.options.name == PAIRS else None
         self.scans: Mixture | None = None  # next to pairs
-
-    def _pair_options(self) -> PairOptions:
-        options = construct("data.pairs", PairOptions, self.options.pairs)
-        check(not self.augment, "data.augment changes scans, and an augmented pair is not a flow's pair; leave it out.")
-        check(self.validation.data is None, "data.validation.data cannot be held out from pairs; leave it out.")
-        return options
+        self.pairs: PairOptions | None = None
+        if self.options.name == PAIRS:
+            self.pairs = construct("data.pairs", PairOptions, self.options.pairs)
+            check(not self.augment, "data.augment changes scans, and an augmented pair is not a flow's; leave it out.")
+            check(self.validation.data is None, "data.validation.data cannot be held out from pairs; leave it out.")
 
     @property
     def pair_store(self) -> PairStore:
