@@ -53,10 +53,6 @@ class SourceOptions:
         return self.chosen.get("columns")
 
     @property
-    def on_bad_scan(self) -> str:
-        return self.chosen.get("on_bad_scan", "error")
-
-    @property
     def folder(self) -> str:
         """`root` as a string: YAML reads a folder name of digits as a number."""
         check(self.root is not None, f"data={self.name} needs the folder of its scans: data.root=FOLDER.")

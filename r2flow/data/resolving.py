@@ -90,7 +90,7 @@ def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
     check(wanted == AUTO, f"encoding.reflectance must be true, false or auto, found {wanted!r}.")
     run = DataOptions(**resolve(data))
     for options in (*run.sets, *([run.held_out] if run.held_out else [])):
-        lacking = SOURCES[options.name].lacks_reflectance(options, options.on_bad_scan)
+        lacking = SOURCES[options.name].lacks_reflectance(options, options.chosen["on_bad_scan"])
         if lacking:
             log.info("range alone is learned (encoding.reflectance=auto): %s", lacking)
             return False
