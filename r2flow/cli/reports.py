@@ -170,10 +170,8 @@ def completion(
     from r2flow.reports.compare import labels
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, measured_by, pictured
 
-    paths = [Path(name) for name in models or [DENSIFY]]
-    loaded = {
-        name: load_checkpoint(path, choose_device(device)) for name, path in zip(labels(paths), paths, strict=True)
-    }
+    paths, where = [Path(name) for name in models or [DENSIFY]], choose_device(device)
+    loaded = {name: load_checkpoint(path, where) for name, path in zip(labels(paths), paths, strict=True)}
     stored = own_reading(real)
     own = next((m.sensor for m in loaded.values() if not isinstance(m.generator, TransferFlow)), None)
     for name, model in loaded.items():
@@ -204,7 +202,7 @@ def completion(
         shown = list(completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, progress=advance))
     figure = pictured(truths[0], shown, first.sensor)
     about = f"{len(truths)} scans of {real} (at most {num}, --num), {answers} completions per scan."
-    page = completion_page([row for row, _ in shown], figure, about, seed, str(choose_device(device)))
+    page = completion_page([row for row, _ in shown], figure, about, seed, where)
     finish(page, out, [about, *page.text[1:]])
 
 

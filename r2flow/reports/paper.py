@@ -92,7 +92,7 @@ def paper_page(
     samples = {
         run.label: run.checkpoint.sample(num).nan_to_num(0.0).numpy() for run in track(runs, "sampling", "generators")
     }
-    scans = None if real is None else np.stack([real.spread(num).source[i] for i in range(min(num, len(real)))])
+    scans = None if real is None else real.spread(num)[:].numpy()
     figures["figure_5"] = birds_eye_figure(
         {run.label: _birds_eye(samples[run.label], run.checkpoint) for run in runs},
         None if scans is None else _birds_eye(scans, runs[0].checkpoint),
