@@ -196,8 +196,8 @@ def reading_for(
     """
     specs = [str(spec) for spec in scans if spec is not None]
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
-    name = parse(specs[0])[0].name if specs else FOLDER
-    reading = _reading_of(model) if model else stored or Reading(SENSORS[SOURCES[name].sensor])
+    options = parse(specs[0])[0] if specs else SourceOptions(FOLDER)
+    reading = _reading_of(model) if model else stored or Reading(SENSORS[SOURCES[options.name].sensor])
     given: dict[str, Any] = {
         "projection": projection, "convention": convention, "reflectance_scale": reflectance_scale,
         "columns": columns and tuple(columns),
@@ -214,8 +214,8 @@ def reading_for(
         return reading
     trained = reading.reflectance_scale  # 1: also of scans that were scaled before the training
     scale = trained if model and trained != 1 else reading.sensor.reflectance_scale
-    if not estimate_scale or stored or name != FOLDER:
-        scale = scale_of(parse(specs[0])[0], scale)
+    if not estimate_scale or stored or options.name != FOLDER:
+        scale = scale_of(options, scale)
     return replace(reading, reflectance_scale=scale)
 
 
