@@ -121,7 +121,7 @@ class Layout(SourceKind):
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         paths = (path for drive in self.find_drives(options) for path in drive.scans)
         with leaving_out(on_bad_scan == "error"):
-            return lacks_reflectance(paths, on_bad_scan, options.columns)
+            return lacks_reflectance(paths, on_bad_scan, options.chosen.get("columns"))
 
 
 def kitti_360(root: Path) -> list[Drive]:

@@ -41,16 +41,12 @@ class SourceOptions:
 
     def __post_init__(self) -> None:
         check_options("data.reading", ReadingOptions, self.reading or {})
-        check_columns(self.columns)
+        check_columns(self.chosen.get("columns"))
 
     @property
     def chosen(self) -> dict[str, Any]:
         """The fields of `reading` that are not None."""
         return {key: value for key, value in (self.reading or {}).items() if value is not None}
-
-    @property
-    def columns(self) -> list[str] | None:
-        return self.chosen.get("columns")
 
     @property
     def folder(self) -> str:
