@@ -161,8 +161,7 @@ class SamplerOptions:
         """Given name and fields, as arguments of `Generator.choose`."""
         from r2flow.samplers import parse_sampler
 
-        fields = {"steps": self.steps, "tolerance": self.tolerance, "grid": self.grid}
-        given = {key: value for key, value in fields.items() if value is not None}
+        given = {key: value for key, value in asdict(self).items() if key != "sampler" and value is not None}
         return {**(parse_sampler(self.sampler) if self.sampler else {}), **given}
 
 
