@@ -24,10 +24,9 @@ from safetensors import safe_open
 from r2flow.config import at_most_three, differences
 from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, find_levels, range_codes, reflectance_codes
-from r2flow.data.reading import Reading, lacks_reflectance, scale_within, stored_reflectance
+from r2flow.data.reading import Reading, lacks_reflectance, read_image
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError, check
-from r2flow.lidar.scan_files import read_range_image
 from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, read_manifest
 
 log = logging.getLogger(__name__)
@@ -102,14 +101,10 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
     """Levels of reflectance; None if the scans lack reflectance."""
     if lacks_reflectance(paths, "skip", reading.columns) is not None:
         return None
-    samples, scale = [], reading.reflectance_scale or 1.0
+    samples = []
     for index in spread(len(paths), PROBED):
         with suppress(InputError):  # reported when the scan is prepared
-            reflectance = stored_reflectance(paths[index], reading.columns)
-            if reflectance is not None:
-                is_image = read_range_image(paths[index]) is not None  # with reflectance in [0, 1]
-                own = 1.0 if is_image else scale_within(paths[index], reflectance, scale)
-                samples.append(reflectance / np.float32(own))
+            samples.append(read_image(Path(paths[index]), replace(reading, reflectance=True))[1])
     values = np.concatenate(samples) if samples else np.zeros(0)
     return find_levels(values) if values.any() else OTHER_LEVELS
 

@@ -222,7 +222,11 @@ def lacks_reflectance(
     """
     for path in paths:
         try:
-            reflectance = stored_reflectance(path, columns)
+            image = read_range_image(path)
+            if image is None:
+                reflectance = read_points(path, columns).reflectance
+            else:
+                reflectance = image[1][image[0] > 0] if len(image) > 1 else None
         except InputError as error:
             if on_bad_scan == "error" or (on_bad_scan == "empty" and not isinstance(error, NoPointsError)):
                 raise
@@ -232,11 +236,3 @@ def lacks_reflectance(
         if reflectance.size:
             return None if reflectance.any() else f"the reflectance in {path} is 0 throughout"
     return "no scan has a return"
-
-
-def stored_reflectance(path: str | Path, columns: Sequence[str] | None = None) -> np.ndarray | None:
-    """The stored reflectance of all returns of a scan file or a range image; None if the file has none."""
-    image = read_range_image(path)
-    if image is None:
-        return read_points(path, columns).reflectance
-    return image[1][image[0] > 0] if len(image) > 1 else None
