@@ -178,6 +178,7 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
         (None, ["--from", "vlp16"], "of 8 rows by --from, in Python by sensor (vlp16 has 16), or --size 8x64 alone"),
         (np.full((2, 8, 64), np.nan, np.float32), [], "give 0 for NaN"),
         (np.zeros((0, 8, 64), np.float32), [], "must be a range image of floats (2 or 1, H, W), found float32 (0, 8"),
+        (np.full((1, 8, 4), 3, np.float32), [], "must be a range image of floats (2 or 1, H, W), found float32 (1, 8"),
         (-scans()[0].numpy(), [], "must hold ranges in metres, of 0 or more"),
         (np.full((2, 8, 64), 3, np.float32), [], "reflectances of [0, 1]. Divide"),
         (scans()[0].numpy() * np.float32([[[1000]], [[1]]]), [], "none of its ranges lies within 1.45-80 m"),
@@ -186,7 +187,7 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
 def test_what_cannot_be_done_is_one_line(complete, tmp_path, image, options, message):
     np.save(tmp_path / "one.npy", scans()[0].numpy() if image is None else image)
     np.save(tmp_path / "mask.npy", np.ones((4, 4), bool))
-    given = [option.format(folder=tmp_path) for option in options]
+    given = (option.format(folder=tmp_path) for option in options)
     assert_refused(complete(tmp_path / "one.npy", *given), message, tmp_path / "out")
 
 
@@ -243,8 +244,7 @@ def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path
     whole = open_scans(given).source
     for number in numbers:
         assert np.array_equal(np.load(tmp_path / "out" / f"prep-{number:06d}.npy")[:, ::2], whole[number][:, ::2])
-    assert "1 scan written" in (said := complete(*asked, 4)[1])
-    assert "3 there already" in said
+    assert f"1 scan written to {tmp_path / 'out'}, 3 there already" in complete(*asked, 4).said
 
 
 def test_a_bad_scan_may_be_mended_and_the_command_given_again(complete, tmp_path):

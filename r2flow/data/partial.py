@@ -209,8 +209,8 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     stored = read_numbers(path)
-    if stored.dtype.kind != "f" or len(stored) not in (1, 2) or not stored.size:
-        raise InputError(f"{path} must be a range image of floats (2 or 1, H, W), found {stored.dtype} {stored.shape}.")
+    other = f"{path} must be a range image of floats (2 or 1, H, W), found {stored.dtype} {stored.shape}."
+    check(stored.dtype.kind == "f" and len(stored) in (1, 2), other)
     r = stored[0]
     if not (stored >= 0).all() or not (stored[1:] <= 1).all() or not np.isfinite(stored).all():
         raise InputError(
@@ -220,7 +220,8 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     within = not r.any() or ((r >= target.min_range) & (r <= target.max_range)).any()
     check(within, f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they in m?")
     image = read_range_image(path)
-    assert image is not None
+    if image is None:  # empty, or points (1, N, 4)
+        raise InputError(other)
     if source is not None and image.shape[1] == source.shape[0]:
         return _seen(image, source.resized(columns=image.shape[2]), target)
     if source is not None or image.shape[1:] != target.shape:
