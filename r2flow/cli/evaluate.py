@@ -213,7 +213,6 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
 
     scans = open_scans(text, reading, split, num)
     refuse_parts(text)
-    check(len(scans), f"{text} contains no scan.")
     _ = scans.source[0]  # fail before the other set is read
     return scans
 

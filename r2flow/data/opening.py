@@ -60,9 +60,7 @@ class Prepared(SourceKind):
                 log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(parts))
         spans = dict(zip(map(id, stored), spans_of(stored), strict=True))
         numbers = [number for drive in kind.chosen(stored, split, drives) for number in spans[id(drive)]]
-        scans = PreparedScans(store, numbers, bool(reading.reflectance))
-        check(len(scans), f"{folder} holds no usable scan of split={split!r}, drives={drives}.")
-        return scans
+        return PreparedScans(store, numbers, bool(reading.reflectance))
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         return f"the scans in {options.folder} have no reflectance" if self.levels_of(options) is None else None
@@ -137,7 +135,10 @@ def open_source(options: SourceOptions, reading: Reading, seed: int = 0, first_s
             reading = replace(reading, reflectance_scale=1.0)
     if reading.reflectance == AUTO:
         reading = replace(reading, reflectance=kind.lacks_reflectance(options, reading.on_bad_scan) is None)
-    return kind.open(options, reading, seed, first_scene)
+    source = kind.open(options, reading, seed, first_scene)
+    chosen = f"split={options.split!r}, drives={options.drives}"
+    check(len(source), f"{options.root or options.name} holds no usable scan of {chosen}.")
+    return source
 
 
 def parse(text: str) -> tuple[SourceOptions, Path | None]:

@@ -93,9 +93,8 @@ class TestSamples:
         self.samples(tmp_path)
         for content in ("{", "1", '{"checksum": ""}', '{"checksum": "", "recipe": {"reading": {"sensor": {}}}}'):
             (tmp_path / "manifest.json").write_text(content)
-            with pytest.raises(InputError, match=r"manifest.json is damaged") as error:
+            with pytest.raises(InputError, match=r"\A.*manifest.json is damaged.*\Z"):  # a dot is no line break
                 open_scans(tmp_path)
-            assert "\n" not in str(error.value)
 
 
 class TestWhatR2FlowWrote:
@@ -257,14 +256,15 @@ def test_scans_that_are_no_files_are_a_kind_of_their_own():
     for wrong in (0, -1, 2.5, "2"):
         with pytest.raises(InputError, match=f"num must be a whole number of at least 1.* found {wrong!r}"):
             open_scans("walls:5", READING, num=wrong)
+    with pytest.raises(InputError, match="^0 holds no usable scan of split=None, drives=None"):
+        open_scans("walls:0", READING)
     scans = open_scans("walls:5", READING, num=3)
     assert [tuple(batch.shape) for batch in scans.batches([0, 2], 1)] == [(1, 1, 8, 32)] * 2
     assert torch.equal(scans[1:], torch.stack([scans[1], scans[2]]))
     assert scans.identity is None  # nobody knows what decides them: no statistics of them are kept
     assert not resolve_reflectance("auto", {"name": "walls", "root": "5"})
     data = ScanDataModule(SENSOR, Encoding(SENSOR, reflectance=False), 0, name="walls", root=10, batch_size=2)
-    (batch,) = data.val_dataloader()
-    assert batch["x_1"].shape == (1, 1, 8, 32)
+    assert [batch["x_1"].shape for batch in data.val_dataloader()] == [(1, 1, 8, 32)]
     assert data.names == [f"wall at {i} m" for i in range(2, 12)]
     sensors = SENSOR, replace(SENSOR, max_range=9000)
     data, far = (ScanDataModule(s, Encoding(s, reflectance=False), 0, name="walls", root=5000) for s in sensors)
