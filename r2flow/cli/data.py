@@ -89,14 +89,12 @@ def prepare(
     size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)
     left_out = sum(len(note["left_out"]) for note in notes)
     usable = len(store.names) - left_out
-    range_error, error = (max(note["errors"][channel] for note in notes) for channel in (0, 1))
-    exact = f"at most {error:.2g} off" if error else "exactly"
-    kept = "no reflectance in the scans" if levels is None else f"reflectance as n/{levels}, {exact}"
+    kept = "no reflectance in the scans" if levels is None else f"reflectance as n/{levels}"
     skipped = f"; {left_out} scans left out" if left_out else ""
     there = shards - round(made.tasks[0].completed)
     of = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"
     of += f" ({there} there already)" if there else ""
-    print(f"{out}: {of}, {size / 2**20:.1f} MiB; range within {range_error * 1e3:.2f} mm, {kept}{skipped}")
+    print(f"{out}: {of}, {size / 2**20:.1f} MiB; {kept}{skipped}")
 
 
 @app.command(epilog="Example: r2flow sensor my/scans --out conf/sensor/mine.yaml")

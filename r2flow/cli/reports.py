@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +21,6 @@ from r2flow.cli.options import (
     SensorOption,
     SizeOption,
     choose_device,
-    cores,
     grouped,
     numbers,
     rows_and_columns,
@@ -127,12 +125,9 @@ def backbones(
     chosen, where = named_sensor(sensor, rows_and_columns(size)), choose_device(device)
     names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, repeats, where)
-    load = os.getloadavg()[0]
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
     check(any("error" not in row for row in measured), measured[0].get("error", ""))
     print_costs(measured, chosen, where)
-    if repeats and load > cores():
-        print(f"The machine was busy (load {load:.1f} on {cores()} cores): latencies may be too high.")
 
 
 @report.command(epilog="Example: r2flow report completion kitti360/test street --num 15 --out reports")

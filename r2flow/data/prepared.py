@@ -111,7 +111,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
 
 def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
     assert store.source is not None
-    numbers, left_out, errors = store.parts[shard], list[int](), [0.0, 0.0]
+    numbers, left_out = store.parts[shard], list[int]()
     shape = (len(numbers), *store.reading.sensor.shape)
     tensors = {name: np.empty(shape, coder.dtype) for name, coder in store.codes.items()}
     for number in numbers:
@@ -124,11 +124,10 @@ def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
             left_out.append(number)
             continue
         row = number - numbers.start - len(left_out)
-        for i, (name, coder) in enumerate(store.codes.items()):
-            codes = tensors[name][row] = coder.encode(image[i])
-            errors[i] = max(errors[i], float(np.abs(coder.values[codes] - image[i]).max()))
+        for channel, (name, coder) in zip(image, store.codes.items(), strict=True):
+            tensors[name][row] = coder.encode(channel)
     kept = {name: codes[: len(numbers) - len(left_out)] for name, codes in tensors.items()}
-    store.write(shard, kept, {"left_out": left_out, "errors": errors, "files": store.sources_of(shard)})
+    store.write(shard, kept, {"left_out": left_out, "files": store.sources_of(shard)})
 
 
 def prepare(
@@ -140,9 +139,8 @@ def prepare(
 ) -> list[dict[str, Any]]:
     """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves out unusable scans.
 
-    The headers of the shards have the numbers of the scans left out, maximum errors of range and reflectance, and a
-    digest of the files: shards of files that have changed since are refused. `checked` and `made` are called with each
-    shard.
+    The headers of the shards have the numbers of the scans left out and a digest of the files: shards of files that
+    have changed since are refused. `checked` and `made` are called with each shard.
     """
     if not store.check() or store.missing(store.shards):
         store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])

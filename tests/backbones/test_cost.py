@@ -1,7 +1,5 @@
 """Parameters and multiply-accumulates: the paper's table II."""
 
-import os
-
 import pytest
 import torch
 from tiny_backbones import Plain
@@ -99,10 +97,7 @@ def test_a_network_that_cannot_run_on_the_meta_device_has_no_gmac(monkeypatch):
     assert cost(compose(["encoding.reflectance=true"]))["gmac"] is None
 
 
-@pytest.mark.parametrize(("load", "busy"), [(0.0, False), (1e4, True)])
-def test_the_verb_measures_what_it_is_asked_for_and_names_a_busy_machine(r2flow, monkeypatch, load, busy):
-    monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
+def test_the_verb_measures_what_it_is_asked_for(r2flow):
     options = ("--only", "hdit_tiny,local", "--size", "16x64", "--repeats", 1, "--device", "cpu")
     said = r2flow("report", "backbones", *options).said
     assert [line.split()[0] for line in said.splitlines()[2:4]] == ["hdit_tiny", "local"]
-    assert ("machine was busy" in said) == busy
