@@ -138,12 +138,10 @@ def _rows(
 def _columns(xyz: np.ndarray, columns: int, convention: Convention) -> np.ndarray:
     """Column of every point, (N,) int64."""
     turn = (1 - np.arctan2(xyz[:, 1], xyz[:, 0]) / np.float32(math.pi)) / 2  # of [0, 1], 1 at exactly -180 degrees
-    if convention == "centre":
-        return (turn * np.float32(columns) + np.float32(TIE)).astype(np.int64) % columns
-    column = (turn * np.float32(columns)).astype(np.int64)
-    np.minimum(column, columns - 1, out=column)  # float32 may round the last bin up to W
+    column = (turn * np.float32(columns) + np.float32(TIE if convention == "centre" else 0)).astype(np.int64)
     if convention == "reference":
         column[turn == 1] = 0
+    column[column == columns] = 0 if convention == "centre" else columns - 1  # float32 may round the last bin up to W
     return column
 
 
