@@ -193,16 +193,14 @@ def complete(
 
     Output files have the format of the input. The same command resumes an interrupted run.
     """
-    from r2flow.generators import TransferFlow
     from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.model.completion import completing
     from r2flow.models import DEFAULT, DENSIFY, MODELS
     from r2flow.reports.completed import Job, lack_sectors, print_completed, remarks_on_files, write_completed
 
-    mask = given.mask and parse_mask(given.mask)
-    job = Job(num, seed, mask or None, given.fill_gaps, batch_size, pictures, precision)
-    by_densify = how.given.get("name", "jump") in ("jump", "transport")
-    name = str(checkpoint or (DENSIFY if by_densify else DEFAULT))
+    mask = parse_mask(given.mask) if given.mask else None
+    job = Job(num, seed, mask, given.fill_gaps, batch_size, pictures, precision)
+    name = str(checkpoint or (DENSIFY if how.given.get("name", "jump") in ("jump", "transport") else DEFAULT))
     loaded, scans, remarks = given.open(name, device, what)
     if not (checkpoint or given.to or given.size or how.sampler) and name == DENSIFY and lack_sectors(scans, job):
         name = DEFAULT
@@ -217,5 +215,5 @@ def complete(
         "reflectance_scale": given.reflectance_scale, "columns": given.columns,
     }  # fmt: skip
     print_completed(write_completed(loaded, scans, out, job, sampler, about), out, len(scans))
-    if num > 1 and isinstance(loaded.generator, TransferFlow):
+    if num > 1 and sampler.name == "transport":  # those of jump err as a single one
         print(f"the {num} answers differ where a scan leaves them open, and err more than the one of --num 1")
