@@ -34,7 +34,7 @@ from r2flow.data.opening import SOURCES, Layout, Prepared
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.resolving import reflectance_levels, resolve, resolve_reflectance
-from r2flow.errors import InputError, check_folder
+from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
 from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.noise import seed_torch
@@ -180,8 +180,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
         config["encoding"]["reflectance"] = True  # decided when the scans are read
     with torch.device("meta"):
         generator = build_generator(config)
-    run = _assembled(config, generator, asked)
-    check_run(run.folder, config)
+    check_run(_assembled(config, generator, asked).folder, config)
     return config
 
 
@@ -288,8 +287,6 @@ def fit(run: Run) -> Result:
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
     stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping(run.folder))
     with stopping.listening(), _quiet():
-        if run.trainer.is_global_zero and not run.config["trainer"]["fast_dev_run"]:
-            check_folder(run.folder)
         with _said_once():
             run.data.setup()
             run.config["scans"] = run.data.fingerprint()
@@ -318,6 +315,8 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
             init = as_override("stage.init", run.folder)
             print(f"finished before, at step {step_of(last)}; to learn more: {init} name=OTHER")
         return step_of(last)  # no training, no pairs
+    with _said_once():
+        run.data.read()
     if run.trainer.is_global_zero:
         if last is not None:
             log.info("resuming from %s", last)

@@ -205,7 +205,7 @@ def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
     def ready(run: r2flow.training.Run) -> None:
         """In place of `fit`: what it reads before the first step."""
         if run.config["data"]["name"] != "simulated":
-            run.data.setup()
+            run.data.read()
         raise AssertionError("it would train")
 
     monkeypatch.setattr(r2flow.training, "fit", ready)

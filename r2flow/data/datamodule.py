@@ -53,7 +53,7 @@ class ScanDataModule(L.LightningDataModule):
         self.validation = self.options.validation_options
         self.further: Further | None = None
         self.names: list[str] = []
-        self.opened: list[Mixture] = []  # as found, before they are read
+        self.opened: Sequence[Mixture] = ()  # as found, before they are read
         self.training_source: Mixture | PairSource | None = None
         self.validation_source: Mixture | PairSource | None = None
         self.scans: Mixture | None = None  # next to pairs
@@ -70,19 +70,22 @@ class ScanDataModule(L.LightningDataModule):
         return PairStore(self.options.folder, self.pairs, self.encoding.shape, self.noise_shape)
 
     def setup(self, stage: str | None = None) -> None:
-        if self.training_source is not None or self.scans is not None:
-            return
-        if self.pairs is not None:
-            _ = self.pair_store  # refuses other pairs in the folder early; missing pairs are made later
-            if self.options.scans is not None:
-                source = Mixture([self._open(SourceOptions(**self.options.scans))])
-                self.names, self.opened = list(source.names), [source]
-                self.scans = self._kept(source, "scans next to the pairs", [self.sensor])
-            return
-        training, held = self.opened = [*self.sources()]
-        self._order(training)  # refuses wrong weights before anything is read or written
-        self.training_source = self._kept(training, "training scans", self.sensors)
-        self.validation_source = self._kept(held, "validation scans", self.held_out_sensors)
+        """Open the scans; `read` reads them."""
+        if self.pairs is None and self.training_source is None:
+            self.training_source, self.validation_source = self.opened = self.sources()
+            self._order(self.training_source)  # refuses wrong weights before anything is read or written
+        elif self.options.scans is not None and self.scans is None:
+            self.scans = Mixture([self._open(SourceOptions(**self.options.scans))])
+            self.names, self.opened = list(self.scans.names), [self.scans]
+
+    def read(self) -> None:
+        """Read the scans into memory if they fit; a second call reads nothing."""
+        self.setup()
+        if self.scans is not None:
+            self.scans = self._kept(self.scans, "scans next to the pairs", [self.sensor])
+        if isinstance(self.training_source, Mixture) and isinstance(self.validation_source, Mixture):
+            self.training_source = self._kept(self.training_source, "training scans", self.sensors)
+            self.validation_source = self._kept(self.validation_source, "validation scans", self.held_out_sensors)
 
     def sources(self) -> tuple[Mixture, Mixture]:
         """The training and the validation scans, not yet read.
@@ -141,8 +144,7 @@ class ScanDataModule(L.LightningDataModule):
     def _kept(self, source: Mixture, what: str, sensors: Sequence[Sensor]) -> Mixture:
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = [*source.parts]
-        channels = 1 + self.encoding.reflectance
-        shapes = [(len(part), channels, *sensor.shape) for part, sensor in zip(parts, sensors, strict=True)]
+        shapes = [(len(part), self.encoding.channels, *own.shape) for part, own in zip(parts, sensors, strict=True)]
         size = sum(math.prod(shape) * 4 for part, shape in zip(parts, shapes, strict=True) if part.slow)
         if size > self.options.memory_gib * 2**30:
             return source
@@ -181,8 +183,8 @@ class ScanDataModule(L.LightningDataModule):
         return RunLoader(dataset, batch_sampler=sampler, **self._loader_options())
 
     def _ready(self) -> None:
-        """Open the pairs, which are made after `setup`."""
-        self.setup()
+        """Read the scans, and open the pairs, which are made after `setup`."""
+        self.read()
         if self.pairs is not None and self.training_source is None:
             pairs = PairSource(self.pair_store)
             first, last = holdout_block(len(pairs), self.validation.share)

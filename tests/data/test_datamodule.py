@@ -20,7 +20,7 @@ SENSOR = SENSORS["hdl64e"].resized(16, 64)
 
 def module(encoding: Encoding | None = None, **options) -> ScanDataModule:
     data = ScanDataModule(SENSOR, encoding or Encoding(SENSOR), 0, **options)
-    data.setup()
+    data.read()
     return data
 
 

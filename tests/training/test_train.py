@@ -176,7 +176,7 @@ def test_a_folder_that_now_holds_other_scans_is_refused(train: Run, copied: Path
     checkpoints_of(copied)[0].unlink()
     moved = train("name=copied", f"data.root={other}")  # the same scans elsewhere
     assert "resuming from" in moved.stdout + moved.stderr
-    (other / "000000.bin").rename(other / "another.bin")
+    (other / "000005.bin").write_bytes(b"no scan")  # refused before it is read
     assert "scans=9 of 12 scans" in train("name=copied", f"data.root={other}", check=False).refusal
 
 
