@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.lidar.region import region
 from r2flow.lidar.scan_files import read_numbers
 from r2flow.registry import Count, Natural, Registry, Share, construct
@@ -39,6 +39,7 @@ def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
     returned = images[:, 0] > 0
     state = torch.where(returned, int(Ray.RETURN), int(Ray.EMPTY)).to(torch.uint8)
     if measured is not None:
+        check(measured.shape[-2:] == images.shape[2:], f"measured is {(*measured.shape,)}, images {(*images.shape,)}.")
         state[~measured.to(images.device).expand_as(returned)] = int(Ray.UNKNOWN)
     return state
 

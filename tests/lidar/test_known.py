@@ -23,9 +23,10 @@ def draws(seed: int = 0) -> np.random.Generator:
 
 
 def test_a_ray_is_never_empty_because_it_was_not_measured():
-    images = torch.zeros(1, 2, 2, 2)
-    images[0, 0, 0, 0] = 5.0
+    images = torch.tensor([5.0, 0, 0, 0, 0, 0, 0, 0]).reshape(1, 2, 2, 2)
     measured = torch.tensor([[True, True], [False, True]])
+    with pytest.raises(InputError, match=r"measured is \(1, 2\), images \(1, 2, 2, 2\)"):
+        ray_states(images, measured[:1])  # which would be repeated
     assert ray_states(images, measured).tolist() == [[[Ray.RETURN, Ray.EMPTY], [Ray.UNKNOWN, Ray.EMPTY]]]
     assert ray_states(images).tolist() == [[[Ray.RETURN, Ray.EMPTY], [Ray.EMPTY, Ray.EMPTY]]]
 
@@ -40,8 +41,7 @@ def test_masks_measure_what_they_say():
     measured = np.isin(np.arange(16), range(1, 16, 3))[:, None] & WHOLE  # five beams, in rows 1, 4, 7, 10 and 13
     assert np.flatnonzero(parse_mask("rows:2")(measured, draws()).all(1)).tolist() == [1, 7, 13]
     assert (parse_mask("random:0.4")(measured, draws()) & measured).any(1).sum() == 2
-    ahead = ~parse_mask("sector:-45,45")(WHOLE, draws()).any(0)  # the quarter ahead of 64 columns
-    assert np.flatnonzero(ahead).tolist() == list(range(24, 40))
+    assert np.flatnonzero(~parse_mask("sector:-45,45")(WHOLE, draws()).any(0)).tolist() == [*range(24, 40)]  # ahead
     assert parse_mask("rows:4+sector:-45,45")(WHOLE, draws()).sum() == 4 * 48
 
 
