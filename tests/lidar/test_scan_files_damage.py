@@ -13,7 +13,7 @@ import pytest
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.scan_files.clouds import decompress_lzf
-from tests.conftest import Trap, memory_below
+from tests.conftest import memory_below
 
 # A reader that warns has met something it was not made for.
 pytestmark = pytest.mark.filterwarnings("error")
@@ -275,11 +275,6 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_headers_and_rows_are_refused(tmp_path, case):
     assert read_bytes(tmp_path, *WRONG[case]) is None
-
-
-def test_a_pickle_in_a_npy_is_never_run(tmp_path):
-    np.save(tmp_path / "a.npy", np.array([Trap()], dtype=object), allow_pickle=True)
-    assert read(tmp_path / "a.npy") is None
 
 
 def test_paths_that_are_not_regular_files_are_refused(tmp_path):

@@ -1,6 +1,5 @@
 import io
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -14,7 +13,6 @@ from r2flow.errors import InputError
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import SOURCES, add, kept, read_published, weights_hash
 from r2flow.metrics.extractors.pointnet import PointNet
-from tests.conftest import Trap
 from tests.metrics.conftest import untrained
 
 PARTS = {
@@ -107,19 +105,6 @@ def test_kept_weights_that_were_changed_are_not_used(pointnet, folder):
     kept_path.write_bytes(data[:-100])
     with pytest.raises(InputError, match="damaged"):
         EXTRACTORS["pointnet"].trained()
-
-
-@pytest.mark.parametrize("legacy", [False, True])
-def test_a_file_that_would_run_code_is_refused_and_runs_none(tmp_path, folder, legacy):
-    path = tmp_path / "weights.pth"
-    content = {"state_dict": PARTS["backbone"], "hyper_parameters": Trap()}
-    torch.save(content, path, _use_new_zipfile_serialization=not legacy)
-    with pytest.raises(InputError, match=r"refused: it holds objects that would run code when loaded \(.*exec\)"):
-        add("pointnet", path)
-    path.write_bytes(pickle.dumps(content, protocol=2))
-    with pytest.raises(InputError):
-        add("pointnet", path)
-    assert not folder.exists()
 
 
 def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, folder):
