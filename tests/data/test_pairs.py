@@ -55,7 +55,6 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
         assert torch.equal(x_0, standard_normal(SHAPE, 0, "pairs", index))
         # Half precision keeps 11 bits.
         torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)
-        assert x_1.dtype == torch.float32
     assert x_1.abs().max() > 1  # nothing is clamped
 
 

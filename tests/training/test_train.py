@@ -311,8 +311,6 @@ def test_a_mixture_goes_on_where_it_stopped_and_may_move(train: Run, scans: Path
     assert "resuming from" in train(*options(tmp_path / "moved", "stopped"), "data.workers=2").stdout
     assert_bit_equal(tmp_path / "runs/whole", tmp_path / "runs/stopped")
     # The scans have no reflectance: nobody asked for a flow of range alone, and it is one.
-    config = read_config(tmp_path / "runs/whole")
-    assert config is not None
-    assert config["encoding"]["reflectance"] is False
+    assert read_config(tmp_path / "runs/whole")["encoding"]["reflectance"] is False
     assert load_checkpoint(tmp_path / "runs/whole").encoding.channels == 1
     assert np.load(next((tmp_path / "runs/whole").rglob("*.npy"))).shape[0] == 1
