@@ -15,6 +15,7 @@ from r2flow.generators import build_generator
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
+from tests.systems.test_lidm import SMALL_AUTOENCODER, SMALL_UNET
 from tests.training.conftest import hold_at, in_process, stop_held
 
 SENSOR = {"name": "hdl64e", "rows": 8, "columns": 32}
@@ -25,14 +26,8 @@ SYSTEMS: dict[str, tuple[dict[str, Any], str, int]] = {
     "dusty2": (GAN, "direct", 1),
     "diffusion": ({}, "ddpm:steps=5", 5),
     "score": ({"width": 4, "levels": 3}, "langevin:steps=5", 3 * 5 + 1),
-    "latent_diffusion": (
-        {
-            "autoencoder": {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16},
-            "unet": {"width": 32, "multipliers": [1, 2], "blocks": 1, "attention": [2]},
-        },
-        "latent_ddim:steps=7",
-        8,  # 1000 // 7 = 142 goes 8 times into 1000
-    ),
+    # 1000 // 7 = 142 goes 8 times into 1000
+    "latent_diffusion": ({"autoencoder": SMALL_AUTOENCODER, "unet": SMALL_UNET}, "latent_ddim:steps=7", 8),
 }
 
 
@@ -149,6 +144,7 @@ def garble(part: str, **changes: Any) -> Callable[[Any], None]:
 OUTPUT = "model.generator.synthesis_kwargs.out_ch.0"
 GARBLED = [
     ("dusty2", garble("model.generator", arch="stylegan"), "KeyError: 'stylegan'"),
+    ("dusty2", garble("model.generator.synthesis_kwargs", output_scale=1.0), "output_scale"),
     ("dusty2", garble("dataset", max_depth=1.0), "needs 0 < min_range < max_range"),
     ("dusty2", garble(OUTPUT, act="os.system"), "ValueError: the activation 'os.system'"),
     ("r2dm", garble("data", min_depth=90.0), "found 90.0 and 80.0"),

@@ -26,7 +26,6 @@ from r2flow.systems.gan.layers import logistic, straight_through_mask
 from r2flow.systems.gan.stage import Warmup, blurred, discriminator_loss, generator_loss, lazy_adam, r1
 from r2flow.systems.gan.style_gan import DustyV2
 from r2flow.training import build, compose, fit
-from tests.conftest import Trap
 from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
 from tests.training.conftest import start
 
@@ -291,22 +290,6 @@ def test_sensor_and_angles_of_a_published_file_are_its_own_also_when_saved(share
     assert torch.equal(saved.sample(1), checkpoint.sample(1))
 
 
-def test_outputs_of_another_scale_are_refused(shared: Path, tmp_path: Path):
-    content = torch.load(shared / "oracle_baselines" / "dusty2_published.pth", weights_only=False)
-    content["cfg"]["model"]["generator"]["synthesis_kwargs"]["output_scale"] = 1.0
-    torch.save(content, tmp_path / "it.pth")
-    with pytest.raises(InputError, match="output_scale"):
-        load_checkpoint(tmp_path / "it.pth")
-
-
-def test_a_file_that_would_run_code_beside_its_config_is_refused(shared: Path, tmp_path: Path):
-    content = torch.load(shared / "oracle_baselines" / "vanilla_published.pth", weights_only=False)
-    content["optim_G"] = Trap()
-    torch.save(content, tmp_path / "it.pth")
-    with pytest.raises(InputError, match=r"would run code when loaded \((builtins\.)?exec\)"):
-        load_checkpoint(tmp_path / "it.pth")
-
-
 TINY = [
     "sensor.rows=16", "sensor.columns=32", "data.scenes=8", "data.batch_size=4", "generator.latent=8",
     "generator.base_channels=4", "stage.discriminator.base_channels=4", "stage.r1_every=2", "stage.augment.every=2",
@@ -334,7 +317,6 @@ def test_truncation_by_0_is_refused_and_by_less_draws_codes_together():
 
 def test_a_generator_with_a_mask_needs_draws():
     generator = build_generator(tiny("dusty1")).eval()
-    assert isinstance(generator, DustyV1)
     noise = Draws(0, range(2)).start(generator.noise_shape)
     with pytest.raises(InputError, match="draws"):
         generator(noise)
