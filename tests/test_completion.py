@@ -59,18 +59,6 @@ def test_a_scan_of_which_nothing_is_known_is_drawn_in_the_precision_that_was_ask
     assert torch.equal(flow.complete(nothing, precision="bf16-mixed")[:, 0], coarse)
 
 
-def test_an_answer_depends_on_seed_scan_and_its_number_alone():
-    images = scans(3)
-    state = halved(images)
-    checkpoint = network()
-    whole = checkpoint.complete(images, state, num=3, seed=1)
-    batched = checkpoint.complete(images, state, num=3, seed=1, batch_size=4)
-    torch.testing.assert_close(batched, whole, rtol=1e-4, atol=1e-4)
-    (alone,) = complete(checkpoint, images[2:], state[2:], num=2, seed=1, first=2)
-    assert torch.equal(alone.images[0], whole[2, 0])
-    assert not torch.equal(whole[:, 0], checkpoint.complete(images, state, seed=2)[:, 0])
-
-
 def test_scans_that_are_known_in_part_wholly_and_not_at_all_go_together():
     images = scans(3)
     state = halved(images)

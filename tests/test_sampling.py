@@ -244,12 +244,7 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     (tmp_path / "camera" / "000000.png").write_text("")
     with pytest.raises(InputError, match=r"000000.png and no manifest.json"):
         write_samples(checkpoint, tmp_path / "camera", 1, 0)
-    note = tmp_path / "manifest.json"
-    for content in ("[]", "{"):
-        note.write_text(content)
-        with pytest.raises(InputError, match="damaged"):
-            write(3)
-    note.unlink()
+    (tmp_path / "manifest.json").unlink()
     with pytest.raises(InputError, match=r"\.npy\) and no manifest.json"):
         write(3)
 

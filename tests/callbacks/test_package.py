@@ -18,17 +18,6 @@ def test_a_second_copy_is_refused(monkeypatch):
     assert "callbacks" not in sys.modules
 
 
-def test_a_class_alone_as_of_a_plugin_is_a_callback_of_the_table(monkeypatch):
-    class Say(L.Callback):
-        def __init__(self, every: int) -> None:
-            self.every = every
-
-    monkeypatch.setattr(CALLBACKS, "_entries", dict(CALLBACKS._entries))
-    CALLBACKS.add("say", Say)
-    built = build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.say.every=2"]))
-    assert [one.every for one in built if isinstance(one, Say)] == [2]
-
-
 @pytest.mark.parametrize(
     ("callback", "option", "message"),
     [

@@ -213,16 +213,6 @@ def test_scans_prepared_for_other_images_are_refused(clouds, tmp_path, changes: 
     prepared_in(tmp_path, replace(SMALL, name="mine", height=2.0))  # no pixel depends on these
 
 
-def test_another_recipe_is_refused_in_the_same_folder(clouds: Path, tmp_path: Path):
-    make(tmp_path, plan_of(clouds))
-    before = files(tmp_path)
-    with pytest.raises(InputError, match=r"holds other scans: .*convention=centre there, reference here"):
-        make(tmp_path, plan_of(clouds, convention="reference"))
-    with pytest.raises(InputError, match=r"holds other scans: .*scans=10 there, 6 here"):
-        make(tmp_path, plan_of(clouds / "drive0"))
-    assert files(tmp_path) == before
-
-
 def test_other_files_of_the_same_names_are_refused_and_a_mended_one_is_taken(clouds: Path, tmp_path: Path):
     root, out = Path(shutil.copytree(clouds, tmp_path / "scans")), tmp_path / "out"
     bad, whole = root / "drive0" / "000004.bin", files(make(tmp_path / "whole", plan_of(clouds)))

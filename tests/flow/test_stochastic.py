@@ -14,7 +14,6 @@ from r2flow.flow.solvers import named_grid
 from r2flow.generators import USUAL, build_generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.region import Region
-from r2flow.model.sampling import draw
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.samplers.stochastic import back, sde, sde_step
@@ -100,19 +99,6 @@ def test_a_flow_draws_the_data_s_distribution(method):
     assert made.evaluations.tolist() == [32] * 48
     assert how.evaluations(flow) == 32
     assert made.converged.all()
-
-
-def test_a_scan_is_a_function_of_its_number_and_what_fails_does_not_touch_the_others():
-    flow, how = normal(), build_sampler("sde", steps=5)
-    whole = draw(flow, range(3), 7, how).images
-    for i in range(3):
-        torch.testing.assert_close(draw(flow, [i], 7, how).images[0], whole[i])
-    x_0 = Draws(7, range(3)).start(flow.noise_shape)
-    fine = flow(x_0, sampler=how, draws=Draws(7, range(3))).x
-    x_0[1, 0, 0, 0] = math.inf
-    made = flow(x_0, sampler=how, draws=Draws(7, range(3)))
-    assert made.converged.tolist() == [True, False, True]
-    assert torch.equal(made.x[::2], fine[::2])
 
 
 def test_what_needs_the_ode_says_so():
