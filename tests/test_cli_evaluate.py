@@ -239,14 +239,6 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
     assert again == pytest.approx(expected, rel=1e-10)
 
 
-def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):
-    run = saved[0].parent.parent
-    assert r2flow("sample", run, "--num", 2, "--steps", 2, "-o", run / "samples", "--pictures", 0)[0] == 0
-    assert "(2 : 12)" in r2flow("evaluate", real, run / "samples", "--metrics", "jsd", "--workers", 0).said
-    assert r2flow("show", run, "--out", tmp_path / "views")[0] == 0
-    assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["000000.png", "000001.png"]
-
-
 def test_a_judged_set_may_have_the_name_of_a_baseline(r2flow, real, generated, tmp_path):
     shutil.copytree(generated, tmp_path / "noise")
     sets = real, tmp_path / "noise", generated

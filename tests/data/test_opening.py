@@ -65,13 +65,6 @@ class TestSamples:
         with pytest.raises(InputError, match="not of vlp16 8x32"):
             open_scans(tmp_path, Reading(SENSORS["vlp16"].resized(8, 32)))
 
-    def test_points_are_seen_through_any_sensor(self, tmp_path: Path):
-        folder = self.samples(tmp_path)
-        write_points(folder / "000001.ply", np.array([[10.0, 0, 0], [0, 20, 0]], np.float32), np.ones(2, np.float32))
-        seen = open_scans(folder / "000001.ply", Reading(SENSORS["vlp16"].resized(16, 64)))
-        assert seen.source[0].shape[-2:] == (16, 64)
-        assert sorted(seen.source[0][0][seen.source[0][0] > 0].tolist()) == [10, 20]
-
     def test_a_run_stands_for_its_samples(self, tmp_path: Path):
         (tmp_path / "config.yaml").touch()
         with pytest.raises(InputError, match="is a run without samples; draw some: r2flow sample"):

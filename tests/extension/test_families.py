@@ -117,15 +117,6 @@ def test_what_a_gan_cannot_do_is_one_line(tmp_path: Path, tmp_path_factory: pyte
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_without_its_plugin_says_which_and_how(trained: tuple[Family, Path], tmp_path: Path):
-    family, run = trained
-    name, kind = ("toy_backbone", "backbone") if family is BACKBONE else (f"toy_{family.name}", "generator")
-    for arguments in (["info", run], ["sample", run, "-o", tmp_path / "out"]):
-        said = r2flow(*arguments).refusal
-        assert f"no {kind} named '{name}'" in said
-        assert f"give --plugin {FAMILIES / f'{family.file}.py'}." in said
-
-
 SHRUNKEN = Family("sampler", "toy_sampler", ("sampler={name: shrunken, steps: 3, share: 0.25}",))
 
 
