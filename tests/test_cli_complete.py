@@ -417,9 +417,7 @@ def test_points_outside_the_limits_and_sectors_never_scanned_are_told(complete, 
 
 
 @pytest.mark.parametrize(("rows", "columns", "named"), [(4, 64, True), (8, 32, True), (4, 32, True), (8, 32, False)])
-def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(
-    tmp_path: Path, rows: int, columns: int, named: bool
-):
+def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(tmp_path, rows, columns, named):
     """The same rays as points and as a range image: between them nothing was measured."""
     sensor, target = SENSORS["os1_64"].resized(rows, columns), SENSORS["os1_64"].resized(8, 64)
     # beams a little off the middle, where no row of the target ends

@@ -144,9 +144,7 @@ def test_prepared_scans_are_the_raw_ones_to_the_stated_quantisation(clouds: Path
 @pytest.mark.parametrize(
     ("layout", "folder", "most"), [("kitti_360", "kitti360", 2), ("kitti_raw", "raw", 2), ("object", "object", 1)]
 )
-def test_real_scans_keep_their_reflectance_to_the_bit(
-    shared: Path, tmp_path: Path, layout: str, folder: str, most: int
-):
+def test_real_scans_keep_their_reflectance_to_the_bit(shared, tmp_path, layout, folder, most):
     sensor = SENSORS["hdl64e"]
     plan = plan_of(shared / "real" / folder, sensor, layout)
     few = PreparedStore(

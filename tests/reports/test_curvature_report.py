@@ -6,15 +6,12 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow.lidar.encoding import Encoding, ModelSpace
-from r2flow.lidar.sensors import SENSORS
-from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.curvature import curvature_page, curvature_rows, measure_paths, summary
-from tests.fields import Field
+from tests.conftest import SENSOR
+from tests.test_sampling import flow
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
-SENSOR = SENSORS["hdl64e"].resized(4, 16)
 STEPS = 16
 
 
@@ -29,11 +26,6 @@ class Falling(nn.Module):
         return -self.a * (x + 1) * t
 
 
-def checkpoint(model: nn.Module) -> Checkpoint:
-    space = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays())
-    return Checkpoint(Field(model, space.shape, space), {}, 0, None, "r2flow")  # type: ignore[arg-type]
-
-
 def by_hand(a: float, num: int) -> tuple[np.ndarray, np.ndarray]:
     """Every state and velocity of Euler's path, (num, n + 1, elements) and (num, n, elements), in numpy."""
     x = Draws(5, range(num)).start((2, *SENSOR.shape)).double().numpy().reshape(num, -1)
@@ -46,7 +38,7 @@ def by_hand(a: float, num: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("batch_size", [1, 2, 3])
 def test_the_figures_are_those_of_paths_kept_whole(batch_size):
-    found = measure_paths(checkpoint(Falling()), "falling", 3, STEPS, 5, batch_size, most_curved=7)
+    found = measure_paths(flow(Falling()), "falling", 3, STEPS, 5, batch_size, most_curved=7)
     x, v = by_hand(3.0, 3)
     d = x[:, -1] - x[:, 0]
     s = ((d[:, None] - v) ** 2).sum(-1)
@@ -67,27 +59,27 @@ def test_the_figures_are_those_of_paths_kept_whole(batch_size):
 
 def test_the_page_compares_the_flows():
     slopes = {"slow": 0.5, "fast": 4.0}
-    flows = {name: measure_paths(checkpoint(Falling(a)), name, 1, STEPS, 5) for name, a in slopes.items()}
+    flows = {name: measure_paths(flow(Falling(a)), name, 1, STEPS, 5) for name, a in slopes.items()}
     page = curvature_page(flows, 5)
     said = " ".join(page.text)
     # s / |d|^2 does not change when a straight-line velocity is scaled; here the slower one is nearer to v = c t,
     # whose variance over squared mean is (1/12) / (1/4) = 1/3.
     assert 0.9 / 3 < summary("slow", flows["slow"])["integral_normalised"] < 1.2 / 3
-    for row in (summary(*flow) for flow in flows.items()):
+    for row in (summary(*one) for one in flows.items()):
         assert f"| {row['checkpoint']} | {row['integral']:.3g} | {row['integral_normalised']:.3g} |" in said
     assert len(page.figures["curvature"].axes) == 2
     assert len(page.figures["trajectories"].axes) == 2
 
 
 def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
-    flow = measure_paths(checkpoint(Falling(0.0)), "still", 1, 4, 5)
-    page = curvature_page({"still": flow}, 5)
-    assert math.isnan(summary("still", flow)["integral_normalised"])
+    still = measure_paths(flow(Falling(0.0)), "still", 1, 4, 5)
+    page = curvature_page({"still": still}, 5)
+    assert math.isnan(summary("still", still)["integral_normalised"])
     assert "| still | 0 | - |" in page.text[1]
 
 
 def test_a_flow_of_nan_is_said(caplog):
-    measure_paths(checkpoint(Falling(math.nan)), "broken", 2, 4, 5)
+    measure_paths(flow(Falling(math.nan)), "broken", 2, 4, 5)
     assert "broken: s(t) is not finite for 2 of 2 scans" in caplog.text
 
 

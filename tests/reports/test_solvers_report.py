@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,26 +40,22 @@ def test_a_row_is_what_the_solver_did():
         assert 0 < row["seconds"] < 1
 
 
-class Trained:
+def trained(problem):
     """An exact problem in the place of a checkpoint."""
-
-    encoding = None
-
-    def __init__(self, problem) -> None:
-        self.generator = Field(problem, (16,))
+    return SimpleNamespace(encoding=None, generator=Field(problem, (16,)))
 
 
 @pytest.mark.parametrize("name", ["gaussian", "two_modes", "rotating"])
 def test_the_least_measurable_error_is_above_the_true_error_of_the_reference(name):
     problem = PROBLEMS[name]()
-    found = checkpoint_subject(Trained(problem), name, num=3, steps=32, tolerance=1e-6)
+    found = checkpoint_subject(trained(problem), name, num=3, steps=32, tolerance=1e-6)
     true = (found.x_1 - problem.solution(found.x_0, 1.0)).square().mean(1).sqrt()
     assert found.x_1.dtype == torch.float64
     assert true.max() < found.floor < 1e-2
 
 
 def test_without_a_reference_no_error_can_be_measured():
-    found = checkpoint_subject(Trained(lambda t, x: 9 * x**2), "blow-up", num=2, steps=32, tolerance=1e-4)
+    found = checkpoint_subject(trained(lambda t, x: 9 * x**2), "blow-up", num=2, steps=32, tolerance=1e-4)
     assert found.floor == math.inf
     assert best_within(measure([found], configurations(["euler"], [4], [])), 4) is None
 

@@ -156,9 +156,7 @@ GARBLED = [
 
 
 @pytest.mark.parametrize(("name", "change", "said"), GARBLED)
-def test_a_published_file_that_is_not_understood_is_one_line(
-    shared: Path, tmp_path: Path, name: str, change, said: str
-):
+def test_a_published_file_that_is_not_understood_is_one_line(shared, tmp_path, name, change, said):
     content: Any = [{"module.begin_conv.weight": torch.zeros(4, 4, 3, 3)}, {}, 1, 2, {}]
     if change is not None:
         content = torch.load(shared / "oracle_baselines" / f"{name}_published.pth", weights_only=False)

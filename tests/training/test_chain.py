@@ -96,9 +96,7 @@ def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Pat
 
 
 @pytest.mark.slow
-def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
-    chained: tuple[Path, str], scans: Path, tmp_path: Path
-):
+def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(chained, scans, tmp_path):
     shutil.copytree(chained[0], tmp_path / "runs" / "demo")
     run = tmp_path / "runs" / "demo"
     shutil.rmtree(run / "td2")
@@ -126,9 +124,7 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
         (["experiment=reflow", "stage.init=RF1"], "holds other pairs"),
     ],
 )
-def test_a_child_that_cannot_be_is_refused_in_one_line(
-    chained: tuple[Path, str], tmp_path: Path, overrides: list[str], message: str
-):
+def test_a_child_that_cannot_be_is_refused_in_one_line(chained, tmp_path, overrides, message):
     done = train_child(tmp_path, *(one.replace("RF1", str(chained[0] / "rf1")) for one in overrides), check=False)
     assert message in done.refusal
     assert list(tmp_path.iterdir()) == []
@@ -190,9 +186,7 @@ def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone()
     )  # fmt: skip
 
 
-def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(tmp_path, monkeypatch):
     ran: list[list[str]] = []
     monkeypatch.setattr("r2flow.runs.chain.run_process", lambda command: ran.append(command) or 2)
     command = ["experiment=r2flow", "data.root=/nowhere", "data.augment.flip=true", "trainer.accelerator=cpu"]

@@ -152,9 +152,7 @@ def srun(
 
 
 @pytest.mark.slow
-def test_a_job_told_to_leave_is_queued_again_and_ends_as_the_one_left_alone(
-    alone: tuple[Path, str], scans: Path, tmp_path: Path
-):
+def test_a_job_told_to_leave_is_queued_again_and_ends_as_the_one_left_alone(alone, scans, tmp_path):
     run = tmp_path / "runs" / "queued"
     command = ["name=queued", "data.workers=1"]
     [(code, said)] = srun(tmp_path, scans, *command, leave_after=run / "checkpoints" / "step-00000002.ckpt")

@@ -96,9 +96,7 @@ def test_a_killed_run_ends_as_the_one_left_alone(train: Run, alone: tuple[Path, 
 @pytest.mark.parametrize(
     ("by", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
 )
-def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(
-    train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, by: int, code: int
-):
+def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(train, alone, scans, tmp_path, by, code):
     # The regular checkpoints are those of steps 4, 8 and 12.
     options = ["name=stopped", "data.workers=2", "callbacks.checkpoint={every: 4, keep: 3}"]
     options += ["data.memory_gib=0", *hold_at(5, tmp_path / "held")]
