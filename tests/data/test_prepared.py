@@ -208,6 +208,8 @@ def test_scans_prepared_for_other_images_are_refused(clouds, tmp_path, changes: 
     with pytest.raises(InputError) as error:
         prepared_in(tmp_path, replace(SMALL, **changes), **options)
     assert said in str(error.value)
+    with pytest.raises(InputError, match="holds other scans: "):
+        make(tmp_path, plan_of(clouds, replace(SMALL, **changes), **options))
     prepared_in(tmp_path, replace(SMALL, name="mine", height=2.0))  # no pixel depends on these
 
 
