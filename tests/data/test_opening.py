@@ -65,6 +65,13 @@ class TestSamples:
         with pytest.raises(InputError, match="not of vlp16 8x32"):
             open_scans(tmp_path, Reading(SENSORS["vlp16"].resized(8, 32)))
 
+    def test_points_are_seen_through_any_sensor(self, tmp_path: Path):
+        folder = self.samples(tmp_path)
+        write_points(folder / "000001.ply", np.array([[10.0, 0, 0], [0, 20, 0]], np.float32), np.ones(2, np.float32))
+        seen = open_scans(folder / "000001.ply", Reading(SENSORS["vlp16"].resized(16, 64)))
+        assert seen.source[0].shape[-2:] == (16, 64)
+        assert sorted(seen.source[0][0][seen.source[0][0] > 0].tolist()) == [10, 20]
+
     def test_a_run_stands_for_its_samples(self, tmp_path: Path):
         (tmp_path / "config.yaml").touch()
         with pytest.raises(InputError, match="is a run without samples; draw some: r2flow sample"):
@@ -96,7 +103,7 @@ class TestWhatR2FlowWrote:
     def test_simulated_scans_need_no_sensor_and_no_size(self, tmp_path: Path, caplog):
         sensor = SENSORS["vlp32c"].resized(16, 64)
         write_folder(SimulatedFolder(tmp_path, sensor, 3, ("ply",)), [5], workers=1)
-        reading = reading_for([tmp_path, "simulated:3"])
+        reading = reading_for(["simulated:3", tmp_path])
         assert (reading.sensor, reading.reflectance_scale) == (replace(sensor, reflectance_scale=None), 1.0)
         image = simulate(sensor, 3, 5).image
         np.testing.assert_allclose(open_scans(tmp_path, reading).source[0], image, atol=1e-5)
