@@ -171,7 +171,7 @@ class UNet(Backbone, ABC):
     Parameters have the names of the published weights.
 
     Args:
-        base_channels: Width of the first convolution, of the outermost level and of the sinusoidal time features.
+        base_channels: Width of the first convolution, unless `multiplied`, and of the sinusoidal time features.
         channel_multiplier: Width of each level over base_channels.
         num_residual_blocks: Residual blocks of each level, or one number for all levels.
         num_heads: Heads of self-attention, which is at the deepest level only.
