@@ -43,7 +43,7 @@ def sensor_of(scans: list[Points], named: Sensor | None = None) -> Sensor:
 
 
 def rows_of(elevations: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """The row of a sensor's image for each elevation in degrees; -1 outside the view."""
+    """The row of a sensor's image for each elevation in degrees, TIE of a degree lowered; -1 outside the view."""
     row = np.searchsorted(-sensor.row_edges, TIE - np.asarray(elevations), side="right") - 1
     return np.where(row < sensor.shape[0], row, -1)
 
