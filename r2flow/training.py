@@ -34,7 +34,7 @@ from r2flow.data.opening import SOURCES, Layout, Prepared
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.resolving import reflectance_levels, resolve, resolve_reflectance
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check_folder
 from r2flow.generators import Generator, build_generator
 from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.noise import seed_torch
@@ -291,6 +291,9 @@ def fit(run: Run) -> Result:
             run.data.setup()
             run.config["scans"] = run.data.fingerprint()
             log.info("training on %s", run.config["scans"].partition(",")[0])
+            if not run.folder.exists():  # a bad scan leaves no folder
+                check_folder(run.folder)
+                run.data.read()
         run.stage.config = dict(run.config)
         if run.config["trainer"]["fast_dev_run"]:
             run.trainer.fit(run.stage, run.data)

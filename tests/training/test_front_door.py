@@ -192,10 +192,11 @@ def test_one_bad_scan_stops_the_run_or_is_left_out(train: Run, scans: Path, tmp_
     folder = Path(shutil.copytree(scans, tmp_path / "copy"))
     (folder / "000004.bin").write_bytes(b"\0" * 33)
     inside = f"run_dir={folder}/000000.bin/run"  # refused before a scan is read
-    for where, words in (("name=strict", "data.reading.on_bad_scan=skip"), (inside, "0.bin is a file, not a folder")):
+    for where, words in (("name=strict", "data.reading.on_bad_scan=skip"), (inside, "0.bin is not a folder that can")):
         refusal = train(f"data.root={folder}", where, check=False).refusal
         assert words in refusal
         assert ("000004.bin" in refusal) == (where != inside)
+    assert not (tmp_path / "runs" / "strict").exists()
     done = train(f"data.root={folder}", "name=lenient", "data.reading.on_bad_scan=skip", "trainer.max_steps=2")
     assert "left out" in done.stdout + done.stderr
     assert (tmp_path / "runs" / "lenient" / "checkpoints").exists()
