@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 KIND = "scans"
 SHARD_SCANS = 64  # 13 MB at 64 x 1024, held in memory until written
 PROBED = 8  # number of scans read to determine the levels of reflectance
-PROJECTION = 3  # revision; increase it when the same files give different images or codes
+PROJECTION = 4  # revision; increase it when the same files give different images or codes
 
 
 class PreparedStore(Store):
