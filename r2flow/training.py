@@ -291,9 +291,9 @@ def fit(run: Run) -> Result:
             run.data.setup()
             run.config["scans"] = run.data.fingerprint()
             log.info("training on %s", run.config["scans"].partition(",")[0])
-            if not run.folder.exists():  # a bad scan leaves no folder
+            if run.trainer.is_global_zero and not (run.folder.exists() or run.config["trainer"]["fast_dev_run"]):
                 check_folder(run.folder)
-                run.data.read()
+                run.data.read()  # a bad scan leaves no folder
         run.stage.config = dict(run.config)
         if run.config["trainer"]["fast_dev_run"]:
             run.trainer.fit(run.stage, run.data)

@@ -93,7 +93,7 @@ class TestSamples:
         self.samples(tmp_path)
         for content in ("{", "1", '{"checksum": ""}', '{"checksum": "", "recipe": {"reading": {"sensor": {}}}}'):
             (tmp_path / "manifest.json").write_text(content)
-            with pytest.raises(InputError, match=r"\A.*manifest.json is damaged.*\Z"):  # a dot is no line break
+            with pytest.raises(InputError, match=r"\A.*manifest.json is damaged.*\Z"):  # one line
                 open_scans(tmp_path)
 
 
