@@ -339,24 +339,25 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     write_file(path, save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})}))
 
 
+def is_dense(value: object) -> bool:
+    """Whether a value is a dense real tensor."""
+    if not isinstance(value, Tensor) or value.layout != torch.strided:
+        return False
+    return not (value.is_meta or value.is_quantized or value.is_complex())
+
+
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
     """Check all names, shapes, types and values before loading."""
     expected = model.state_dict()
     missing, surplus = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
-    problems = [f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"]
-    if not (missing or surplus):
-        problems = [
-            f"'{name}' has shape {tuple(given.shape)} ({given.layout}, {given.dtype}), the config makes it "
-            f"{tuple(value.shape)} ({value.dtype})"
-            for name, value in expected.items()
-            if (given := weights[name]).shape != value.shape
-            or given.layout != torch.strided
-            or given.is_meta
-            or given.is_complex()
-            or value.is_floating_point() != given.is_floating_point()
-        ]
-    if problems:
-        raise InputError(f"its weights do not fit its config: {problems[0]}.")
-    names = (name for name, _ in model.named_parameters())  # buffers may be infinite, as the mask of an attention
-    broken = next((n for n in names if not weights[n].sum(dtype=torch.float64).isfinite()), None)  # faster than all()
+    unlike = "its weights do not fit its config:"
+    names = f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"
+    check(not (missing or surplus), f"{unlike} {names}.")
+    for name, value in expected.items():
+        given = weights[name]
+        fits = given.shape == value.shape and given.is_floating_point() == value.is_floating_point()
+        found = f"'{name}' has shape {tuple(given.shape)} ({given.layout}, {given.dtype})"
+        check(fits and is_dense(given), f"{unlike} {found}, the config makes it {tuple(value.shape)} ({value.dtype}).")
+    trained = (name for name, _ in model.named_parameters())  # buffers may be infinite, as the mask of an attention
+    broken = next((n for n in trained if not weights[n].sum(dtype=torch.float64).isfinite()), None)  # faster than all()
     check(broken is None, f"'{broken}' has values that are NaN or infinite. Use another checkpoint.")

@@ -22,7 +22,7 @@ from r2flow.files import atomic_write, cache_folder, parse_json, reading, tellin
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.scans import Scans
-from r2flow.model.checkpoint import NOTES, read_tensors, read_torch
+from r2flow.model.checkpoint import NOTES, is_dense, read_tensors, read_torch
 from r2flow.registry import Registry
 
 BONN = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/"
@@ -195,16 +195,9 @@ def _read_torch(file: IO[bytes], name: str) -> dict[str, Tensor]:
     content = read_torch(file, name)
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
-    if not isinstance(content, dict) or not content or not all(_is_plain(*item) for item in content.items()):
-        raise InputError(f"{name} holds no table of tensors.")
+    tensors = isinstance(content, dict) and all(isinstance(n, str) and is_dense(value) for n, value in content.items())
+    check(tensors and content, f"{name} holds no table of tensors.")
     return content
-
-
-def _is_plain(name: object, value: object) -> bool:
-    """Whether an item is a str name with a dense real tensor."""
-    if not isinstance(name, str) or not isinstance(value, Tensor) or value.layout != torch.strided:
-        return False
-    return not (value.is_meta or value.is_quantized or value.is_complex())
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
