@@ -4,6 +4,7 @@ for completed in complete(checkpoint, images, state, num=8):
     completed.images, completed.spread
 """
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import Tensor
 from r2flow.errors import InputError, check
 from r2flow.generators import Flow, Generator, Sampler, condition_of
 from r2flow.generators.base import Precision, Progress
-from r2flow.lidar.encoding import LIMIT_TOLERANCE
+from r2flow.lidar.encoding import LIMIT_TOLERANCE, wrong_with
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, Samples, draw, warn_unsolved
@@ -132,7 +133,7 @@ def complete(
 
 
 def _check_values(sensor: Sensor, images: Tensor) -> None:
-    r, strength = images[:, 0], images[:, 1:]
+    r = images[:, 0]
     near, far = sensor.min_range * (1 - LIMIT_TOLERANCE), sensor.max_range * (1 + LIMIT_TOLERANCE)
     wrong = ~((r == 0) | ((r >= near) & (r <= far)))
     if bool(wrong.any()):
@@ -140,8 +141,5 @@ def _check_values(sensor: Sensor, images: Tensor) -> None:
             f"a range of {float(r[wrong][0]):g} m is outside sensor '{sensor.name}', {sensor.min_range:g} to "
             f"{sensor.max_range:g} m; give 0 and the state of a ray that was not measured."
         )
-    if not bool(((strength >= -LIMIT_TOLERANCE) & (strength <= 1 + LIMIT_TOLERANCE)).all()):
-        raise InputError(
-            f"reflectance must lie in [0, 1], found {float(strength.min()):g} to {float(strength.max()):g}; divide it "
-            "by the value of full reflectance."
-        )
+    problem = next(filter(None, (wrong_with(image, math.inf) for image in images)), None)
+    check(problem is None, f"{problem}.")
