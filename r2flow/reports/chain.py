@@ -5,17 +5,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.flow.straightness import straightness
 from r2flow.generators import Flow
 from r2flow.lidar.projection import write_scan
 from r2flow.metrics.panel import PANEL, distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.sampling import sample
-from r2flow.noise import Draws
 from r2flow.progress import track
+from r2flow.reports.curvature import measure_paths
 from r2flow.reports.outputs import draw_pages, what_next
 from r2flow.reports.pages import Page, write_page
 from r2flow.reports.pictures import contact_sheet
@@ -41,7 +39,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     real, rays = held_out(first, next(iter(runs.values()))), first.sensor.rays()
     truth = panel(real, first.sensor)
     rows, drawn = [], {}
-    bends = {name: bend(flow, num) for name, flow in flows.items()}
+    bends = {name: bend(name, flow, num) for name, flow in flows.items()}
     fixed = {name: getattr(flow.generator.sampler, "steps", 1) for name, flow in flows.items()
              if flow.generator.fixed or not hasattr(flow.generator.sampler, "steps")}  # fmt: skip
     every = sorted({1, *fixed.values(), MANY})  # numbers of steps of flows that are not distilled
@@ -95,11 +93,8 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
     return np.stack([held[i] for i in track(range(len(held)), "reading held-out scans", "scans")])
 
 
-def bend(flow: Checkpoint, num: int) -> float:
+def bend(name: str, flow: Checkpoint, num: int) -> float:
     """int s(t) dt over |x_1 - x_0|^2, mean over scans: 0 is straight; NaN without paths, or distilled."""
-    generator = flow.generator
-    if not isinstance(generator, Flow) or generator.fixed:  # a distilled network knows the times of its steps
+    if not isinstance(flow.generator, Flow) or flow.generator.fixed:  # a distilled network knows the times of its steps
         return math.nan
-    x_0 = Draws(0, range(num)).start(generator.noise_shape).to(generator.device)
-    with torch.inference_mode():
-        return float(straightness(generator.velocity, x_0, MANY).s_normalised.mean())
+    return float(measure_paths(flow, name, num, MANY, batch_size=num).s_normalised.mean())
