@@ -55,7 +55,10 @@ def write_samples(
     """
     generator, out, rays = checkpoint.generator, Path(out), checkpoint.sensor.rays()
     sampler = sampler or generator.sampler
-    endings = _chosen(checkpoint, formats)
+    fitting = [name for name in FORMATS if name != "bin" or checkpoint.encoding.reflectance]
+    endings = fitting if formats is None else formats
+    if other := [name for name in endings if name not in fitting]:
+        raise InputError(f"--format {','.join(other)} cannot hold these scans; give some of {','.join(fitting)}.")
     sampler.check(generator)
     how: dict[str, Any] = {"region": region, "precision": precision}
     part = {k: v for k, v in (how | {"region": region and asdict(region)}).items() if v not in (None, "32-true")}
@@ -82,15 +85,6 @@ def write_samples(
         model = path.parents[1].name if path.parent.name == FOLDER else path.stem
         draw_pages(shown, rays, out, f"{model}, seed {seed}")
     return endings
-
-
-def _chosen(checkpoint: Checkpoint, formats: Sequence[str] | None) -> Sequence[str]:
-    """The formats, by default all that suit the model: .bin needs reflectance; refuses others."""
-    fitting = [name for name in FORMATS if name != "bin" or checkpoint.encoding.reflectance]
-    formats = fitting if formats is None else formats
-    if other := [name for name in formats if name not in fitting]:
-        raise InputError(f"--format {','.join(other)} cannot hold these scans; give some of {','.join(fitting)}.")
-    return formats
 
 
 def _stale(store: FileStore, replace: bool) -> list[Path]:
