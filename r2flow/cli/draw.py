@@ -215,5 +215,3 @@ def complete(
         "reflectance_scale": given.reflectance_scale, "columns": given.columns,
     }  # fmt: skip
     print_completed(write_completed(loaded, scans, out, job, sampler, about), out, len(scans))
-    if num > 1 and sampler.name == "transport":  # those of jump err as a single one
-        print(f"the {num} answers differ where a scan leaves them open, and err more than the one of --num 1")
