@@ -115,12 +115,17 @@ def evaluate(
     several --steps or --sampler plot distance against evaluations and seconds. The same command with --out resumes.
     Under torchrun, processes share the scans.
     """
-    from r2flow.evaluation.measuring import check_reflectance
+    from r2flow.evaluation.comparing import Comparer, pairs_of, with_equal_panels
+    from r2flow.evaluation.copies import Nearest, find_nearest, with_copies
+    from r2flow.evaluation.measuring import Cache, Work, check_reflectance
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.metrics import METRICS
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.processes import joined, place
+    from r2flow.reports.evaluation import evaluation_page, print_comparisons
+    from r2flow.reports.pages import write_json, write_page
+    from r2flow.reports.view.panels import write_sets
 
     named = list(dict.fromkeys(generated or []))
     sampled = [name for name in named if is_checkpoint(name)]
@@ -148,49 +153,27 @@ def evaluate(
         training = None if options.train is None else _open(options.train, reading, options.train_split, None)
         for folder in filter(None, (options.out, options.json and options.json.parent)):
             check_folder(folder)
-        _compare(truth, metrics, device, judged, training, options)
-
-
-def _compare(
-    truth: "ScanSet",
-    metrics: "Mapping[str, ScanMetric]",
-    device: str,
-    judged: "dict[str, ScanSet]",
-    training: "ScanSet | None",
-    options: EvaluateOptions,
-) -> None:
-    """Compare all sets; the first process prints and writes the results."""
-    from r2flow.evaluation.comparing import Comparer, pairs_of, with_equal_panels
-    from r2flow.evaluation.copies import Nearest, find_nearest, with_copies
-    from r2flow.evaluation.measuring import Cache, Work
-    from r2flow.evaluation.protocols import PROTOCOLS
-    from r2flow.processes import place
-    from r2flow.reports.evaluation import evaluation_page, print_comparisons
-    from r2flow.reports.pages import write_json, write_page
-    from r2flow.reports.view.panels import write_sets
-
-    work = Work(options.batch_size, options.workers)
-    rules, cache = PROTOCOLS[options.protocol], None if options.no_cache else Cache()
-    compare = Comparer(metrics, work, rules, cache, options.out and options.out / "results", device)
-    pairs = pairs_of(truth, judged, options.reference, options.baselines)
-    comparisons = with_equal_panels([compare(*pair) for pair in pairs])
-    if place()[0] > 0:
-        return
-    nearest: dict[str, Nearest] = {}
-    if training is not None:
-        nearest = find_nearest({**judged, REAL: truth}, training, work, device)
-        real = nearest.pop(REAL)
-        comparisons = with_copies(comparisons, nearest, real, len(training))
-    seeds = {"sampled scans": options.seed} if any(scans.source.drawn for scans in judged.values()) else {}
-    page = evaluation_page(comparisons, device, seeds, nearest, training)
-    print_comparisons(comparisons)
-    if options.json is not None:
-        write_json(page, options.json)
-        print(options.json)
-    if options.out is not None:
-        print(*write_page(page, options.out), sep="\n")
-        sets = {"real": truth} | {"real, judged" if name == "real" else name: s for name, s in judged.items()}
-        print(write_sets(options.out / "evaluation.html", sets, title="Generated and real scans"))
+        work = Work(options.batch_size, options.workers)
+        cache = None if options.no_cache else Cache()
+        compare = Comparer(metrics, work, rules, cache, options.out and options.out / "results", device)
+        pairs = pairs_of(truth, judged, options.reference, options.baselines)
+        comparisons = with_equal_panels([compare(*pair) for pair in pairs])
+        if place()[0] > 0:  # the first process prints and writes the results
+            return
+        nearest: dict[str, Nearest] = {}
+        if training is not None:
+            nearest = find_nearest({**judged, REAL: truth}, training, work, device)
+            comparisons = with_copies(comparisons, nearest, nearest.pop(REAL), len(training))
+        seeds = {"sampled scans": options.seed} if any(scans.source.drawn for scans in judged.values()) else {}
+        page = evaluation_page(comparisons, device, seeds, nearest, training)
+        print_comparisons(comparisons)
+        if options.json is not None:
+            write_json(page, options.json)
+            print(options.json)
+        if options.out is not None:
+            print(*write_page(page, options.out), sep="\n")
+            shown = {"real": truth} | {"real, judged" if name == "real" else name: s for name, s in judged.items()}
+            print(write_sets(options.out / "evaluation.html", shown, title="Generated and real scans"))
 
 
 def _reading(how: ReadingOptions, specs: Sequence[str], flows: "Sequence[Checkpoint]") -> "Reading":
