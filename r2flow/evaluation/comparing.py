@@ -85,8 +85,14 @@ class Comparer:
 
     def __call__(self, kind: Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
         """Compare two sets, or read the stored results."""
-        path, results = self._path(real, other), None
-        if path is not None:
+        path = results = None
+        if self.folder is not None and other.source.drawn:
+            recipe = {
+                "real": real.identity or [real.label, len(real)], "sampled": other.about,
+                "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
+                "protocol": self.rules.name, "plugins": plugin_digests(), "device": self.device,
+            }  # fmt: skip
+            path = self.folder / f"{checksum(recipe)[:16]}.json"
             with suppress(OSError, ValueError, TypeError):  # missing or damaged
                 results = [MetricResult(**entry) for entry in read_json(path)]
         if results is None:
@@ -101,14 +107,3 @@ class Comparer:
             if path is not None and place()[0] == 0:
                 write_file(path, json.dumps([asdict(result) for result in results]))
         return Comparison(name, real, other, results, kind)
-
-    def _path(self, real: ScanSet, other: ScanSet) -> Path | None:
-        """File of the results; None unless they are stored."""
-        if self.folder is None or not other.source.drawn:
-            return None
-        recipe = {
-            "real": real.identity or [real.label, len(real)], "sampled": other.about,
-            "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
-            "protocol": self.rules.name, "plugins": plugin_digests(), "device": self.device,
-        }  # fmt: skip
-        return self.folder / f"{checksum(recipe)[:16]}.json"
