@@ -103,7 +103,7 @@ def completion_page(rows: Sequence[Mapping[str, Any]], figure: Figure, about: st
     for task in dict.fromkeys(row["task"] for row in rows):
         part = [row for row in rows if row["task"] == task]
         columns = {key: heading for key, heading in COLUMNS.items() if any(key in row for row in part)}
-        text += [f"## {task}", table([{key: row.get(key) for key in columns} for row in part], columns)]
+        text += [f"## {task}", table(part, columns)]
     return Page("completion", "Completed scans", text, rows, {"completion": figure}, {"noise": seed}, device)
 
 
