@@ -88,9 +88,9 @@ class Work:
     workers: int = 0  # additional reader processes
 
 
-def bar(doing: str, total: int, unit: str = "scans") -> Bar:
+def bar(doing: str, total: int) -> Bar:
     """Create a progress bar, shown only by the first process."""
-    return Bar(doing, total, unit, shown=None if place()[0] == 0 else False)
+    return Bar(doing, total, shown=None if place()[0] == 0 else False)
 
 
 @dataclass(frozen=True)
