@@ -13,8 +13,6 @@ CHUNK = 16384  # points per pass: 1024 channels of them take 64 MiB
 class Points(nn.Module):
     """Three layers per point, then the maximum over points: (B, 3, N) -> (B, 1024)."""
 
-    rectified = True  # whether a ReLU follows the last layer
-
     def __init__(self) -> None:
         super().__init__()
         self.conv1 = nn.Conv1d(3, 64, 1)
@@ -31,8 +29,7 @@ class Points(nn.Module):
     def each(self, points: Tensor) -> Tensor:
         x = torch.relu(self.bn1(self.conv1(points)))
         x = torch.relu(self.bn2(self.conv2(x)))
-        x = self.bn3(self.conv3(x))
-        return torch.relu(x) if self.rectified else x
+        return self.bn3(self.conv3(x))
 
 
 class Transform(Points):
@@ -47,15 +44,13 @@ class Transform(Points):
         self.bn5 = nn.BatchNorm1d(256)
 
     def forward(self, points: Tensor) -> Tensor:
-        x = torch.relu(self.bn4(self.fc1(self.largest(points))))
+        x = torch.relu(self.bn4(self.fc1(torch.relu(self.largest(points)))))
         x = torch.relu(self.bn5(self.fc2(x)))
         return self.fc3(x).view(-1, 3, 3) + torch.eye(3, device=x.device, dtype=x.dtype)
 
 
 class Cloud(Points):
     """Global feature of a cloud, (B, 3, N) -> (B, 1024)."""
-
-    rectified = False
 
     def __init__(self) -> None:
         super().__init__()
