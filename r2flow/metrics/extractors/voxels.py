@@ -7,6 +7,7 @@ weights were not available: their names, the widths below (48 follows from 768 f
 from the weights) and the features are not verified.
 """
 
+from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -36,11 +37,9 @@ def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
         return points.new_zeros(0, 3, dtype=torch.int64), points.new_zeros(0, 4)
     coords = (points / VOXEL).round().long()
     coords = coords - coords.amin(0)
-    _, size_y, size_z = (coords.amax(0) + 1).tolist()
-    key = (coords[:, 0] * size_y + coords[:, 1]) * size_z + coords[:, 2]
-    voxel, of_point = key.unique(return_inverse=True)
+    voxels, of_point = coords.unique(dim=0, return_inverse=True)
     number = torch.arange(len(points), device=points.device)
-    first = torch.full_like(voxel, len(points)).scatter_reduce_(0, of_point, number, "amin").sort().values
+    first = number.new_full((len(voxels),), len(points)).scatter_reduce_(0, of_point, number, "amin").sort().values
     return coords[first], torch.nn.functional.pad(points[first], (0, 1), value=-1.0)
 
 
@@ -67,15 +66,9 @@ def _step(channels: int, out: int, size: int, transposed: bool = False) -> list[
     return [SparseConv3d(channels, out, size, transposed), SparseNorm(out), SparseReLU()]
 
 
-class Block(nn.Module):
-    """Convolution, normalisation, ReLU."""
-
-    def __init__(self, channels: int, out: int, transposed: bool = False) -> None:
-        super().__init__()
-        self.net = nn.Sequential(*_step(channels, out, 2, transposed))
-
-    def forward(self, x: Sparse) -> Sparse:
-        return self.net(x)
+def _resampled(channels: int, out: int, transposed: bool = False) -> nn.Module:
+    """A step to the coarser or finer grid, named `net` as in the published weights."""
+    return nn.Sequential(OrderedDict(net=nn.Sequential(*_step(channels, out, 2, transposed))))
 
 
 class Residual(nn.Module):
@@ -104,13 +97,13 @@ class MinkowskiNet(Extractor):
         self.stem = nn.Sequential(*_step(channels, c[0], 3), *_step(c[0], c[0], 3))
         for level in range(1, 5):
             down = nn.Sequential(
-                Block(c[level - 1], c[level - 1]), Residual(c[level - 1], c[level]), Residual(c[level], c[level])
+                _resampled(c[level - 1], c[level - 1]), Residual(c[level - 1], c[level]), Residual(c[level], c[level])
             )
             self.add_module(f"stage{level}", down)
         for level in range(1, 5):
             width, skip = c[4 + level], c[4 - level]
             blocks = nn.Sequential(Residual(width + skip, width), Residual(width, width))
-            self.add_module(f"up{level}", nn.ModuleList([Block(c[3 + level], width, transposed=True), blocks]))
+            self.add_module(f"up{level}", nn.ModuleList([_resampled(c[3 + level], width, True), blocks]))
         self.classifier = nn.Sequential(nn.Linear(c[8], num_classes))
 
     def down(self, x: Sparse) -> list[Sparse]:
