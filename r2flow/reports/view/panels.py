@@ -138,10 +138,8 @@ def way_panels(
 
 def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, title: str = "r2flow") -> Path:
     """Write a page with one panel per set, with `num` evenly spread scans as frames."""
-    panels = []
-    for name, scans in sets.items():
-        chosen = scans.spread(num)
-        if len(chosen):
-            images = chosen.source.batch(range(len(chosen))).nan_to_num(0.0).numpy()
-            panels.append(Panel(f"{name}: {scans.label}", images, scans.sensor.rays()))
+    panels = [
+        Panel(f"{name}: {scans.label}", scans.spread(num)[:].nan_to_num(0.0).numpy(), scans.sensor.rays())
+        for name, scans in sets.items()
+    ]
     return write_page(path, panels, title)
