@@ -10,7 +10,6 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
-    CheckpointOption,
     ColumnsOption,
     DeviceOption,
     DrawOptions,
@@ -98,7 +97,7 @@ def sample(
 def interpolate(
     first: Annotated[str, typer.Argument(help="A scan file or a range image (.npy).")],
     last: Annotated[str, typer.Argument(help="A second scan file or range image.")],
-    checkpoint: CheckpointOption,
+    checkpoint: Annotated[Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.")],
     out: OutOption,
     sampling: SamplerOptions,
     frames: Annotated[int, typer.Option(min=2, help="Number of scans, both ends included.")] = 6,

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from r2flow.data.reading import Reading
     from r2flow.model.checkpoint import Checkpoint
 
-CheckpointOption = Annotated[
-    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.")
-]
 DeviceOption = Annotated[str, typer.Option(help="Device: auto, cpu, cuda, cuda:1, ...")]
 PrecisionOption = Annotated[
     Literal["32-true", "bf16-mixed"],
