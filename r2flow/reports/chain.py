@@ -68,8 +68,6 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     page = Page("chain", "From many steps to few", text, rows, figures, {"evaluation": 0}, device)
     written = write_page(page, out)[-1]
     print_table(rows, COLUMNS)
-    before = [row for row in rows if row["flow"] == cells[0][0]][-1]
-    ends = dict.fromkeys(f"{row['flow']} in {row['steps']} ({row['mean']:.3f})" for row in (before, rows[-1]))
     learned = flows[last].config | {"data": first.config.get("data", {})}  # the chain's scans are its first run's
     print(
         f"""
@@ -80,7 +78,6 @@ table         {written}
 flows         {", ".join(map(str, runs.values()))}
 {what_next(runs[last], out, config=learned)}
 
-Shown: in how many steps a flow draws a scan, and how far its scans are from held-out ones: {", then ".join(ends)}.
 Open {out / "chain.png"} first.""",
         flush=True,
     )
