@@ -84,10 +84,7 @@ def test_every_verb_has_help_with_an_example(r2flow, verb):
 )
 def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, words):
     monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", Mock(side_effect=error))
-    for more, instead in ((("--batch-size", 4), "a smaller --batch-size"), ((), "smaller batches or images")):
-        said = r2flow("sample", "-o", tmp_path, *more).refusal
-        assert words in said
-        assert instead in said
+    assert words in r2flow("sample", "-o", tmp_path).refusal
 
 
 def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_path):

@@ -71,9 +71,7 @@ def _run() -> None:
             raise
         size = re.search(r"allocate ([\d.]+ \w+)", str(error))
         more = f" for {size[1]} more" if size else ""
-        batched = any(word.startswith("--batch-size") for word in sys.argv)
-        less = "a smaller --batch-size" if batched else "smaller batches or images"
-        message = f"the memory has no room{more}; give {less}, or more memory."
+        message = f"the memory has no room{more}; give smaller batches or images, or more memory."
     except USAGE_ERROR as error:
         text = one_line(error.format_message()).rstrip(".") or "no verb given"
         message = f"{text}{'.' * (not text.endswith('?'))} See --help."
