@@ -45,10 +45,9 @@ def show(
         path = out / f"{names[-1]}.{format}"
         if format == "npy":
             save_array(path, image)
-            size, returns = " x ".join(map(str, image.shape)), (image[0] > 0).mean()
-            print(f"{path}: {size}, {returns:.1%} returns")
-            continue
-        print(save_figure(scan_figure(image, rays, file.name), path))
+        else:
+            save_figure(scan_figure(image, rays, file.name), path)
+        print(path)
 
 
 @app.command(epilog="Example: r2flow view street velodyne/0000000100.bin --steps 1,2,4,32 --out page.html")
