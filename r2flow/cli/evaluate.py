@@ -163,9 +163,9 @@ def evaluate(
         nearest: dict[str, Nearest] = {}
         if training is not None:
             nearest = find_nearest({**judged, REAL: truth}, training, work, device)
-            comparisons = with_copies(comparisons, nearest, nearest.pop(REAL), len(training))
+            comparisons = with_copies(comparisons, nearest, nearest.pop(REAL))
         seeds = {"sampled scans": options.seed} if any(scans.source.drawn for scans in judged.values()) else {}
-        page = evaluation_page(comparisons, device, seeds, nearest, training)
+        page = evaluation_page(comparisons, device, seeds, nearest)
         print_comparisons(comparisons)
         if options.json is not None:
             write_json(page, options.json)

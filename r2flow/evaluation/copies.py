@@ -46,18 +46,19 @@ def described(scans: ScanSet, work: Work, device: str, doing: str) -> Iterator[T
 
 
 class Nearest:
-    """Nearest training scan of each scan of a set, among the training scans compared so far.
+    """Nearest scan of a training set for each scan of a set, among the training scans compared so far.
 
     `numbers`: indices of scans with returns, (N,); `squared`: d^2 to the nearest training scan; `neighbours`: index of
     this training scan; `turns`: its shift u in cells, or -1 - u if mirrored first.
     """
 
-    def __init__(self, scans: ScanSet, work: Work, device: str) -> None:
+    def __init__(self, scans: ScanSet, training: ScanSet, work: Work, device: str) -> None:
         x = torch.cat(list(described(scans, work, device, "describing")))
         usable = x.isfinite().flatten(1).all(1)
         check(usable.any(), f"none of the {len(scans)} scans of {scans.label} has a return to compare.")
-        self.scans, self.numbers, x = scans, np.flatnonzero(usable.cpu().numpy()), x[usable]
-        self.x, self.width = x, x.shape[2]
+        self.scans, self.training, self.numbers = scans, training, np.flatnonzero(usable.cpu().numpy())
+        self.x = x = x[usable]
+        self.width = x.shape[2]
         self.spectra = -2 * torch.fft.rfft(x).conj().permute(2, 0, 1).contiguous()  # (K, N, h)
         self.squared = x.new_full((len(x),), torch.inf)
         self.neighbours, self.turns = (torch.zeros_like(self.squared, dtype=torch.long) for _ in range(2))
@@ -89,9 +90,9 @@ class Nearest:
         """Distance of each scan to its nearest training scan, (N,)."""
         return np.asarray(self.squared.double().sqrt().cpu())
 
-    def match(self, place: int, training: ScanSet) -> np.ndarray:
+    def match(self, place: int) -> np.ndarray:
         """Image of the nearest training scan of the scan at `place`, aligned with that scan."""
-        image, turn = training.source[int(self.neighbours[place])], int(self.turns[place])
+        image, turn = self.training.source[int(self.neighbours[place])], int(self.turns[place])
         if turn < 0:
             image, turn = image[..., ::-1], -1 - turn
         return np.roll(image, -round(turn * image.shape[-1] / self.width), axis=-1)
@@ -99,7 +100,7 @@ class Nearest:
 
 def find_nearest(sets: Mapping[str, ScanSet], training: ScanSet, work: Work, device: str = "cpu") -> dict[str, Nearest]:
     """Find the nearest training scan of each scan of several sets; reads training scans once, without storing them."""
-    nearest = {name: Nearest(scans, work, device) for name, scans in sets.items()}
+    nearest = {name: Nearest(scans, training, work, device) for name, scans in sets.items()}
     first = 0
     for y in described(training, work, device, "reading training scans"):
         for neighbours in nearest.values():
@@ -109,7 +110,7 @@ def find_nearest(sets: Mapping[str, ScanSet], training: ScanSet, work: Work, dev
     return nearest
 
 
-def copies_result(judged: Nearest, real: Nearest, training: int) -> MetricResult:
+def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
     """Median distance to the nearest training scan, and P(a scan's distance < a real scan's), 0.5 by chance.
 
     The test, one-sided Mann-Whitney U, leaves out real scans that are training scans. A small p does not prove copying:
@@ -130,19 +131,17 @@ def copies_result(judged: Nearest, real: Nearest, training: int) -> MetricResult
             f"{len(others)} real ones, {len(d) / (len(others) + 1):.2g} expected; nearer in "
             f"{figures['copies_nearer']:.0%} of all pairs (p = {test.pvalue:.2g})."
         )
-    settings = {"cells": list(CELLS), "turned": True, "mirrored": True, "training scans": training}
+    settings = {"cells": list(CELLS), "turned": True, "mirrored": True, "training scans": len(real.training)}
     sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(judged.numbers)}
     protocol = {**asdict(Protocol("copies", "log-range of cells", settings=settings)), "sizes": sizes}
     return MetricResult("copies", figures, protocol, None, remarks)
 
 
-def with_copies(
-    comparisons: Sequence[Comparison], nearest: Mapping[str, Nearest], real: Nearest, training: int
-) -> list[Comparison]:
+def with_copies(comparisons: Sequence[Comparison], nearest: Mapping[str, Nearest], real: Nearest) -> list[Comparison]:
     """Add `copies_result` to each judged set in `nearest`, and that of the real scans to the halves."""
     of = {("judged", name): neighbours for name, neighbours in nearest.items()} | {("reference", HALVES): real}
     return [
-        replace(row, measured=[*row.measured, copies_result(of[row.kind, row.name], real, training)])
+        replace(row, measured=[*row.measured, copies_result(of[row.kind, row.name], real)])
         if (row.kind, row.name) in of
         else row
         for row in comparisons

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from r2flow.data.sets import ScanSet
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.sets import AS_MANY, HALVES
@@ -112,8 +111,7 @@ def evaluation_page(
     comparisons: Sequence[Comparison],
     device: str,
     seeds: Mapping[str, int],
-    nearest: Mapping[str, Nearest] | None = None,
-    training: ScanSet | None = None,
+    nearest: Mapping[str, Nearest],
 ) -> Page:
     """Build the page of an evaluation: table, sets, protocols and pictures, with nearest training scans if computed."""
     columns, lines = _table(comparisons)
@@ -148,8 +146,8 @@ def evaluation_page(
     if len(sampled) > len({row["flow"] for row in sampled}):
         names = [name for name in dict.fromkeys(key for row in sampled for key in row) if "/" in name]
         figures["evaluation_speed"] = speed_figure(sampled, names)
-    if nearest and training is not None:
-        figures["evaluation_copies"] = copies_figure(nearest, training)
+    if nearest:
+        figures["evaluation_copies"] = copies_figure(nearest)
     title = "Generated scans against real ones"
     return Page("evaluation", title, text, rows_of(comparisons), figures, seeds, device, more)
 
@@ -276,7 +274,7 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
     return figure
 
 
-def copies_figure(nearest: Mapping[str, Nearest], training: ScanSet, pairs: int = 4) -> Figure:
+def copies_figure(nearest: Mapping[str, Nearest], pairs: int = 4) -> Figure:
     """Draw the scans of each set nearest to training scans, next to the aligned training scan."""
     chosen = [(name, copies, int(i)) for name, copies in nearest.items() for i in np.argsort(copies.distances)[:pairs]]
     figure = blank_figure(14, 0.9 * len(chosen) + 0.2)
@@ -284,6 +282,6 @@ def copies_figure(nearest: Mapping[str, Nearest], training: ScanSet, pairs: int 
     for (left, right), (name, copies, place) in zip(panels, chosen, strict=True):
         number = int(copies.numbers[place])
         draw_range(left, copies.scans.source[number], label=False)
-        draw_range(right, copies.match(place, training), label=False)
+        draw_range(right, copies.match(place), label=False)
         left.set_title(f"{name} {number}: {shown(float(copies.distances[place]))} away", fontsize=8, pad=2)
     return figure

@@ -54,8 +54,8 @@ def test_each_has_its_nearest_over_turns_and_mirror_and_copies_are_found(sets, m
     assert one.distances[3:].tolist() == [0, 0, 0]
     assert (one.turns[3:] < 0).tolist() == [False, False, True]
     for place in (3, 4, 5):  # the figure draws the training scan as the sample shows it
-        np.testing.assert_array_equal(one.match(place, sets["training"])[0], made["generated"][place][0])
-    result = copies_result(one, real, 9)
+        np.testing.assert_array_equal(one.match(place)[0], made["generated"][place][0])
+    result = copies_result(one, real)
     count = (one.distances < min(real.distances)).sum()
     assert f"{count} of 6 scans" in result.remarks[0]
     assert result.figures["copies"] == np.median(one.distances)
