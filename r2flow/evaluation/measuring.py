@@ -218,6 +218,7 @@ def _update(
     starts = range(0, len(numbers), work.batch_size)[rank::ranks]
     shared = [number for start in starts for number in numbers[start : start + work.batch_size]]
     measured = real and protocol.real == "measured"
+    rays = protocol.real if real and protocol.real != "measured" else protocol.generated
     batches = scans.batches(shared, work.batch_size, work.workers, with_points=measured)
     names, side = scans.source.names, "real" if real else "generated"
     empty = 0
@@ -225,7 +226,7 @@ def _update(
         for start, read in zip(starts, batches, strict=True):
             images, points = read if measured else (read, None)
             labels = [f"{names[number]} of {scans.label}" for number in numbers[start : start + work.batch_size]]
-            batch = Scans(images.to(device), scans.sensor, protocol.rays(real), points, labels)
+            batch = Scans(images.to(device), scans.sensor, rays, points, labels)
             empty += int((~batch.returned.flatten(1).any(1)).sum())
             version = batch.images._version  # counts the edits in place
             for name, metric in metrics.items():

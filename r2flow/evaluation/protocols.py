@@ -38,10 +38,6 @@ class Rules:
     choose: Callable[[ScanSet, int], Sequence[int]]
     chosen: str
 
-    def rays(self, real: bool) -> Rays:
-        """Rays of points that are not measured."""
-        return self.real if real and self.real != "measured" else self.generated
-
     def check(self, real: ScanSet) -> None:
         """Refuse a real set without the measured coordinates that the protocol needs."""
         try:
