@@ -190,12 +190,12 @@ def complete(
 ) -> None:
     """Complete scans: more beams, filled gaps, hidden parts.
 
-    Output files have the format of the input. The same command resumes an interrupted run.
+    Files have the format of the input, or .ply if it cannot be written. The same command resumes an interrupted run.
     """
     from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.model.completion import completing
     from r2flow.models import DEFAULT, DENSIFY, MODELS
-    from r2flow.reports.completed import Job, lack_sectors, print_completed, remarks_on_files, write_completed
+    from r2flow.reports.completed import Job, lack_sectors, print_completed, write_completed
 
     mask = parse_mask(given.mask) if given.mask else None
     job = Job(num, seed, mask, given.fill_gaps, batch_size, pictures, precision)
@@ -207,8 +207,10 @@ def complete(
     if checkpoint is None:
         print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
     sampler = completing(loaded.generator, several=num > 1, **how.given)
-    for line in (*remarks, *remarks_on_files(loaded, scans)):
+    for line in remarks:
         print(line)
+    if not loaded.encoding.reflectance:
+        print("the model is of range alone: answers have no reflectance")
     about = {
         "mask": given.mask and mask_identity(given.mask), "from": given.source,
         "reflectance_scale": given.reflectance_scale, "columns": given.columns,

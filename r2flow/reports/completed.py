@@ -61,8 +61,11 @@ def write_completed(
     """
     digits = len(str(job.num - 1))
     numbers = [""] if job.num == 1 else [f"_{answer:0{digits}d}" for answer in range(job.num)]
-    files = {scan.name: [out / f"{scan.name}{n}{answer_ending(checkpoint, scan)}" for n in numbers] for scan in scans}
+    written = [ending for ending in WRITTEN if ending != ".bin" or checkpoint.encoding.reflectance]
+    files: dict[str, list[Path]] = {}
     for scan in scans:
+        ending = scan.ending if scan.ending in written else ".ply"
+        files[scan.name] = [out / f"{scan.name}{number}{ending}" for number in numbers]
         if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
             raise InputError(f"{out} is the folder of the scans; give another --out.")
     settings = {"num": job.num, "fill_gaps": job.fill_gaps, **about, "precision": job.precision}
@@ -167,22 +170,6 @@ def print_completed(done: Mapping[str, np.ndarray | None], out: Path, scans: int
         off = f"MAE {mae:.2f} m ({linear:.2f}) where all return" if np.isfinite(mae) else "no ray returns in all"
         print(f"on hidden rays of {len(errors)} scans (linear interpolation in brackets):")
         print(f"{off}, {wrong:.1%} ({wrong_linear:.1%}) wrong in ray-drop")
-
-
-def remarks_on_files(checkpoint: Checkpoint, scans: Sequence[PartialScan]) -> list[str]:
-    """What the files of completed scans hold other than those of the scans."""
-    changed = {scan.ending for scan in scans if answer_ending(checkpoint, scan) != scan.ending}
-    remarks = [f"completions of {ending} files are written as .ply" for ending in sorted(changed)]
-    if not checkpoint.encoding.reflectance:
-        remarks.append("the model is of range alone: answers have no reflectance")
-    return remarks
-
-
-def answer_ending(checkpoint: Checkpoint, scan: PartialScan) -> str:
-    """File format of a scan's answers: the scan's, or .ply if not writable or in need of missing reflectance."""
-    if scan.ending not in WRITTEN or (scan.ending == ".bin" and not checkpoint.encoding.reflectance):
-        return ".ply"
-    return scan.ending
 
 
 def _write(
