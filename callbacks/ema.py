@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import lightning as L
-import torch
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
@@ -35,7 +34,7 @@ DECAYS: Registry[Callable[[int, int, float], float]] = Registry(
 
 
 class EMA(WeightAveraging):
-    """Exponential moving average of the weights, in float32, for validation, pictures and checkpoints.
+    """Exponential moving average of the weights, for validation, pictures and checkpoints.
 
     Every `every` steps: average <- decay average + (1 - decay) weights. A run that ends before the first update after
     the warm-up keeps its raw weights as the average.
@@ -55,7 +54,6 @@ class EMA(WeightAveraging):
         self.decay, self.every, self.warmup_steps = decay, every, warmup_steps
         self._decay_at = DECAYS[rule]
         self._step, self._end, self._copies = 0, -1, False
-        self._raw: list[Tensor] = []
 
     def _decay(self) -> float:
         """Decay after step `_step`, counted from 0."""
@@ -76,34 +74,14 @@ class EMA(WeightAveraging):
         super().setup(trainer, pl_module, stage)
         if self.warmup_steps is None:
             self.warmup_steps = int(getattr(pl_module, "warmup_steps", 0))
-        if self._average_model is not None:
-            # A half-precision average stalls: its updates are smaller than the float spacing.
-            self._average_model.float().requires_grad_(False)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._end = trainer.max_steps - 1
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         # Built before the module moved to its device; otherwise every update would copy the weights to the CPU.
-        if self._average_model is not None and self._device is None:
-            self._average_model.to(pl_module.device)
-
-    # The base class swaps weights and average in place, which rounds a float32 average to the weights' precision; here
-    # the raw weights are saved and restored, and the average is never overwritten.
-    def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if self._average_model is not None:
-            self._raw = [p.detach().clone() for p in pl_module.parameters()]
-            averages = self._average_model.module.parameters()
-            with torch.no_grad():
-                for weight, average in zip(pl_module.parameters(), averages, strict=True):
-                    weight.copy_(average)
-
-    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if self._raw:
-            with torch.no_grad():
-                for weight, raw in zip(pl_module.parameters(), self._raw, strict=True):
-                    weight.copy_(raw)
-            self._raw = []
+            self._average_model.to(pl_module.device)
 
 
 def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:

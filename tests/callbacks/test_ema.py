@@ -1,5 +1,3 @@
-from types import SimpleNamespace
-
 import lightning as L
 import pytest
 import torch
@@ -79,22 +77,6 @@ def test_validation_sees_the_average_and_leaves_the_weights(tmp_path):
     assert average == pytest.approx(3.1575, abs=1e-3)
     assert module.seen == pytest.approx(average)
     assert module.weight.item() == pytest.approx(average)  # after fit the module is the model
-
-
-def test_a_look_at_a_float32_average_of_bfloat16_leaves_what_the_module_counts():
-    module = Scripted([]).to(torch.bfloat16)
-    module.register_buffer("count", torch.tensor(1))
-    ema = EMA(every=10, warmup_steps=0)
-    ema.setup(None, module, "fit")  # type: ignore[arg-type]
-    assert all(p.dtype == torch.float32 for p in ema._average_model.parameters())
-    with torch.no_grad():
-        module.weight.fill_(2.0)
-    module.count += 1  # since the average was last updated
-    with averaged_weights(SimpleNamespace(callbacks=[ema]), module):  # type: ignore[arg-type]
-        assert module.weight == 0
-        assert module.count == 2
-    assert module.weight == 2
-    assert module.count == 2
 
 
 @pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (3, 2), (3, 6), (3, 10), (20, 15)])
