@@ -153,7 +153,7 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
     if config.get("preview"):
         raise InputError("preview is of a chain of runs, such as experiment=demo: leave it out, or give preview=null.")
-    with _said_once(), made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
+    with _quiet(), made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
         parent = find_parent(config["stage"].get("init"))
         config = _checked(config, asked, parent)
         config["plugins"] = config.get("plugins") or loaded_plugins()
@@ -287,13 +287,12 @@ def fit(run: Run) -> Result:
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
     stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping(run.folder))
     with stopping.listening(), _quiet():
-        with _said_once():
-            run.data.setup()
-            run.config["scans"] = run.data.fingerprint()
-            log.info("training on %s", run.config["scans"].partition(",")[0])
-            if run.trainer.is_global_zero and not (run.folder.exists() or run.config["trainer"]["fast_dev_run"]):
-                check_folder(run.folder)
-                run.data.read()  # a bad scan leaves no folder
+        run.data.setup()
+        run.config["scans"] = run.data.fingerprint()
+        log.info("training on %s", run.config["scans"].partition(",")[0])
+        if run.trainer.is_global_zero and not (run.folder.exists() or run.config["trainer"]["fast_dev_run"]):
+            check_folder(run.folder)
+            run.data.read()  # a bad scan leaves no folder
         run.stage.config = dict(run.config)
         if run.config["trainer"]["fast_dev_run"]:
             run.trainer.fit(run.stage, run.data)
@@ -318,11 +317,10 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
             init = as_override("stage.init", run.folder)
             print(f"finished before, at step {step_of(last)}; to learn more: {init} name=OTHER")
         return step_of(last)  # no training, no pairs
-    with _said_once():
-        run.data.read()
+    run.data.read()
+    if last is not None:
+        log.info("resuming from %s", last)
     if run.trainer.is_global_zero:
-        if last is not None:
-            log.info("resuming from %s", last)
         log_config(run.trainer.loggers, run.config)
     try:
         if last is None and run.config["stage"].get("init"):  # what the end of the run is compared with
@@ -353,28 +351,19 @@ def _result(run: Run, step: int, finished: bool) -> Result:
 
 
 @contextmanager
-def _said_once() -> Iterator[None]:
-    """Context of what all devices find alike: only the first logs it."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING if getattr(rank_zero_only, "rank", 0) else before)
-    try:
-        yield
-    finally:
-        logging.disable(before)
-
-
-@contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress Lightning's messages and warnings about intended choices."""
-    loggers = [logging.getLogger(f"lightning.{name}") for name in ("pytorch.utilities.rank_zero", "fabric")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.WARNING)
+    """Suppress Lightning's messages, its warnings about intended choices, and what further devices repeat."""
+    levels = dict.fromkeys(("lightning.pytorch.utilities.rank_zero", "lightning.fabric"), logging.WARNING)
+    if getattr(rank_zero_only, "rank", 0):
+        levels["r2flow"] = logging.ERROR
+    before = {name: logging.getLogger(name).level for name in levels}
+    for name, level in levels.items():
+        logging.getLogger(name).setLevel(level)
     try:
         with warnings.catch_warnings():
             for message in EXPECTED_WARNINGS:
                 warnings.filterwarnings("ignore", message=message)
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        for name, level in before.items():
+            logging.getLogger(name).setLevel(level)
