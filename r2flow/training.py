@@ -57,11 +57,8 @@ EXPECTED_WARNINGS = (
     ".*does not have many workers.*",
     "Total length of .list. across ranks is zero.*",
     ".*smaller than the logging interval.*",
-    "Checkpoint directory .* exists and is not empty.*",
     ".*isinstance.treespec, LeafSpec.*",
     "You passed in a .val_dataloader. but have no .validation_step.*",
-    "The dirpath has changed from.*",
-    "Using ModelCheckpoint with manual optimization.*",
     "Be aware that when using .ckpt_path.*",  # a callback's options may change
 )
 
