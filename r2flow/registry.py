@@ -121,26 +121,21 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
     parameters = _parameters(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
-    if problem := next(_problems(_by_keyword(parameters[given:]), options), None):
-        raise InputError(f"{what}{problem}")
+    known = _by_keyword(parameters[given:])
+    for key, value in options.items():
+        if key not in known:
+            names = ", ".join(known) or "none"
+            raise InputError(f"{what} has no option {key!r}; it knows: {names}.{did_you_mean(key, known)}")
+        if (wanted := _wanted(known[key].annotation)) and not wanted[1](value):
+            raise InputError(f"{what}: {key} must be {wanted[0]}, found {value!r}.")
+    for key, parameter in known.items():
+        check(parameter.default is not parameter.empty or key in options, f"{what} needs the option {key!r}.")
 
 
 def construct(what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any) -> T:
     """Call a constructor with `args` and a config's options, which are checked; None: its defaults."""
     check_options(what, constructor, options or {}, given=len(args))
     return constructor(*args, **(options or {}))
-
-
-def _problems(known: Mapping[str, inspect.Parameter], options: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with options: unknown, of a value that the annotation does not allow, or missing."""
-    for key, value in options.items():
-        if key not in known:
-            yield f" has no option {key!r}; it knows: {', '.join(known) or 'none'}.{did_you_mean(key, known)}"
-        elif (wanted := _wanted(known[key].annotation)) and not wanted[1](value):
-            yield f": {key} must be {wanted[0]}, found {value!r}."
-    yield from (
-        f" needs the option {key!r}." for key, p in known.items() if p.default is p.empty and key not in options
-    )
 
 
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
