@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from lightning.pytorch.callbacks import Callback, EarlyStopping, GradientAccumulationScheduler
 
 from r2flow.errors import InputError, check
-from r2flow.registry import Registry, check_options
+from r2flow.registry import Registry, construct
 from r2flow.runs.lineage import drawn_by
 
 from .checkpoints import Checkpoints
@@ -47,9 +47,7 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     for name, registered in CALLBACKS.items():
         if name in wanted:
             entry = registered if isinstance(registered, Entry) else Entry(registered)  # a class, as from a plug-in
-            given = entry.given(config)
-            check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
-            made = entry.constructor(*given, **wanted[name])
+            made = construct(f"callbacks.{name}", entry.constructor, wanted[name], *entry.given(config))
             check(isinstance(made, Callback), f"callbacks.{name} must make a Lightning callback, found {made!r}.")
             built.append(made)
     for kind, instead in (

@@ -134,8 +134,9 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
 
 def construct(what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any) -> T:
     """Call a constructor with `args` and a config's options, which are checked; None: its defaults."""
-    check_options(what, constructor, options or {}, given=len(args))
-    return constructor(*args, **(options or {}))
+    options = {} if options is None else options
+    check_options(what, constructor, options, given=len(args))
+    return constructor(*args, **options)
 
 
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
