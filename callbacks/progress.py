@@ -37,7 +37,7 @@ class Progress(ProgressBar):
         if now - self._noted >= min(self.seconds, 1):  # reading a loss waits for the GPU
             self._noted, shown = now, trainer.progress_bar_metrics  # logged with prog_bar=True
             losses = [f"{key.removeprefix('train/')} {value:.4f}" for key, value in shown.items()]
-            rate = self._bar.rate(trainer.global_step) * int(getattr(trainer.datamodule, "batch_size", 1))  # type: ignore[attr-defined]
+            rate = self._bar.rate * int(getattr(trainer.datamodule, "batch_size", 1))  # type: ignore[attr-defined]
             fits = self._bar.disable or self._bar.console.width >= 100  # else the time left would be cut
             note = "  ".join([*losses, *[f"{rate:.1f} scans/s"] * fits])
         self._bar.set(trainer.global_step, note)

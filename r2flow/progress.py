@@ -1,5 +1,6 @@
 """Progress bars."""
 
+import math
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -33,14 +34,14 @@ class Bar(Progress):
         super().__init__(
             TextColumn(doing), BarColumn(), MofNCompleteColumn(), TextColumn(unit), _Rate(), TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),
-            console=Console(stderr=True), transient=True, disable=not drawn,
+            console=Console(stderr=True, get_time=time.monotonic), speed_estimate_period=math.inf, transient=True,
+            disable=not drawn,
         )  # fmt: skip
         self._task = self.add_task(unit, total=total, note="")
         self._doing, self._unit, self.every = doing, unit, every
         self._share, self._spent = total / evaluations if evaluations else 0.0, 0
         self._lines = lines or (shown is None and not drawn)
         self._printed = time.monotonic()
-        self._first: tuple[float, float] | None = None  # units done at the first call, above 0 after resuming; its time
 
     def __call__(self, units: float = 1) -> None:
         self.advance(self._task, units)
@@ -60,19 +61,17 @@ class Bar(Progress):
             self.update(self._task, completed=done)
             self._print()
 
-    def rate(self, done: float) -> float:
-        """Units per second since the first call, for a number of finished units."""
-        now = time.monotonic()
-        before, began = self._first = self._first or (done, now)
-        return (done - before) / max(now - began, 1e-9)
+    @property
+    def rate(self) -> float:
+        """Units per second, without those finished at the first call, as by an earlier run."""
+        return self.tasks[0].speed or 0.0
 
     def _print(self) -> None:
         now, task = time.monotonic(), self.tasks[0]
-        rate = self.rate(task.completed)
-        if self._lines and rate > 0 and now - self._printed >= self.every:
-            self._printed, left = now, duration(max((task.total or 0) - task.completed, 0) / rate)
+        if self._lines and now - self._printed >= self.every and self.rate:
+            self._printed = now
             counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
-            line = f"{counted}  {rate:.2f}/s  {left} left  {task.fields['note']}"
+            line = f"{counted}  {self.rate:.2f}/s  {duration(task.time_remaining or 0)} left  {task.fields['note']}"
             print(line.rstrip(), file=sys.stderr, flush=True)
 
 
