@@ -71,17 +71,10 @@ class EMA(WeightAveraging):
         return before == step_idx or self._copies
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        self._device, self._end = trainer.strategy.root_device, trainer.max_steps - 1  # the module moves there later
         super().setup(trainer, pl_module, stage)
         if self.warmup_steps is None:
             self.warmup_steps = int(getattr(pl_module, "warmup_steps", 0))
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._end = trainer.max_steps - 1
-
-    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        # Built before the module moved to its device; otherwise every update would copy the weights to the CPU.
-        if self._average_model is not None:
-            self._average_model.to(pl_module.device)
 
 
 def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:
