@@ -11,7 +11,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from r2flow.errors import InputError, naming
+from r2flow.errors import InputError, check, naming
 
 
 @contextmanager
@@ -76,9 +76,23 @@ def read_json(path: Path) -> Any:
 
 @contextmanager
 def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Iterator[None]:
-    """Read a file in the block: its path is checked first, and every error becomes an InputError that names it."""
+    """Read a regular file of `least` to `largest` bytes: every error becomes an InputError that names it."""
     with telling(path):
-        refuse_unreadable(path, largest, what, least)
+        problem = ""
+        if path.is_symlink() and not path.exists():
+            problem = f"is a link to {path.readlink()}, which does not exist."
+        elif not path.exists():
+            problem = "does not exist. Is the path right?"
+        elif path.is_dir():
+            problem = f"is a folder, not a {what}; name a file in it."
+        elif not path.is_file():  # reading a pipe or a device may never end
+            problem = "is not a regular file."
+        elif (size := path.stat().st_size) < least:
+            problem = f"is empty ({size} bytes); fetch or write it again."
+        elif size > largest:
+            most = f"{largest / 2**30:g} GiB" if largest >= 2**30 else f"{largest / 2**20:g} MiB"
+            problem = f"has {size:,} bytes, too many for a {what} (at most {most}). Is it another file?"
+        check(not problem, f"{path} {problem}")
         yield
 
 
@@ -98,26 +112,6 @@ def telling(path: Path) -> Iterator[None]:
             raise
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160].rstrip('.')}"
         raise InputError(f"{path} is not a readable {path.suffix} file ({reason}). Is it damaged?") from error
-
-
-def refuse_unreadable(path: Path, largest: int, what: str = "file", least: int = 1) -> None:
-    """Refuse a path that is not a regular file of `least` to `largest` bytes, before it is opened."""
-    if path.is_symlink() and not path.exists():
-        problem = f"is a link to {path.readlink()}, which does not exist."
-    elif not path.exists():
-        problem = "does not exist. Is the path right?"
-    elif path.is_dir():
-        problem = f"is a folder, not a {what}; name a file in it."
-    elif not path.is_file():  # reading a pipe or a device may never end
-        problem = "is not a regular file."
-    elif (size := path.stat().st_size) < least:
-        problem = f"is empty ({size} bytes); fetch or write it again."
-    elif size > largest:
-        most = f"{largest / 2**30:g} GiB" if largest >= 2**30 else f"{largest / 2**20:g} MiB"
-        problem = f"has {size:,} bytes, too many for a {what} (at most {most}). Is it another file?"
-    else:
-        return
-    raise InputError(f"{path} {problem}")
 
 
 def _sync_folder(folder: Path) -> None:
