@@ -61,10 +61,6 @@ def read_config(run: str | Path) -> dict[str, Any] | None:
     return dict(config) or None
 
 
-def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
-    write_file(Path(run, CONFIG), yaml.safe_dump(dict(config), sort_keys=False))
-
-
 def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
     """Open a run folder: returns the newest readable checkpoint to resume from, or None for a new run."""
     for leftover in Path(run, FOLDER).glob(".*.part"):  # of killed writers
@@ -80,7 +76,7 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
                 f"another sampler by r2flow sample {run} --sampler NAME --steps N."
             )
     if old != dict(config) or not Path(run, CONFIG).is_file():  # free keys may have changed
-        write_config(run, config)
+        write_file(Path(run, CONFIG), yaml.safe_dump(dict(config), sort_keys=False))
     return last
 
 

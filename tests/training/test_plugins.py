@@ -16,7 +16,7 @@ from r2flow.plugins import load_plugins, made_with, take_plugins
 from r2flow.registry import Registry
 from r2flow.reports.compare import read_runs
 from r2flow.runs.composing import REGISTRIES, choices, compose
-from r2flow.runs.folder import write_config
+from r2flow.runs.folder import open_run
 from r2flow.stages import STAGES
 from r2flow.training import build
 from tests.extension.conftest import FAMILIES, GAN, TINY, loaded
@@ -45,7 +45,7 @@ def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path):
     plugins._loaded.clear()  # of other tests of this process
     load_plugins([str(deep)])
     run = build(compose(["backbone=deep", f"run_dir={tmp_path}/run"]))
-    write_config(run.folder, run.config)
+    open_run(run.folder, run.config)
     save_checkpoint(Checkpoint(run.stage.generator, run.config), tmp_path / "deep.safetensors")
     plugins._loaded.clear()
     del BACKBONES._entries["deep"]
