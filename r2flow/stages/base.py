@@ -139,10 +139,9 @@ class Stage(L.LightningModule):
             self.manual_backward(loss)
         average_gradients(parameter for group in optimizer.param_groups for parameter in group["params"])
         optimizer.step()
-        schedules = self.lr_schedulers() or []
-        for schedule in schedules if isinstance(schedules, list) else [schedules]:
-            if schedule.optimizer is optimizer.optimizer:
-                schedule.step()  # type: ignore[call-arg]
+        for config in self.trainer.lr_scheduler_configs:
+            if config.scheduler.optimizer is optimizer.optimizer:
+                config.scheduler.step()  # type: ignore[call-arg]
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         if not self.automatic_optimization:  # float16 gradients are unscaled only now

@@ -39,10 +39,8 @@ class Muon(torch.optim.AdamW):
                 loss = closure()
         groups = self.param_groups
         self.param_groups = [group for group in groups if group["momentum"] is None]
-        try:
-            super().step()
-        finally:
-            self.param_groups = groups
+        super().step()
+        self.param_groups = groups
         for group in groups:
             if group["momentum"] is not None:
                 for p in group["params"]:
