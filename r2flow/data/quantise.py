@@ -10,7 +10,7 @@ STEP = 1.9e-3  # metres: half a step plus float32's rounding is below a millimet
 KNEE = 65.0  # metres: limit of the fine step, if the sensor's range is too long for a single step
 
 # Reflectance levels of data sets: KITTI-360 n / 256, KITTI n / 100, others a byte n / 255.
-KNOWN_LEVELS = (256, 100, 255)
+KNOWN_LEVELS = (256, 100)
 OTHER_LEVELS = 255
 ROUNDING = 1e-6  # some KITTI files store n * 0.01 in float32 instead of n / 100: 0.20000002
 
@@ -48,12 +48,10 @@ def reflectance_codes(levels: int) -> Codes:
     return Codes([0, highest / levels], [0, highest], np.uint8)
 
 
-def fits(reflectance: np.ndarray, levels: int) -> bool:
-    """Whether every value is a multiple of 1 / levels, up to rounding."""
-    codes = reflectance_codes(levels)
-    return bool(np.abs(codes.values[codes.encode(reflectance)] - reflectance).max(initial=0) <= ROUNDING)
-
-
 def find_levels(reflectance: np.ndarray) -> int:
-    """The number of levels n for which all values are multiples of 1 / n; 255 if no known n fits."""
-    return next((n for n in KNOWN_LEVELS if fits(reflectance, n)), OTHER_LEVELS)
+    """The number of levels n for which all values are multiples of 1 / n, up to rounding; 255 if no known n fits."""
+    for levels in KNOWN_LEVELS:
+        codes = reflectance_codes(levels)
+        if np.abs(codes.values[codes.encode(reflectance)] - reflectance).max(initial=0) <= ROUNDING:
+            return levels
+    return OTHER_LEVELS
