@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import math
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -48,7 +47,6 @@ class ScanDataModule(L.LightningDataModule):
         self.batch_size = self.options.batch_size
         self.parts = self.options.sets
         self.sensors = [sensor if part.sensor is None else build_sensor(**part.sensor) for part in self.parts]
-        self.held_out_sensors = self.sensors if self.options.held_out is None else [sensor]
         self.augment = construct("data.augment", Augmentation, self.options.augment)
         self.validation = self.options.validation_options
         self.further: Further | None = None
@@ -82,10 +80,10 @@ class ScanDataModule(L.LightningDataModule):
         """Read the scans into memory if they fit; a second call reads nothing."""
         self.setup()
         if self.scans is not None:
-            self.scans = self._kept(self.scans, "scans next to the pairs", [self.sensor])
+            self.scans = self._kept(self.scans, "scans next to the pairs")
         if isinstance(self.training_source, Mixture) and isinstance(self.validation_source, Mixture):
-            self.training_source = self._kept(self.training_source, "training scans", self.sensors)
-            self.validation_source = self._kept(self.validation_source, "validation scans", self.held_out_sensors)
+            self.training_source = self._kept(self.training_source, "training scans")
+            self.validation_source = self._kept(self.validation_source, "validation scans")
 
     def sources(self) -> tuple[Mixture, Mixture]:
         """The training and the validation scans, not yet read.
@@ -141,22 +139,16 @@ class ScanDataModule(L.LightningDataModule):
             texts.append(f"{len(self.opened[0])} of {len(self.names)} scans, {digest}")
         return "; ".join(texts)
 
-    def _kept(self, source: Mixture, what: str, sensors: Sequence[Sensor]) -> Mixture:
+    def _kept(self, source: Mixture, what: str) -> Mixture:
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = [*source.parts]
-        shapes = [(len(part), self.encoding.channels, *own.shape) for part, own in zip(parts, sensors, strict=True)]
-        size = sum(math.prod(shape) * 4 for part, shape in zip(parts, shapes, strict=True) if part.slow)
-        if size > self.options.memory_gib * 2**30:
+        firsts = {i: part[0] for i, part in enumerate(parts) if part.slow and len(part)}
+        if sum(len(parts[i]) * first.nbytes for i, first in firsts.items()) > self.options.memory_gib * 2**30:
             return source
-        for i, part in enumerate(parts):
-            if part.slow and len(part):
-                images = np.empty(shapes[i], np.float32)
-                for number in track(range(len(part)), f"reading {what}", least=16):
-                    image = part[number]
-                    found = np.shape(image)
-                    check(found == shapes[i][1:], f"{part.names[number]}: an image of {shapes[i][1:]}, found {found}.")
-                    images[number] = image  # which would broadcast one channel
-                parts[i] = InMemory(images, part.names)
+        for i, first in firsts.items():
+            images = map(parts[i].__getitem__, track(range(len(parts[i])), f"reading {what}", least=16))
+            stored = np.fromiter(images, np.dtype((np.float32, first.shape)), len(parts[i]))
+            parts[i] = InMemory(stored, parts[i].names)
         return Mixture(parts)
 
     def check_run(self, ranks: int, accumulated: int) -> None:
@@ -198,7 +190,7 @@ class ScanDataModule(L.LightningDataModule):
             scans = FlowDataset(self.scans, self.encoding, self.seed, "beside", None, self.noise_shape)
             return PairDataset(source, self.seed, purpose, scans)
         augment = self.augment if purpose == "training" else None
-        sensors = self.sensors if purpose == "training" else self.held_out_sensors
+        sensors = self.sensors if purpose == "training" or self.options.held_out is None else [self.sensor]
         return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further, sensors)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:

@@ -59,7 +59,10 @@ class FlowDataset(Dataset[Item]):
         u = torch.tensor(draw.random(dtype=np.float32))
         image = self.source[index]
         encoding = self.encodings[self.source.locate(index)[0]]
-        if wrong := wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range)):
+        wrong = wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range))
+        if image.shape != encoding.shape:
+            wrong = f"an image of {encoding.shape}, found {image.shape}"
+        if wrong:
             raise InputError(f"{self.source.names[index]}: {wrong}.")
         if self.augment:
             image = self.augment(image, self.seed, k)
