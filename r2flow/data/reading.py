@@ -130,30 +130,23 @@ def estimated_scale(path: str | Path, scans: Iterable[Points]) -> float:
     return scale
 
 
-def scale_within(path: str | Path, values: np.ndarray, scale: float) -> float:
-    """`scale`, or, with a warning, 1 for stored fractions of 1, which are not values of a common larger scale."""
-    if scale in FULL_REFLECTANCE[1:] and values.max(initial=0) <= 1 and (values % 1).any():
-        warn_odd(Path(path), f"reflectance is not divided by {scale:g}: its values are fractions of 1")
-        return 1.0
-    return scale
-
-
 def scaled_reflectance(path: str | Path, points: Points, scale: float | None, strict: bool = True) -> np.ndarray:
     """The reflectance of points, scaled to [0, 1]; None estimates the scale. Unless `strict`, all beyond is clipped."""
     if points.reflectance is None:
         raise _no_reflectance(path)
-    highest = float(np.nan_to_num(points.reflectance).max(initial=0))
-    scale = scale_within(path, points.reflectance, estimated_scale(path, [points]) if scale is None else scale)
+    least, highest = float(points.reflectance.min(initial=0)), float(points.reflectance.max(initial=0))
+    scale = estimated_scale(path, [points]) if scale is None else scale
+    if scale in FULL_REFLECTANCE[1:] and highest <= 1 and (points.reflectance % 1).any():
+        warn_odd(Path(path), f"reflectance is not divided by {scale:g}: its values are fractions of 1")
+        scale = 1.0
     if 0 < highest < FAINT * scale:
         warn_odd(Path(path), DARK)
+    check(not strict or least >= 0, f"{path}: reflectance must not be negative, found {least:g}; correct the file.")
     scaled = points.reflectance / np.float32(scale)
-    least = float(points.reflectance.min(initial=0))
-    check(not strict or not least < 0, f"{path}: reflectance must not be negative, found {least:g}; correct the file.")
-    # NaN compares false and is refused, too.
-    if strict and not (np.count_nonzero(scaled > 1.001) <= OUTLIERS * len(scaled) and least >= 0):
+    if strict and np.count_nonzero(scaled > 1.001) > OUTLIERS * len(scaled):
         full = max(full_reflectance([points]) or 0, 255)
         raise InputError(
-            f"{path}: reflectance must lie in [0, {scale:g}], found {points.reflectance.min():g} to {highest:g}. "
+            f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
             f"Give the value of full reflectance, often {full:g}: data.reading.reflectance_scale={full:g}, that of "
             f"its part of data.parts, or --reflectance-scale {full:g}."
         )
@@ -174,10 +167,9 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
         )
     if len(image) < channels:
         raise _no_reflectance(path)
-    return _within_limits(path, image[:channels], reading) if reading.within_limits else image[:channels]
-
-
-def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarray:
+    image = image[:channels]
+    if not reading.within_limits:
+        return image
     nearest, farthest = reading.sensor.min_range, reading.sensor.max_range
     seen = (image[0] >= nearest) & (image[0] <= farthest)
     if not seen.any() and reading.on_bad_scan != "empty":

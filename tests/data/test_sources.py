@@ -45,7 +45,7 @@ def test_a_scan_out_of_range_says_its_numbers(tmp_path: Path):
 
 
 def test_reflectance_out_of_scale_names_the_key(tmp_path: Path):
-    words = r"in \[0, 1\], found {0} to {0}\..*reflectance_scale={1},"
+    words = r"in \[0, 1\], found up to {0}\..*reflectance_scale={1},"
     for stored, said in (-1, "negative, found -1;"), (4e4, words.format(40000, 65535)), (204, words.format(204, 255)):
         write_points(tmp_path / "scan.ply", np.array([[10, 0, -1]]), np.array([stored]))
         with pytest.raises(InputError, match=said):
