@@ -6,7 +6,6 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
 from pathlib import Path
 
 from r2flow.data.options import SourceOptions
@@ -110,11 +109,12 @@ class Layout(SourceKind):
                 "unfolded rows are the sensor's rings, which are not evenly spaced: sensor=hdl64e_rings has their "
                 "elevations, sensor=hdl64e is up to 6 degrees off"
             )
-        selected = self.find_drives(options)
-        drives = {drive.name: span for drive, span in zip(selected, spans_of(selected), strict=True)}
+        paths, drives = list[str](), dict[str, range]()
+        for drive in self.find_drives(options):
+            drives[drive.name] = range(len(paths), len(paths) + len(drive.scans))
+            paths += drive.scans
         about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
         root = Path(options.folder).expanduser()  # the prefix of all paths found in it
-        paths = [path for drive in selected for path in drive.scans]
         warn_of_other_sensor(paths, reading, root)
         return ScanFiles(paths, reading, root, drives, about)
 
@@ -213,12 +213,6 @@ def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
     images_last = sorted(paths, key=lambda path: path.lower().endswith(".npy"))
     kept = set({path[: len(path) - len(scan_ending(path))]: path for path in images_last}.values())
     return tuple(path for path in paths if path in kept)
-
-
-def spans_of(drives: Sequence[Drive]) -> list[range]:
-    """The numbers of each drive's scans in the concatenation of all drives."""
-    ends = accumulate(len(drive.scans) for drive in drives)
-    return [range(end - len(drive.scans), end) for drive, end in zip(drives, ends, strict=True)]
 
 
 def named_drive(drives: list[Drive], name: str) -> Drive:

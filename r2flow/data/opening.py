@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from r2flow.data import layouts
-from r2flow.data.layouts import Drive, Layout, SourceKind, spans_of
+from r2flow.data.layouts import Drive, Layout, SourceKind
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED, SourceOptions
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
@@ -58,8 +58,8 @@ class Prepared(SourceKind):
             parts = sorted({part for drive in stored if (part := kind.split_of(drive.name))})
             if len(parts) > 1:
                 log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(parts))
-        spans = dict(zip(map(id, stored), spans_of(stored), strict=True))
-        numbers = [number for drive in kind.chosen(stored, split, drives) for number in spans[id(drive)]]
+        place = {name: number for number, name in enumerate(store.names)}
+        numbers = [place[name] for drive in kind.chosen(stored, split, drives) for name in drive.scans]
         return PreparedScans(store, numbers, bool(reading.reflectance))
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
