@@ -203,7 +203,9 @@ class PreparedScans(ScanSource):
             except FileNotFoundError:
                 raise InputError(f"{store.folder} is not finished: the same r2flow prepare command resumes.") from None
             except (Damaged, KeyError) as error:
-                raise self._damaged(shard, error) from None
+                path = store.files(shard)[0]
+                again = "The same r2flow prepare command makes it again."
+                raise InputError(f"{path} is damaged ({error}). {again}") from None
             rows = [number for number in numbers_of_shard if number not in left_out]
             entries |= {number: (number, shard, row) for row, number in enumerate(rows)}
         #: Rows of (number in the data set, shard, row of the shard).
@@ -255,19 +257,11 @@ class PreparedScans(ScanSource):
     def __getitem__(self, index: int) -> np.ndarray:
         _, shard, row = map(int, self.rows[index])
         codes = [*self.store.codes.items()][: 1 + self.reflectance]
-        try:
-            if shard not in self._shards:
-                self.store.head(shard)  # checks the file's length and recipe
-                file = safe_open(self.store.files(shard)[0], framework="numpy")
-                self._shards[shard] = [file.get_slice(name) for name, _ in codes]
-        except (Damaged, OSError) as error:
-            raise self._damaged(shard, error) from None
+        if shard not in self._shards:
+            file = safe_open(self.store.files(shard)[0], framework="numpy")
+            self._shards[shard] = [file.get_slice(name) for name, _ in codes]
         stored = [image[row : row + 1][0] for image in self._shards[shard]]
         # No index is out of bounds; mode="clip" only skips the bounds check.
         return np.stack(
             [np.take(coder.values, code, mode="clip") for (_, coder), code in zip(codes, stored, strict=True)]
         )
-
-    def _damaged(self, shard: int, error: Exception) -> InputError:
-        path = self.store.files(shard)[0]
-        return InputError(f"{path} is damaged ({error}). The same r2flow prepare command makes it again.")
