@@ -67,22 +67,25 @@ def _starts(xyz: np.ndarray) -> np.ndarray:
 
 def rows_from_field(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Rows from a file's ring numbers, (N,) int64, which count from 0 or 1, from the top, the bottom or by laser."""
-    rows = sensor.shape[0]
-    if len(ring) and ring.min() > 0 and (ring.max() == rows or _from_one(xyz, ring, sensor)):
-        ring = ring - 1
-    lasers = int(ring.max(initial=0)) + 1
+    rows, first, highest = sensor.shape[0], 0, int(ring.max(initial=0))
+    if len(ring) and ring.min() > 0 and highest <= rows:
+        # Elevations decide if neither the first nor the last ring has a return.
+        means = _means(xyz, ring, rows + 1)
+        from_0, from_1 = (_misfit(part, best_order(part, sensor)[0], sensor) for part in (means[:-1], means[1:]))
+        first = int(highest == rows or from_1 < from_0 / 2)
+    lasers = highest - first + 1
     if not rows / 2 <= lasers <= rows:
         raise InputError(
             f"the scan has ring numbers up to {lasers - 1}, but sensor '{sensor.name}' has {rows} rows. Is it this "
             "sensor's? If so, use the spherical projection, which finds rows by elevation."
         )
-    order, share = best_order(_means(xyz, ring, rows), sensor)
+    order, share = best_order(_means(xyz, ring - first, rows), sensor)
     if share < SURE:
         raise InputError(
             f"the scan's ring numbers follow neither the elevations of its points nor the firing order of sensor "
             f"'{sensor.name}'. Give the sensor its `firing`, or use the spherical projection."
         )
-    return order[ring]
+    return order[ring - first]
 
 
 def _means(xyz: np.ndarray, ring: np.ndarray, rows: int) -> np.ndarray:
@@ -93,16 +96,6 @@ def _means(xyz: np.ndarray, ring: np.ndarray, rows: int) -> np.ndarray:
     total = np.bincount(ring[seen], elevation[seen], minlength=rows)
     with np.errstate(invalid="ignore"):
         return total / count
-
-
-def _from_one(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> bool:
-    """Whether rings are counted from 1, by their elevations, if neither the first nor the last ring has a return."""
-    rows = sensor.shape[0]
-    if ring.max() > rows:
-        return False
-    means = _means(xyz, ring, rows + 1)
-    from_0, from_1 = (_misfit(part, best_order(part, sensor)[0], sensor) for part in (means[:-1], means[1:]))
-    return from_1 < from_0 / 2
 
 
 def _misfit(elevation: np.ndarray, order: np.ndarray, sensor: Sensor) -> float:
