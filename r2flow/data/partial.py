@@ -13,12 +13,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, scale_of
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.errors import InputError, check, naming
+from r2flow.lidar.encoding import FAR, wrong_with
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -210,13 +212,10 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     stored = read_numbers(path)
     other = f"{path} must be a range image of floats (2 or 1, H, W), found {stored.dtype} {stored.shape}."
-    check(stored.dtype.kind == "f" and len(stored) in (1, 2), other)
+    check(stored.dtype.kind == "f" and len(stored) in (1, 2) and stored.size, other)
+    wrong = wrong_with(torch.from_numpy(stored.astype(np.float32)), max(FAR, target.max_range))
+    check(not wrong, f"{path}: {wrong}; --mask FILE.npy names what was not measured.")
     r = stored[0]
-    if not (stored >= 0).all() or not (stored[1:] <= 1).all() or not np.isfinite(stored).all():
-        raise InputError(
-            f"{path} must hold ranges in metres, of 0 or more, and reflectances of [0, 1]. Divide the reflectances by "
-            "what means full reflectance; give 0 for NaN and infinity, and --mask FILE.npy for what was not measured."
-        )
     within = not r.any() or ((r >= target.min_range) & (r <= target.max_range)).any()
     check(within, f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they in m?")
     image = read_range_image(path)
