@@ -21,6 +21,7 @@ from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.data.opening import find_drives
 from r2flow.data.prepared import plan_files, prepare
 from r2flow.data.reading import Reading
+from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -106,6 +107,15 @@ def memory_below(size: int) -> Iterator[None]:
         assert tracemalloc.get_traced_memory()[1] < size
     finally:
         tracemalloc.stop()
+
+
+@contextlib.contextmanager
+def refused(*words: object) -> Iterator[None]:
+    """The block ends in one line for the user, which holds these words."""
+    with pytest.raises(InputError) as caught:
+        yield
+    assert "\n" not in str(caught.value)
+    assert all(str(word) in str(caught.value) for word in words), caught.value
 
 
 def quiet_trainer(folder: Path, **options: Any) -> L.Trainer:

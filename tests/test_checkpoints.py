@@ -16,7 +16,7 @@ from r2flow.generators import build_generator
 from r2flow.lidar.encoding import build_space
 from r2flow.model.checkpoint import Checkpoint, check_weights, load_checkpoint, save_checkpoint
 from r2flow.model.published import published_config
-from tests.conftest import CONFIG, Trap, small_disk
+from tests.conftest import CONFIG, Trap, refused, small_disk
 
 
 def test_the_averaged_weights_are_the_model(saved):
@@ -116,10 +116,8 @@ def test_entries_of_another_kind_are_refused_in_one_line(saved, changed: dict):
     """As {config, state_dict} of another program has them."""
     path, _ = saved
     torch.save({**torch.load(path, weights_only=True), **changed}, path)
-    with pytest.raises(InputError) as refused:
+    with refused(path):
         load_checkpoint(path)
-    assert str(path) in str(refused.value)
-    assert len(str(refused.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize("kind", [torch.int8, torch.complex64, "sparse", math.nan, -math.inf])

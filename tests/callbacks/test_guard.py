@@ -15,7 +15,7 @@ from r2flow.callbacks.guard import Guard
 from r2flow.data.loader import Permutations, RunLoader, RunSampler
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
-from tests.conftest import quiet_trainer
+from tests.conftest import quiet_trainer, refused
 
 NAN, INF = float("nan"), float("inf")
 
@@ -104,11 +104,7 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
     (tmp_path / "checkpoints" / "step-00000001.ckpt").touch()
     order = [int(s) for epoch in range(2) for s in noise.generator(0, "shuffle", epoch).permutation(6)]
     loader = RunLoader(Numbered({order[5]} - set(order[:4])), batch_sampler=RunSampler(Permutations(6, 0), 2, 40))
-    with pytest.raises(InputError) as caught:
-        fit(Line(), loader, tmp_path, Guard(tmp_path, skips=1), accumulate_grad_batches=2)
-    said = str(caught.value)
-    assert "\n" not in said
-    for words in (
+    with refused(
         "stopped at step 2: the step was skipped",
         "Loss nan",
         "gradient of inner.weight non-finite first, 4 of 4",
@@ -116,7 +112,7 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
         "images k = 4 to 7, scans " + ", ".join(map(str, order[4:8])),
         f"last good checkpoint is {tmp_path}/checkpoints/step-00000001.ckpt",
     ):
-        assert words in said, (words, said)
+        fit(Line(), loader, tmp_path, Guard(tmp_path, skips=1), accumulate_grad_batches=2)
 
 
 def half(scale: float) -> MixedPrecision:
@@ -153,11 +149,9 @@ def test_broken_weights_are_never_written(tmp_path, averaged: bool):
         trainer.save_checkpoint(tmp_path / f"checkpoints/step-{trainer.global_step:08d}.ckpt")
 
     callbacks = [EMA(every=1)] * averaged + [Guard(tmp_path), LambdaCallback(on_train_batch_end=spoil)]
-    with pytest.raises(InputError) as caught:
+    stopped = "stopped at step 3: the weights are no longer finite (inner.bias first, 1 of 4)"
+    with refused(stopped, "step-00000002.ckpt, from which the same command resumes"):
         fit(Line(), batches(*[1.0] * 9), tmp_path, *callbacks)
-    said = str(caught.value)
-    assert "stopped at step 3: the weights are no longer finite (inner.bias first, 1 of 4)" in said
-    assert "step-00000002.ckpt, from which the same command resumes" in said
     assert [p.name for p in checkpoints_of(tmp_path)] == ["step-00000002.ckpt", "step-00000001.ckpt"]
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import ELSEWHERE, NoPointsError, read_points, write_points
+from tests.conftest import refused
 from tests.lidar.conftest import assert_points
 
 DRAW = np.random.default_rng(3)
@@ -212,9 +213,8 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("1 2 \xe9\n", "convert"),
     ):
         (tmp_path / "a.txt").write_text(text, encoding="latin-1")
-        with pytest.raises(InputError, match=words) as caught:
+        with refused(words):
             read_points(tmp_path / "a.txt")
-        assert "\n" not in str(caught.value)
 
 
 def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.errors import InputError
 from r2flow.generators import Generated, build_generator
 from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
 from r2flow.lidar.sensors import SENSORS
@@ -19,6 +18,7 @@ from r2flow.samplers import build_sampler
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
 from tests.conftest import CONFIG as FLOW
+from tests.conftest import refused
 from tests.simulator.test_folder import write_folder
 from tests.stages.test_transfer_flow import CONFIG
 
@@ -81,9 +81,8 @@ def test_what_is_hidden_depends_on_the_scan_s_number_alone(checkpoint):
 
 @pytest.mark.parametrize("task", ["rows:1", "points:0", "rain:2", "nothing"])
 def test_a_task_that_is_none_is_one_line(checkpoint, task):
-    with pytest.raises(InputError) as caught:
+    with refused():
         measured_by(task, checkpoint.sensor, 0)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_verb_writes_a_page_with_its_picture(r2flow, checkpoint, tmp_path: Path):
