@@ -140,7 +140,6 @@ OWN = build_sampler("adams3", steps=16, grid="power:1.75")
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [
-        ({"steps": 2}, build_sampler("chord", steps=2)),
         ({"steps": 15}, build_sampler("chord", steps=15)),
         ({"steps": 2, "grid": "power:3"}, build_sampler("chord", steps=2, grid="power:3")),
         ({"steps": 16}, OWN),

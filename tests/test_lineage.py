@@ -122,7 +122,6 @@ def reading_in(data, root: str | None = None, of_sensor: float | None = 0.012):
         ("folder", "scans", 255.0, 255.0),
         ("folder", "drawn", None, 1.0),
         ("folder", "drawn", 255.0, 1.0),
-        ("folder", "simulated", None, 1.0),
         ("kitti_raw", "scans", None, 1.0),
         ("nuscenes", "scans", None, 255.0),
     ],
@@ -130,8 +129,7 @@ def reading_in(data, root: str | None = None, of_sensor: float | None = 0.012):
 def test_full_reflectance_is_what_was_given_else_the_sensors_and_one_in_what_r2flow_wrote(
     tmp_path: Path, name, root, given, expected
 ):
-    for folder in ("drawn", "simulated"):
-        Store(tmp_path / folder, "samples", {}).begin()
+    Store(tmp_path / "drawn", "samples", {}).begin()
     (tmp_path / "scans").mkdir()
     (tmp_path / "scans" / "manifest.json").write_text('{"version": 1}')  # of a data set
     data = {"name": name, "reading": {"reflectance_scale": given}}

@@ -39,15 +39,12 @@ sample run -o out --sampler dopri5 --steps 50 # steps
 sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
-sample run -o out -o # '-o' requires an argument
 sample '' -o out # an argument is empty
 info nowhere
-info run --jsn
 sample run -o out --steps 10000000 # 1,000,000
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
 export run --to onx # no export format named 'onx'
-export run --what all
 export run --to safetensors --what network # --what network is for
 export run --what network --steps 4 # takes no sampler: leave sampler, steps
 export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx
@@ -84,7 +81,6 @@ prepare scans/000000.bin -o out
 prepare scans -o out --split train # no split named 'train'
 prepare scans -o out --drives 77
 pairs run --num 1 --seed 99999999999999999999
-weights --add
 weights --add rangenet53 file.txt
 evaluate scans # nothing to compare with
 evaluate scans scans --generated-split train # no split named 'train'

@@ -45,13 +45,9 @@ def test_masks_measure_what_they_say():
     assert parse_mask("rows:4+sector:-45,45")(WHOLE, draws()).sum() == 4 * 48
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "row:4", "rows:0", "rows:1.5", "rows:4,-1", "rows:nan", "rows:two", "rows", "random:1.5", "points:-1",
-        "sector:5", "sector:5,5", "sector:1,2,3", "sector:nan,5", "no.npy",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("text", [
+    "row:4", "rows:0", "rows:4,-1", "rows:nan", "rows", "random:1.5", "sector:5", "sector:5,5", "sector:nan,5", "a.npy",
+])  # fmt: skip
 def test_what_is_no_mask_is_one_line(text):
     with refused(text.partition(",")[0].partition(":")[0]):
         parse_mask(text)(WHOLE, draws())

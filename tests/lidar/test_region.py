@@ -45,7 +45,6 @@ def test_the_whole_image_keeps_its_order():
     ("sector", "rows", "words"),
     [
         ((10, 10), None, "narrower than a column"),
-        ((0, -360 + 4.9), None, "narrower than a column"),
         ((math.nan, 10), None, "degrees"),
         ((0, 720), None, "within -360 to 360"),
         (None, (5, 4), "FIRST-LAST within 0-15"),
