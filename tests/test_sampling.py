@@ -360,7 +360,6 @@ def endless(network: nn.Module, count: int) -> None:
     [
         (TINY, build_sampler("euler", steps=2)),
         (TINY, build_sampler("sde", steps=2)),
-        ([*TINY, "+generator.name=flow_map"], build_sampler("jump", steps=1)),
         ([*TINY, "+generator.name=flow_map"], build_sampler("jump", steps=3)),
         ([*TINY, "+generator.name=flow_map"], build_sampler("renoise", steps=2)),
         (["experiment=r2dm", "size=small"], build_sampler("ddpm", steps=2)),
