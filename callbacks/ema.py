@@ -60,7 +60,7 @@ class EMA(WeightAveraging):
         return 0.0 if self._copies else self._decay_at(self._step, self.warmup_steps or 0, self.decay)
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
-        return average + (1 - self._decay()) * (weight - average)
+        return average.lerp(weight, 1 - self._decay())
 
     def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
         if step_idx is None:
@@ -73,6 +73,8 @@ class EMA(WeightAveraging):
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         self._device, self._end = trainer.strategy.root_device, trainer.max_steps - 1  # the module moves there later
         super().setup(trainer, pl_module, stage)
+        if self._average_model is not None:
+            self._average_model.n_averaged.fill_(1)  # of 0, the base class copies the weights, whatever the rule
         if self.warmup_steps is None:
             self.warmup_steps = int(getattr(pl_module, "warmup_steps", 0))
 
