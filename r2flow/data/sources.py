@@ -321,5 +321,5 @@ def holdout_block(count: int, share: float, starts: Sequence[int] = ()) -> tuple
     """
     held = min(math.ceil(count * share), count - 1)
     whole = [count - start for start in starts if start > 0 and abs(count - start - held) <= held / 2]
-    held = min(whole, key=lambda size: abs(size - held), default=held) if held else 0
+    held = min(whole, key=lambda size: abs(size - held), default=held)
     return range(count - held), range(count - held, count)
