@@ -1,15 +1,32 @@
-"""s(t) of small variances, of broken paths and of networks; test_curvature_report.py has its values."""
+"""s(t) against the exact paths of a Gaussian flow and of a rotation."""
 
 import math
 
 import pytest
 import torch
 
-from r2flow.flow.problems import Rotating
+from r2flow.flow.problems import Gaussian, Rotating
 from r2flow.flow.straightness import straightness
 
-ROTATION = Rotating(turns=1 / math.pi)
+GAUSSIAN, ROTATION = Gaussian(), Rotating(turns=1 / math.pi)
 X_0 = torch.randn(3, 2, 2, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("problem", [GAUSSIAN, ROTATION], ids=["gaussian", "rotation"])
+def test_s_is_that_of_the_exact_path(problem):
+    chord = problem.solution(X_0, 1.0) - X_0
+    off = []
+    for steps in (512, 1024):
+        found = straightness(problem, X_0, steps=steps)
+        assert found.s.shape == (3, steps)
+        velocities = torch.stack([problem(t, problem.solution(X_0, t)) for t in found.t.double()], 1)
+        exact = (chord[:, None] - velocities).square().flatten(2).sum(2)
+        off.append((found.s - exact).abs().max() / exact.max())
+    # Euler's path is off by O(1/n); halving the step halves the difference.
+    assert off[1] < 5e-3
+    assert math.log2(off[0] / off[1]) == pytest.approx(1, abs=0.1)
+    lengths = chord.square().flatten(1).sum(1)
+    torch.testing.assert_close(found.squared_length, lengths, rtol=1e-2, atol=0)
 
 
 def test_a_small_variance_survives_float32():
