@@ -72,6 +72,7 @@ class EMA(WeightAveraging):
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         self._device, self._end = trainer.strategy.root_device, trainer.max_steps - 1  # the module moves there later
+        trainer.precision_plugin.convert_module(pl_module)  # as the strategy does later: the average has its type
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
             self._average_model.n_averaged.fill_(1)  # of 0, the base class copies the weights, whatever the rule

@@ -254,9 +254,11 @@ def test_too_few_scans_for_a_share_of_the_validation_are_one_line(train: Run):
     assert "trainer: You requested" in train("trainer.limit_val_batches=0.1", check=False).refusal
 
 
-def test_mixed_precision_trains(train: Run, tmp_path: Path):
-    train("trainer.precision=bf16-mixed", "trainer.max_steps=4", "name=half")
-    assert all(v.dtype == torch.float32 for v in weights(tmp_path / "runs" / "half")[1].values())
+@pytest.mark.parametrize(("precision", "kind"), [("bf16-mixed", torch.float32), ("64-true", torch.float64)])
+def test_the_average_has_the_precision_of_the_weights(train: Run, tmp_path: Path, precision, kind):
+    train(f"trainer.precision={precision}", "trainer.max_steps=4", "name=other")
+    _, average = weights(tmp_path / "runs" / "other")
+    assert {v.dtype for name, v in average.items() if name.endswith("weight")} == {kind}
 
 
 def test_fast_dev_run_leaves_folders_as_they_were(train: Run, copied: Path, tmp_path: Path):
