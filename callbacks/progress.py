@@ -37,9 +37,9 @@ class Progress(ProgressBar):
         if now - self._noted >= min(self.seconds, 1):  # reading a loss waits for the GPU
             self._noted, shown = now, trainer.progress_bar_metrics  # logged with prog_bar=True
             losses = [f"{key.removeprefix('train/')} {value:.4f}" for key, value in shown.items()]
-            rate = self._bar.rate * int(getattr(trainer.datamodule, "batch_size", 1))  # type: ignore[attr-defined]
+            rate = (self._bar.tasks[0].speed or 0.0) * int(getattr(trainer.datamodule, "batch_size", 1))  # type: ignore[attr-defined]
             fits = self._bar.disable or self._bar.console.width >= 100  # else the time left would be cut
-            note = "  ".join([*losses, *[f"{rate:.1f} scans/s"] * fits])
+            note = "  ".join([*losses, *[f"{rate:.1f} scans/s"] * bool(fits and rate)])
         self._bar.set(trainer.global_step, note)
 
     def on_train_end(self, trainer: L.Trainer, *given: Any) -> None:

@@ -13,14 +13,12 @@ from rich.text import Text
 
 T = TypeVar("T")
 
-EVERY = 30  # seconds between lines without a terminal, as in a cluster's log
-
 
 class Bar(Progress):
     """A progress bar with rate and time left, on standard error.
 
     Args:
-        shown: Whether to draw it; default: on a terminal, elsewhere a line every `EVERY` seconds.
+        shown: Whether to draw it; default: on a terminal; elsewhere, as in a log, lines are printed.
         lines: Print lines also on a terminal, since bars of several processes would overwrite each other.
         evaluations: Network evaluations of all units, for `evaluated`; 0: unknown, as for adaptive solvers.
         every: Seconds between lines.
@@ -28,7 +26,7 @@ class Bar(Progress):
 
     def __init__(
         self, doing: str, total: int, unit: str = "scans", shown: bool | None = None, lines: bool = False,
-        evaluations: int = 0, every: float = EVERY,
+        evaluations: int = 0, every: float = 30,
     ) -> None:  # fmt: skip
         drawn = not lines and (sys.stderr is not None and sys.stderr.isatty() if shown is None else shown)
         super().__init__(
@@ -58,20 +56,14 @@ class Bar(Progress):
         if note is not None:
             self.update(self._task, note=note)
         if done is not None:
-            self.update(self._task, completed=done)
-            self._print()
-
-    @property
-    def rate(self) -> float:
-        """Units per second, without those finished at the first call, as by an earlier run."""
-        return self.tasks[0].speed or 0.0
+            self(done - self.tasks[0].completed)
 
     def _print(self) -> None:
         now, task = time.monotonic(), self.tasks[0]
-        if self._lines and now - self._printed >= self.every and self.rate:
+        if self._lines and now - self._printed >= self.every and task.speed:
             self._printed = now
             counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
-            line = f"{counted}  {self.rate:.2f}/s  {duration(task.time_remaining or 0)} left  {task.fields['note']}"
+            line = f"{counted}  {task.speed:.2f}/s  {duration(task.time_remaining or 0)} left  {task.fields['note']}"
             print(line.rstrip(), file=sys.stderr, flush=True)
 
 
