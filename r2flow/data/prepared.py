@@ -27,6 +27,7 @@ from r2flow.data.quantise import OTHER_LEVELS, find_levels, range_codes, reflect
 from r2flow.data.reading import Reading, lacks_reflectance, read_image
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError, check
+from r2flow.files import telling
 from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, read_manifest
 
 log = logging.getLogger(__name__)
@@ -204,8 +205,7 @@ class PreparedScans(ScanSource):
                 raise InputError(f"{store.folder} is not finished: the same r2flow prepare command resumes.") from None
             except (Damaged, KeyError) as error:
                 path = store.files(shard)[0]
-                again = "The same r2flow prepare command makes it again."
-                raise InputError(f"{path} is damaged ({error}). {again}") from None
+                raise InputError(f"{path} is damaged ({error}). The same r2flow prepare makes it again.") from None
             rows = [number for number in numbers_of_shard if number not in left_out]
             entries |= {number: (number, shard, row) for row, number in enumerate(rows)}
         #: Rows of (number in the data set, shard, row of the shard).
@@ -258,8 +258,9 @@ class PreparedScans(ScanSource):
         _, shard, row = map(int, self.rows[index])
         codes = [*self.store.codes.items()][: 1 + self.reflectance]
         if shard not in self._shards:
-            file = safe_open(self.store.files(shard)[0], framework="numpy")
-            self._shards[shard] = [file.get_slice(name) for name, _ in codes]
+            with telling(path := self.store.files(shard)[0]):  # damaged since it was opened
+                file = safe_open(path, framework="numpy")
+                self._shards[shard] = [file.get_slice(name) for name, _ in codes]
         stored = [image[row : row + 1][0] for image in self._shards[shard]]
         # No index is out of bounds; mode="clip" only skips the bounds check.
         return np.stack(

@@ -315,9 +315,12 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_path: Path, damage):
     plan = plan_of(clouds)
-    make(tmp_path, plan)
-    whole, path = files(tmp_path), tmp_path / "scans-000001.safetensors"
+    opened, whole = prepared_in(make(tmp_path, plan)), files(tmp_path)
+    path = tmp_path / "scans-000001.safetensors"
     DAMAGES[damage](path)
+    if damage not in ("swapped", "renamed"):
+        with refused(path):
+            opened[len(opened) // 2]
     said = "scans-000001.safetensors is da" if damage in ("cut", "swapped", "renamed") else "is not finished"
     with pytest.raises(InputError, match=said):
         prepared_in(tmp_path)
