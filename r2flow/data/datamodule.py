@@ -19,7 +19,7 @@ from r2flow.data.pairs import PairDataset, PairSource, PairStore
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
-from r2flow.errors import check
+from r2flow.errors import InputError, check
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.progress import track
@@ -143,12 +143,16 @@ class ScanDataModule(L.LightningDataModule):
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = [*source.parts]
         firsts = {i: part[0] for i, part in enumerate(parts) if part.slow and len(part)}
-        if sum(len(parts[i]) * first.nbytes for i, first in firsts.items()) > self.options.memory_gib * 2**30:
+        if sum(4 * len(parts[i]) * first.size for i, first in firsts.items()) > self.options.memory_gib * 2**30:
             return source
         for i, first in firsts.items():
-            images = map(parts[i].__getitem__, track(range(len(parts[i])), f"reading {what}", least=16))
-            stored = np.fromiter(images, np.dtype((np.float32, first.shape)), len(parts[i]))
-            parts[i] = InMemory(stored, parts[i].names)
+            images = np.empty((len(parts[i]), *first.shape), np.float32)
+            for number in track(range(len(images)), f"reading {what}", least=16):
+                image = parts[i][number]
+                if image.shape != first.shape:  # of one channel, it would fill both
+                    raise InputError(f"{parts[i].names[number]}: an image of {first.shape}, found {image.shape}.")
+                images[number] = image
+            parts[i] = InMemory(images, parts[i].names)
         return Mixture(parts)
 
     def check_run(self, ranks: int, accumulated: int) -> None:

@@ -57,11 +57,11 @@ class FlowDataset(Dataset[Item]):
         draw = noise.generator(self.seed, self.purpose, k)
         x_0 = torch.from_numpy(draw.standard_normal(self.noise_shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))
-        image = self.source[index]
         encoding = self.encodings[self.source.locate(index)[0]]
-        wrong = wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range))
-        if image.shape != encoding.shape:
-            wrong = f"an image of {encoding.shape}, found {image.shape}"
+        image = self.source[index][: encoding.channels]
+        wrong: str | None = f"an image of {encoding.shape}, found {image.shape}"
+        if image.shape == encoding.shape:
+            wrong = wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range))
         if wrong:
             raise InputError(f"{self.source.names[index]}: {wrong}.")
         if self.augment:

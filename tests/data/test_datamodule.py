@@ -248,7 +248,8 @@ def test_scenes_are_held_out_behind_those_that_are_trained_on():
     assert list(data.validation_source.names) == ["scene 5", "scene 6", "scene 7"]
 
 
-def test_images_of_one_channel_are_not_read_into_two(numbered: Path, monkeypatch):
-    monkeypatch.setattr(ScanFiles, "__getitem__", lambda scans, number: np.ones((1, *scans.reading.sensor.shape)))
+@pytest.mark.parametrize("of_two", [0, 1])
+def test_images_of_one_channel_are_not_read_into_two(numbered: Path, monkeypatch, of_two):
+    monkeypatch.setattr(ScanFiles, "__getitem__", lambda _, number: np.ones((1 + (number < of_two), *SENSOR.shape)))
     with pytest.raises(InputError, match="found \\(1, "):
         next(iter(module(name="folder", root=str(numbered)).val_dataloader()))
