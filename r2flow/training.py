@@ -283,13 +283,14 @@ def fit(run: Run) -> Result:
     """
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
     stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping(run.folder))
-    with stopping.listening(), _quiet():
-        run.data.setup()
-        run.config["scans"] = run.data.fingerprint()
-        log.info("training on %s", run.config["scans"].partition(",")[0])
-        if run.trainer.is_global_zero and not (run.folder.exists() or run.config["trainer"]["fast_dev_run"]):
-            check_folder(run.folder)
-            run.data.read()  # a bad scan leaves no folder
+    with stopping.listening(), _quiet(repeated=False):  # each trains on scans of its own
+        with _quiet():
+            run.data.setup()
+            run.config["scans"] = run.data.fingerprint()
+            log.info("training on %s", run.config["scans"].partition(",")[0])
+            if run.trainer.is_global_zero and not (run.folder.exists() or run.config["trainer"]["fast_dev_run"]):
+                check_folder(run.folder)
+                run.data.read()  # a bad scan leaves no folder
         run.stage.config = dict(run.config)
         if run.config["trainer"]["fast_dev_run"]:
             run.trainer.fit(run.stage, run.data)
@@ -314,9 +315,10 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
             init = as_override("stage.init", run.folder)
             print(f"finished before, at step {step_of(last)}; to learn more: {init} name=OTHER")
         return step_of(last)  # no training, no pairs
-    run.data.read()
-    if last is not None:
-        log.info("resuming from %s", last)
+    with _quiet():
+        run.data.read()
+        if last is not None:
+            log.info("resuming from %s", last)
     if run.trainer.is_global_zero:
         log_config(run.trainer.loggers, run.config)
     try:
@@ -348,10 +350,10 @@ def _result(run: Run, step: int, finished: bool) -> Result:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress Lightning's messages, its warnings about intended choices, and what further devices repeat."""
+def _quiet(repeated: bool = True) -> Iterator[None]:
+    """Suppress Lightning's messages, its warnings about intended choices, and logs that further devices repeat."""
     levels = dict.fromkeys(("lightning.pytorch.utilities.rank_zero", "lightning.fabric"), logging.WARNING)
-    if getattr(rank_zero_only, "rank", 0):
+    if getattr(rank_zero_only, "rank", 0) and repeated:
         levels["r2flow"] = logging.ERROR
     before = {name: logging.getLogger(name).level for name in levels}
     for name, level in levels.items():
