@@ -231,8 +231,8 @@ class TransferFlow(Flow):
         """Losses over the hidden rays: negative log-likelihood of log r and of a return, mean |error| of reflectance.
 
         x_1, (B, C, H, W), are crops that do not span a full turn, t their times, (B,); `steps` are those of
-        `Surroundings.of`, `rows` the output of `RowFeatures`. In eval mode, each loss is the mean over the scans' own
-        losses, whatever the batch.
+        `Surroundings.of`, `rows` the output of `RowFeatures`. In training each loss is the mean over the rays of the
+        batch (or of its part on a device), in eval mode the mean over the scans' own losses.
         """
         about = Surroundings.of(self.space, condition, ring=False, steps=steps)
         known = condition[KNOWN]
