@@ -75,7 +75,7 @@ class EMA(WeightAveraging):
         trainer.precision_plugin.convert_module(pl_module)  # as the strategy does later: the average has its type
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
-            self._average_model.n_averaged.fill_(1)  # of 0, the base class copies the weights, whatever the rule
+            self._average_model.n_averaged.fill_(1)  # at 0 the base class copies the weights, whatever the rule
         if self.warmup_steps is None:
             self.warmup_steps = int(getattr(pl_module, "warmup_steps", 0))
 

@@ -77,7 +77,7 @@ class ScanDataModule(L.LightningDataModule):
             self.names, self.opened = list(self.scans.names), [self.scans]
 
     def read(self) -> None:
-        """Read the scans into memory if they fit; a second call reads nothing."""
+        """Read the scans into memory if they fit; a second call reads at most one of each set."""
         self.setup()
         if self.scans is not None:
             self.scans = self._kept(self.scans, "scans next to the pairs")

@@ -59,10 +59,9 @@ class FlowDataset(Dataset[Item]):
         u = torch.tensor(draw.random(dtype=np.float32))
         encoding = self.encodings[self.source.locate(index)[0]]
         image = self.source[index][: encoding.channels]
-        wrong: str | None = f"an image of {encoding.shape}, found {image.shape}"
-        if image.shape == encoding.shape:
-            wrong = wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range))
-        if wrong:
+        if image.shape != encoding.shape:
+            raise InputError(f"{self.source.names[index]}: an image of {encoding.shape}, found {image.shape}.")
+        if wrong := wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range)):
             raise InputError(f"{self.source.names[index]}: {wrong}.")
         if self.augment:
             image = self.augment(image, self.seed, k)
