@@ -75,7 +75,7 @@ def diffusion(shared: Path) -> dict[str, Any]:
     case["autoencoder"] = autoencoder_of(case["cfg"]["first_stage_config"]["params"])
     case["unet"].load_state_dict(_within(case["state_dict"], "model.diffusion_model."))
     case["autoencoder"].load_state_dict(_within(case["state_dict"], "first_stage_model."))
-    case["log_snr"] = square_root_linear(0.0015, 0.0195, 1000)
+    case["log_snr"] = square_root_linear()
     return case
 
 
@@ -276,7 +276,7 @@ def test_a_published_diffusion_without_its_config_has_the_published_size(shared:
     assert loaded.generator.space.shape == (1, 64, 1024)
     assert loaded.config["generator"]["unet"]["head_channels"] == 32
     assert loaded.config["generator"]["unet"]["multipliers"] == [1, 1]
-    assert loaded.config["generator"]["beta_last"] == 0.0195
+    assert loaded.config["generator"]["schedule"]["last"] == 0.0195
 
 
 @pytest.mark.parametrize("name", ["use_new_attention_order", "scale_by_std"])
@@ -408,8 +408,8 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
         ({"unet": {"wdith": 3}, "autoencoder": SMALL_AUTOENCODER}, "generator.unet has no option 'wdith'"),
         ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers must be 1 integers"),
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
-        ({"diffusion_steps": 1}, "diffusion_steps must be a whole number of at least 2"),
-        ({"beta_last": 2.0}, r"beta_last must be a finite number in \(0, 1\)"),
+        ({"schedule": {"name": "cosine", "steps": 1}}, "steps must be a whole number of at least 2"),
+        ({"schedule": {"name": "square_root_linear", "last": 2.0}}, r"last must be a finite number in \(0, 1\)"),
     ],
 )
 def test_sizes_that_cannot_work_are_one_line(change: dict[str, Any], said: str):

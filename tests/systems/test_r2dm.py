@@ -21,6 +21,7 @@ from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.systems.diffusion.generator import Diffusion, log_snr_of, straight_time
 from r2flow.systems.diffusion.process import (
+    DISCRETE,
     PREDICTIONS,
     SCHEDULES,
     Cosine,
@@ -58,6 +59,17 @@ def test_schedules_are_the_published(shared, name):
     assert_near(log_snr, case[name]["log_snr"], 1e-6)
     assert_near(alpha, case[name]["alpha"], 1e-5)
     assert_near(sigma, case[name]["sigma"], 1e-5)
+
+
+@pytest.mark.parametrize("name", ["linear", "cosine", "sigmoid"])
+def test_schedules_of_steps_are_the_published(shared, name):
+    expected = load_case(shared, "r2dm_schedules.pt")["discrete_40_steps"][name]
+    log_snr = DISCRETE[name](40)
+    before = torch.cat([torch.ones(1), log_snr[:-1].sigmoid()])
+    assert_near(log_snr.sigmoid(), expected["alpha_bar"], 1e-6)
+    assert_near(before, expected["alpha_bar_prev"], 1e-6)
+    assert_near(1 - log_snr.sigmoid() / before, expected["beta"], 1e-6)
+    assert_near(log_snr.exp(), expected["snr"], 1e-6)
 
 
 def test_loss_weights_are_the_published(shared):

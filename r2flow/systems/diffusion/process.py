@@ -12,16 +12,19 @@ Noise is passed as a tensor or function, so that samplers are deterministic func
 import math
 from collections.abc import Callable, Iterator
 from itertools import count, pairwise
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
-from r2flow.registry import Positive, Registry
+from r2flow.registry import Bound, NonNegative, Positive, Registry
 from r2flow.samplers.base import Noise
 
 LogSNR = Callable[[Tensor], Tensor]
+Steps = Annotated[int, Bound("of at least 2", lambda n: n >= 2)]
+Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
 
 FARTHEST = 20  # largest |lambda|: up to it, the float32 tangent has an error of at most 0.005
 
@@ -78,13 +81,42 @@ class CosineShifted(CosineInterpolated):
         super().__init__(image_d, noise_d, noise_d, lowest=lowest, highest=highest)
 
 
-def square_root_linear(first: float, last: float, steps: int) -> Tensor:
-    """lambda_t at t = 0 .. steps - 1, (steps,) float64, of beta_t with evenly spaced square roots, as in LiDM.
+def of_steps(beta: Tensor) -> Tensor:
+    """lambda_t at t = 0 .. N - 1, (N,), where beta_t, (N,), is the share of variance that step t replaces by noise.
 
-    beta_t is the share of variance that step t replaces by noise; alpha_t^2 is the product of 1 - beta.
+    alpha_t^2 is the product of 1 - beta up to step t (Ho et al. 2020).
     """
-    beta = torch.linspace(first**0.5, last**0.5, steps, dtype=torch.float64) ** 2
     return torch.logit((1 - beta).cumprod(0))
+
+
+def square_root_linear(first: Beta = 0.0015, last: Beta = 0.0195, steps: Steps = 1000) -> Tensor:
+    """lambda_t, (steps,) float64, of beta_t with evenly spaced square roots, as in LiDM."""
+    return of_steps(torch.linspace(first**0.5, last**0.5, steps, dtype=torch.float64) ** 2)
+
+
+def linear_steps(steps: Annotated[int, Bound("above 20", lambda n: n > 20)] = 1000) -> Tensor:
+    """lambda_t of beta_t from 0.1 / N to 20 / N: 0.0001 to 0.02 in 1,000 steps (Ho et al. 2020)."""
+    return of_steps(torch.linspace(0.1 / steps, 20 / steps, steps, dtype=torch.float64))
+
+
+def cosine_steps(steps: Steps = 1000, offset: NonNegative = 0.008) -> Tensor:
+    """lambda_t of alpha_t = cos(pi / 2 (t / N + offset) / (1 + offset)), beta_t <= 0.999 (Nichol and Dhariwal 2021)."""
+    t = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
+    return _of_signal(torch.cos((t + offset) / (1 + offset) * math.pi / 2).square())
+
+
+def sigmoid_steps(steps: Steps = 1000, start: float = -3.0, end: float = 3.0) -> Tensor:
+    """lambda_t of alpha_t^2 ~ sigmoid(end) - sigmoid(start + (end - start) t / N), 1 at t = 0, beta_t <= 0.999.
+
+    From Jabri et al. 2022, "Scalable adaptive computation for iterative generation".
+    """
+    t = torch.linspace(start, end, steps + 1, dtype=torch.float64)
+    return _of_signal(t[-1].sigmoid() - t.sigmoid())
+
+
+def _of_signal(alpha_squared: Tensor) -> Tensor:
+    """lambda_t of steps between alpha^2 that are given up to a factor, (N + 1,)."""
+    return of_steps((1 - alpha_squared[1:] / alpha_squared[:-1]).clamp(max=0.999))
 
 
 SCHEDULES: Registry[Callable[..., LogSNR]] = Registry(
@@ -93,6 +125,13 @@ SCHEDULES: Registry[Callable[..., LogSNR]] = Registry(
     linear=Linear,
     cosine_shifted=CosineShifted,
     cosine_interpolated=CosineInterpolated,
+)
+DISCRETE: Registry[Callable[..., Tensor]] = Registry(
+    "schedule of steps",
+    square_root_linear=square_root_linear,
+    linear=linear_steps,
+    cosine=cosine_steps,
+    sigmoid=sigmoid_steps,
 )
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -10,15 +10,12 @@ from torch import Tensor, nn
 from r2flow.errors import check
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Bound, Count, construct
+from r2flow.registry import Count, construct
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.diffusion.generator import DDIM, Share
-from r2flow.systems.diffusion.process import PREDICTIONS, square_root_linear, walk
+from r2flow.systems.diffusion.process import DISCRETE, PREDICTIONS, walk
 from r2flow.systems.latent.autoencoder import Autoencoder
 from r2flow.systems.latent.unet import LatentUNet
-
-Steps = Annotated[int, Bound("of at least 2", lambda n: n >= 2)]
-Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
 
 
 class VQAutoencoder(Generator):
@@ -46,8 +43,7 @@ class LatentDiffusion(Generator):
     Args:
         autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
         unet: Options of `r2flow.systems.latent.unet.LatentUNet`; `position: learnable` is LiDM + APE.
-        beta_first, beta_last: Arguments of `r2flow.systems.diffusion.process.square_root_linear`.
-        diffusion_steps: N.
+        schedule: Name and options of a schedule of N steps in `r2flow.systems.diffusion.process.DISCRETE`.
     """
 
     log_snr: Tensor
@@ -58,17 +54,15 @@ class LatentDiffusion(Generator):
         backbone: Mapping[str, Any],
         autoencoder: Mapping[str, Any] | None = None,
         unet: Mapping[str, Any] | None = None,
-        beta_first: Beta = 0.0015,
-        beta_last: Beta = 0.0195,
-        diffusion_steps: Steps = 1000,
+        schedule: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(space)
         self.run_by(LatentDDIM())
+        with torch.device("cpu"):
+            log_snr = DISCRETE.build(schedule or {"name": "square_root_linear"})
         self.first_stage_model = construct("generator.autoencoder", Autoencoder, autoencoder, space.shape[0])
         self.noise_shape = shape = self.first_stage_model.latent_shape(*space.shape[1:])
         self.model = nn.ModuleDict({"diffusion_model": construct("generator.unet", LatentUNet, unet, shape)})
-        with torch.device("cpu"):
-            log_snr = square_root_linear(beta_first, beta_last, diffusion_steps)
         self.register_buffer("log_snr", log_snr.float(), persistent=False)
 
     @property

@@ -63,9 +63,12 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
         "name": "latent_diffusion",
         "autoencoder": _autoencoder(_within(weights, AUTOENCODER)),
         "unet": {**_unet(_within(weights, UNET)), "head_channels": int(unet.get("num_head_channels", HEAD))},
-        "beta_first": float(f"{state['betas'][0]:.6g}"),
-        "beta_last": float(f"{state['betas'][-1]:.6g}"),
-        "diffusion_steps": len(state["betas"]),
+        "schedule": {
+            "name": "square_root_linear",
+            "first": float(f"{state['betas'][0]:.6g}"),
+            "last": float(f"{state['betas'][-1]:.6g}"),
+            "steps": len(state["betas"]),
+        },
     }
     step = int(content.get("global_step", 0))
     return Published(_config(generator, path, notes), weights, step, {"name": "latent_ddim"})
