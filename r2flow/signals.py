@@ -13,7 +13,7 @@ from types import FrameType
 
 Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
-STOPPING = (signal.SIGTERM, signal.SIGINT)
+STOPPING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 LATER = 75  # exit code EX_TEMPFAIL of an unfinished run: the same command resumes
 
@@ -45,12 +45,12 @@ def outlive_parent(seconds: float = 10.0) -> None:
 def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
     """Handle signals within a block; without effect outside the main thread, which alone receives them.
 
-    Ctrl-C stays ignored if it was, as in background jobs of a shell.
+    Signals stay ignored if they were, as Ctrl-C in background jobs of a shell and SIGHUP under nohup.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heard = [n for n in signals if n != signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
+    heard = [number for number in signals if signal.getsignal(number) is not signal.SIG_IGN]
     before = {number: signal.signal(number, handler) for number in heard}
     try:
         yield
@@ -121,7 +121,7 @@ def out_of_reach() -> Iterator[None]:
     """Start processes that block stop signals; this process hears them after the block."""
     heard: list[int] = []
     resource_tracker.ensure_running()  # which unblocks signals
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {*STOPPING, signal.SIGHUP})  # also in the processes
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # also in the processes
     try:
         with listening(lambda number, frame: heard.append(number)):  # in other threads
             yield

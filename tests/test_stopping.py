@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from r2flow.errors import InputError
-from r2flow.signals import Stopped, listening, out_of_reach, stop_at_once
+from r2flow.signals import STOPPING, Stopped, listening, out_of_reach, stop_at_once
 from r2flow.store import Store
 from tests.conftest import ROOT
 from tests.killing import is_gone, wait_until
@@ -111,7 +111,7 @@ else:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", STOPPING)
 def test_told_to_stop_when_workers_start(tmp_path: Path, number: int):
     (tmp_path / "script.py").write_text(WORKERS.format(number=int(number)))
     process = start(tmp_path, ["script.py"], [sys.executable])

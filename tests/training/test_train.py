@@ -94,7 +94,7 @@ def test_a_killed_run_ends_as_the_one_left_alone(train: Run, alone: tuple[Path, 
 
 
 @pytest.mark.parametrize(
-    ("by", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
+    ("by", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow)]
 )
 def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(train, alone, scans, tmp_path, by, code):
     # The regular checkpoints are those of steps 4, 8 and 12.
