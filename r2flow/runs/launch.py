@@ -6,7 +6,6 @@ limit), 130 after Ctrl-C, 143 after SIGTERM.
 
 import functools
 import hashlib
-import logging
 import os
 import re
 import signal
@@ -40,8 +39,6 @@ from r2flow.runs.composing import (
     with_choices,
 )
 from r2flow.signals import LATER, Stopped, listening, stop_at_once
-
-log = logging.getLogger("r2flow")
 
 
 class JobEnded(RuntimeError):
@@ -210,7 +207,6 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
     from r2flow.runs.chain import run_process
 
     run_dir = HydraConfig.get().runtime.output_dir
-    log.info("job %s: %s", HydraConfig.get().job.num, " ".join(given))
     code = run_process([*_restart(command), *given, override("run_dir", str(run_dir))])
     if code in (130, 143):
         raise Stopped(code, "the sweep stopped; the same command resumes there")
