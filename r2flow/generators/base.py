@@ -130,7 +130,8 @@ class Generator(nn.Module):
         if condition is not None and not (self.told or how.completes):
             raise InputError(f"this {type(self).__name__} takes no condition; complete scans with --sampler mmps.")
         check(draws is not None or not how.draws, f"sampler {how.name} is stochastic: give draws.")
-        x = wide(noise.to(self.device))
+        weight = next(self.parameters(), noise)
+        x = wide(noise.to(self.device, torch.promote_types(noise.dtype, weight.dtype)))  # of 64-true runs, float64
         conditions = condition and {name: value.to(self.device) for name, value in condition.items()}
         noise_of_step = None if draws is None else lambda j: self.further_noise(draws, j).to(x)
         with autocast(self.device, precision):

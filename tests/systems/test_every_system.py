@@ -49,6 +49,8 @@ def test_a_scan_is_a_function_of_its_number_alone(name: str):
     assert many.x.abs().max() <= 1 or name == "latent_diffusion"  # whose decoder has no bound
     assert many.evaluations.tolist() == [evaluations] * 3
     assert sampler.evaluations(generator) == evaluations
+    double = generator.double()(one.start(generator.noise_shape), draws=one, sampler=sampler)  # as in 64-true runs
+    torch.testing.assert_close(double.x.float(), alone.x, rtol=0, atol=1e-4)
 
 
 # Options, and the evaluations that a scan takes: steps x noise levels and one to take the last noise off.
