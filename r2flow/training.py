@@ -31,7 +31,7 @@ from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import SOURCES, Layout, Prepared
-from r2flow.data.options import MIXED, PAIRS, SIMULATED, SourceOptions
+from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.resolving import reflectance_levels, resolve, resolve_reflectance
 from r2flow.errors import InputError, check_folder
@@ -201,15 +201,18 @@ def _refuse_unread(key: str, data: Mapping[str, Any], given: Collection[str]) ->
     """Refuse options that the set of scans under this key would ignore."""
     name, defaults = data.get("name"), {**asdict(SourceOptions()), **resolve({})}
     options = defaults.keys() - {"name"}
+    scenes = {"scenes"} if key != "data" or "data.scenes" in given else set[str]()  # else an experiment's
     if name == SIMULATED:
         what, unread = "simulated scans are not files (data=folder for yours)", options - {"scenes"}
     elif name == PAIRS:
         what, unread = "pairs are drawn, not read", options - {"root", "reading"}
     elif name == MIXED:
-        what, unread = "each of data.parts has its own", {"split", "drives"}
+        run = DataOptions(**data)
+        sets = [one for one in (*run.sets, run.held_out) if one and one.scenes == run.scenes]
+        read = any(not isinstance(SOURCES[one.name], Layout | Prepared) for one in sets)
+        what, unread = "each of data.parts has its own", {"split", "drives"} | (set() if read else scenes)
     elif name is not None and isinstance(SOURCES[name], Layout | Prepared):
-        of_experiment = key == "data" and "data.scenes" not in given  # for its simulated scans
-        what, unread = "scans in files are no simulated scenes", set[str]() if of_experiment else {"scenes"}
+        what, unread = "scans in files are no simulated scenes", scenes
     else:
         return
     wrong = sorted(f"{key}.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option])

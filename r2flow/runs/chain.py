@@ -66,7 +66,7 @@ def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], confi
         concerning = ("all", "pairs" if on_pairs else "scans")
         overrides = [text for text in given if rule(key_of(text)).links in concerning] + alone
         sets = [text for text in (*own, *overrides) if key_of(text) == "data"]
-        if sets and not re.match("data='?(simulated|mixed)", sets[-1]):  # scans in files are not simulated scenes
+        if sets and not re.fullmatch("data='?simulated'?", sets[-1]):  # other scans have no scenes, or their own
             own = [text for text in own if key_of(text) != "data.scenes"]
         run_dir = Path(folder, name)
         links.append(Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent))

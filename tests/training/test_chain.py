@@ -206,6 +206,8 @@ def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path
     (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=simulated"])
     assert link.overrides[:2] == ("data.scenes=9", "data=simulated")
     more = {"more": {"init": "rf1", "data": {"scenes": 9}}, "rf2": {"experiment": "reflow", "init": "more"}}
+    (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=mixed"])  # parts have their own
+    assert link.overrides[0] == "data=mixed"
     links = links_of({"rf1": {"data": {"scenes": 8}}, **more}, "runs", ["data=folder"])
     assert ["data=folder" in link.overrides for link in links] == [True, True, False]  # rf2 learns from pairs
     assert not any(text.startswith("data.scenes") for link in links for text in link.overrides)

@@ -66,6 +66,7 @@ REFUSED = {
     # What would be passed over.
     "data=folder & data.root=. & data.scenes=5": "no simulated scenes: leave data.scenes out",
     "data=mixed & data.parts=[{name: simulated}] & data.split=train": "has its own: leave data.split",
+    "data=simulated_sensors & stage=transfer & data.scenes=9": "data.parts has its own: leave data.scenes out",
     "data.root=typo": "simulated scans are not files (data=folder for yours): leave data.root out",
     "data.pairs.num=5": "data.pairs.num are of data=pairs, found data=simulated",
     "stage=reflow & data=pairs & stage.init=street & data.drives=[1]": "pairs are drawn, not read: leave data.drives",
@@ -125,6 +126,8 @@ def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
 def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(scans: Path, tmp_path: Path):
     asked = ["experiment=densify", "data=folder", f"data.root={scans}", f"run_dir={tmp_path / 'run'}"]
     assert build(compose(asked), asked).data.options.name == "folder"
+    asked[1:3] = ["data=simulated_sensors"]
+    assert {part.scenes for part in build(compose(asked), asked).data.parts} == {1000, 250, 150, 200}
 
 
 def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
