@@ -9,7 +9,7 @@ from r2flow.data.options import FOLDER, MIXED, PAIRS, SIMULATED, Data, DataOptio
 from r2flow.data.reading import AUTO
 from r2flow.data.sources import made_here
 from r2flow.errors import InputError, check
-from r2flow.lidar.sensors import build_sensor
+from r2flow.lidar.sensors import ENDINGS, build_sensor, options_of_sensor, read_sensor
 from r2flow.registry import check_options
 
 log = logging.getLogger(__name__)
@@ -62,13 +62,16 @@ def _checked_parts(run: DataOptions) -> list[Data]:
     if not run.parts:
         example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
-    for number, part in enumerate(run.parts):
+    parts: list[Data] = [{"scenes": run.scenes, **part} for part in run.parts]
+    for number, part in enumerate(parts):
+        if isinstance(name := part.get("sensor"), str):
+            part["sensor"] = options_of_sensor(read_sensor(name)) if name.endswith(ENDINGS) else {"name": name}
         _check_set(f"data.parts[{number}]", part, kind=PartOptions)
         if part.get("sensor") is not None:
             check_options(f"data.parts[{number}].sensor", build_sensor, part["sensor"])
-    if len({part.get("weight") is None for part in run.parts}) > 1:
+    if len({part.get("weight") is None for part in parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
-    return [{"scenes": run.scenes, **part} for part in run.parts]
+    return parts
 
 
 def _check_set(

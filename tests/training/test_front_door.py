@@ -10,9 +10,10 @@ import pytest
 import yaml
 
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
+from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.files import write_file
-from r2flow.lidar.sensors import SENSORS, write_sensor
+from r2flow.lidar.sensors import SENSORS, build_sensor, write_sensor
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.training import build, check
@@ -135,6 +136,9 @@ def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
     sensor = compose(["sensor.columns=256", f"sensor='{tmp_path}/my sensor.yaml'", "sensor.min_range=3"])["sensor"]
     assert [sensor[key] for key in ("name", "rows", "columns", "min_range")] == ["mine", None, 256, 3]
     assert sensor["elevations"] == list(SENSORS["vlp16"].elevations)
+    part = {"name": "simulated", "sensor": str(tmp_path / "my sensor.yaml")}
+    (part,) = resolve({"name": "mixed", "parts": [part]})["parts"]
+    assert build_sensor(**part["sensor"]) == replace(SENSORS["vlp16"], name="mine")
 
 
 def test_a_named_choice_has_options_of_its_own():
