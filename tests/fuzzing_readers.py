@@ -33,7 +33,8 @@ def image(path: Path) -> None:
 
 
 def labels(path: Path) -> None:
-    read_labels(path, path.parents[2] / "beside" / "scan.bin")
+    scan = path.parents[2] / "beside" / "scan.bin"
+    read_labels(path, scan, read_points(scan))
 
 
 def in_folder(name: str) -> Callable[[Path], Path]:

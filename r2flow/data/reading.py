@@ -111,7 +111,7 @@ def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, 
     file = labels_beside(path)
     if file is None:
         return image, None
-    labels = read_labels(file, path, points)[chosen].astype(np.uint16)
+    labels = read_labels(file, path, points)[chosen]
     return image, scatter(reading.sensor, pixels, [labels])[0].astype(np.uint16)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from r2flow.errors import check
 from r2flow.files import reading
-from r2flow.lidar.scan_files import LARGEST_FILE, Points, read_points
+from r2flow.lidar.scan_files import LARGEST_FILE, Points
 
 # SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue, people red, plants green,
 # buildings and fences brown; moving objects have the colour of static ones).
@@ -38,13 +38,11 @@ def labels_beside(scan: str | Path) -> Path | None:
     return next((path for path in files if path.exists() or path.is_symlink()), None)  # reading a broken link raises
 
 
-def read_labels(path: str | Path, scan: str | Path, points: Points | None = None) -> np.ndarray:
-    """The semantic id of each point of a scan, (N,) uint16, in the order of `read_points`, without dropped rows.
+def read_labels(path: Path, scan: str | Path, points: Points) -> np.ndarray:
+    """The semantic id of each of a scan's points, (N,) uint16, without dropped rows.
 
     A `.label` file has a uint32 per row of the scan's file, class id in the low 16 bits, instance in the high.
     """
-    path = Path(path)
-    points = read_points(scan) if points is None else points
     rows = len(points.xyz) + points.dropped
     with reading(path, LARGEST_FILE, "file of labels", least=0):
         size = path.stat().st_size  # checked first: a file of the wrong size is not loaded

@@ -45,11 +45,11 @@ def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Pa
     beside.symlink_to("gone")  # a link to nothing was meant to be a file
     assert labels_beside(scan) == beside
     with refused(beside):
-        read_labels(beside, scan)
+        read_labels(beside, scan, read_points(scan))
     beside.unlink()
     beside.write_bytes(WHOLE)
     assert labels_beside(scan) == beside
-    np.testing.assert_array_equal(read_labels(beside, scan), IDS)
+    np.testing.assert_array_equal(read_labels(beside, scan, read_points(scan)), IDS)
 
 
 def test_labels_are_not_those_of_other_scans_next_to_the_folder(scan: Path, label: Path, tmp_path: Path):
@@ -79,7 +79,7 @@ def test_labels_of_dropped_rows_are_dropped(scan: Path, label: Path):
     rows = np.fromfile(scan, "<f4").reshape(-1, 4)
     rows[17, 0], rows[90, 2] = np.nan, 1e30
     rows.tofile(scan)
-    np.testing.assert_array_equal(read_labels(label, scan), np.delete(IDS, [17, 90]))
+    np.testing.assert_array_equal(read_labels(label, scan, read_points(scan)), np.delete(IDS, [17, 90]))
 
 
 def test_a_cut_or_a_longer_file_is_refused(scan: Path, label: Path):
