@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Self
 
 import torch
@@ -243,7 +242,11 @@ class TransferFlow(Flow):
         returned, hidden = metres[:, :1] > 0, condition[KNOWN][:, :1] < 1
         log_r = torch.where(returned, metres[:, :1], 1.0).log()
         mask = (returned & hidden).float()
-        mean = partial(_mean_over, dims=(0, 1, 2, 3) if self.training else (1, 2, 3))
+        dims = (0, 1, 2, 3) if self.training else (1, 2, 3)
+
+        def mean(values: Tensor, weight: Tensor) -> Tensor:
+            return ((values * weight).sum(dims) / weight.sum(dims).clamp(min=1)).mean()
+
         losses = {
             "range": -mean(answers.log_density(log_r), mask),
             "return": mean(
@@ -304,7 +307,3 @@ def _within_reach(known: Tensor) -> Tensor:
         gap = measured.diff().max() if len(measured) > 1 else len(rows)
         reach.append((number > measured[0] - gap) & (number < measured[-1] + gap))
     return torch.stack(reach)[:, None, :, None]
-
-
-def _mean_over(values: Tensor, weight: Tensor, dims: tuple[int, ...]) -> Tensor:
-    return ((values * weight).sum(dims) / weight.sum(dims).clamp(min=1)).mean()
