@@ -140,11 +140,9 @@ def plain(value: Any) -> Any:
     return [plain(node) for node in content] if isinstance(content, list) else content
 
 
-FORMAT = Format("R2Flow", holds, read)
-
 FORMATS: Registry[Format] = Registry(
     "published format",
-    r2flow=FORMAT,
+    r2flow=Format("R2Flow", holds, read),
     r2dm=lazy("r2flow.systems.diffusion.published:FORMAT"),
     dusty=lazy("r2flow.systems.gan.published:FORMAT"),
     lidargen=lazy("r2flow.systems.score.published:FORMAT"),
