@@ -199,7 +199,7 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
 
 def _refuse_unread(key: str, data: Mapping[str, Any], given: Collection[str]) -> None:
     """Refuse options that the set of scans under this key would ignore."""
-    name, defaults = data.get("name"), {**asdict(SourceOptions()), **resolve({})}
+    name, defaults = data["name"], {**asdict(SourceOptions()), **resolve({})}
     options = defaults.keys() - {"name"}
     scenes = {"scenes"} if key != "data" or "data.scenes" in given else set[str]()  # else an experiment's
     if name == SIMULATED:
@@ -211,10 +211,9 @@ def _refuse_unread(key: str, data: Mapping[str, Any], given: Collection[str]) ->
         sets = [one for one in (*run.sets, run.held_out) if one and one.scenes == run.scenes]
         read = any(not isinstance(SOURCES[one.name], Layout | Prepared) for one in sets)
         what, unread = "each of data.parts has its own", {"split", "drives"} | (set() if read else scenes)
-    elif name is not None and isinstance(SOURCES[name], Layout | Prepared):
-        what, unread = "scans in files are no simulated scenes", scenes
     else:
-        return
+        files = isinstance(SOURCES[name], Layout | Prepared)
+        what, unread = "scans in files are no simulated scenes", scenes if files else set()
     wrong = sorted(f"{key}.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option])
     if wrong:
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
