@@ -61,7 +61,6 @@ def test_decoded_reflectance_has_the_sensors_levels():
     image[0] = 10 * image[0] + 2
     decoded = Encoding(sensor, levels=100).decode(Encoding(sensor).encode(image))[1]
     torch.testing.assert_close(decoded, (100 * image[1]).round() / 100, rtol=0, atol=1e-6)
-    assert set((100 * decoded).round().int().ravel().tolist()) <= set(range(101))
 
 
 SENSOR = Sensor("two beams", (30.0, -30.0), columns=4)  # columns look to 135, 45, -45 and -135 degrees

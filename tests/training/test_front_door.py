@@ -53,7 +53,6 @@ REFUSED = {
     "trainer.limit_train_batches=0": "limit_train_batches must be null",
     "trainer.deterministic=foo": "deterministic must be true or false or 'warn' or null",
     "trainer.accelerator=tpu": "trainer: ",
-    "chain=3": "chain must be a group of keys or null, found 3",
     "seed=99999999999999999999": "seed must be a whole number of at least 0 and below 2^63",
     "loggers=3": "loggers must be a list",
     "+foo=3": "the config has no option 'foo'",
