@@ -12,7 +12,6 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.flow.solvers import named_grid
 from r2flow.generators import USUAL, build_generator
-from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
@@ -141,11 +140,6 @@ def test_without_fresh_noise_mmps_needs_no_draws():
 
 
 def test_pairs_are_the_ends_of_paths():
-    flow = build_generator({**CONFIG, "generator": {"name": "flow_map"}})
     ways = [build_sampler(way) for way in ("sde", "renoise", "jump", "adams3")]
     assert [way.draws for way in ways] == [True, True, False, False]
     assert [way.paired for way in ways] == [False, True, True, True]
-    flow.sampler = ways[1]
-    assert ode_sampler(flow) == USUAL
-    flow.sampler = ways[3]
-    assert ode_sampler(flow) == flow.sampler
