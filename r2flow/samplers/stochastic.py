@@ -106,7 +106,7 @@ class SDE(OnGrid):
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         field, x, alive, times = generator.field(condition), noise, finite(noise), self.times()
         if self.finish and self.steps > 1:
-            times = torch.cat([self.times(0.0, 1 - self.finish, fewer=1), times[-1:]])
+            times = torch.cat([self.times(1 - self.finish, fewer=1), times[-1:]])
 
         def estimate(t: Tensor, x: Tensor) -> Tensor:
             return x + (1 - t) * field(t, x).to(x)
