@@ -12,6 +12,7 @@ from typing import Literal
 from r2flow.data.opening import SOURCES
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
+from r2flow.lidar.scan_files import scan_ending
 from r2flow.lidar.sensors import Convention, Rays
 from r2flow.registry import Registry
 
@@ -39,14 +40,15 @@ class Rules:
     chosen: str
 
     def check(self, real: ScanSet) -> None:
-        """Refuse a real set without the measured coordinates that the protocol needs."""
+        """Refuse a real set without the measured coordinates that the protocol needs: a scan of each format."""
+        names = real.source.names if self.real == "measured" else []
         try:
-            if self.real == "measured":
-                real.source.with_points(0)
+            for number in {scan_ending(names[n]): n for n in reversed(range(len(names)))}.values():
+                real.source.with_points(number)
         except InputError:
             raise InputError(
-                f"{real.label} lacks the measured coordinates of its points, which the protocol '{self.name}' compares:"
-                " only point files have them (KITTI's .bin). Or give --protocol r2flow."
+                f"{names[number]} of {real.label} lacks the measured coordinates of its points, which the protocol "
+                f"'{self.name}' compares: only point files have them (KITTI's .bin). Or give --protocol r2flow."
             ) from None
 
 
