@@ -148,7 +148,7 @@ def evaluate(
         rules.check(truth)
         judged = _judged(named, flows, reading, options)
         sets = [truth, *judged.values()]
-        metrics = chosen or _build_possible(all(s.about["reflectance"] for s in sets), options, device)
+        metrics = chosen or _build_possible(all(s.about.get("reflectance") for s in sets), options, device)
         check_reflectance(metrics, sets)
         training = None if options.train is None else _open(options.train, reading, options.train_split, None)
         for folder in filter(None, (options.out, options.json and options.json.parent)):

@@ -251,7 +251,7 @@ class WallKind(SourceKind):
 
 
 @pytest.mark.usefixtures("own_table")
-def test_scans_that_are_no_files_are_a_kind_of_their_own():
+def test_scans_that_are_no_files_are_a_kind_of_their_own(r2flow):
     SOURCES.add("walls", WallKind())
     for wrong in (0, -1, 2.5, "2"):
         with pytest.raises(InputError, match=f"num must be a whole number of at least 1.* found {wrong!r}"):
@@ -263,6 +263,7 @@ def test_scans_that_are_no_files_are_a_kind_of_their_own():
     assert torch.equal(scans[1:], torch.stack([scans[1], scans[2]]))
     assert scans.identity is None  # nobody knows what decides them: no statistics of them are kept
     assert not resolve_reflectance("auto", {"name": "walls", "root": "5"})
+    assert "kid_handcrafted_range" in r2flow("evaluate", "walls:5", "walls:4", "--size", "8x32", "--workers", 0).said
     data = ScanDataModule(SENSOR, Encoding(SENSOR, reflectance=False), 0, name="walls", root=10, batch_size=2)
     assert [batch["x_1"].shape for batch in data.val_dataloader()] == [(1, 1, 8, 32)]
     assert data.names == [f"wall at {i} m" for i in range(2, 12)]
