@@ -49,8 +49,8 @@ def simulate(
     missing = folder.missing(range(num))
     with Bar("simulating", len(missing), "scans") as advance:
         folder.make(missing, folder.simulate, workers or cores(), lambda scan: advance())
-    kept = f", {num - len(missing)} there already" if len(missing) < num else ""
-    print(f"{len(missing)} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")
+    made, kept = len(missing), f", {num - len(missing)} there already" if len(missing) < num else ""
+    print(f"{made} scan{'s' * (made != 1)} ({', '.join(formats)}{', labels' * labels}) in {out}{kept}")
 
 
 @app.command(epilog="Example: r2flow prepare kitti_360:/data/KITTI-360 --out prepared/kitti_360")
@@ -177,4 +177,4 @@ def unpack(
         if stamps.total() == most:
             break
     check(stamps, f"{recording} contains no usable scan.")
-    print(f"{stamps.total()} scans in {out}")
+    print(f"{stamps.total()} scan{'s' * (stamps.total() > 1)} in {out}")

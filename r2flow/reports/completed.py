@@ -168,7 +168,7 @@ def print_completed(done: Mapping[str, np.ndarray | None], out: Path, scans: int
     if errors := [error for error in done.values() if error is not None]:
         (mae, linear), (wrong, wrong_linear) = np.ma.masked_invalid(errors).mean(0).filled(np.nan)
         off = f"MAE {mae:.2f} m ({linear:.2f}) where all return" if np.isfinite(mae) else "no ray returns in all"
-        print(f"on hidden rays of {len(errors)} scans (linear interpolation in brackets):")
+        print(f"on hidden rays of {len(errors)} scan{'s' * (len(errors) > 1)} (linear interpolation in brackets):")
         print(f"{off}, {wrong:.1%} ({wrong_linear:.1%}) wrong in ray-drop")
 
 
