@@ -82,7 +82,7 @@ class EvaluateOptions:
     workers: Annotated[int, typer.Option(min=0, help="Additional processes that read scans.")] = 2
     device: DeviceOption = "auto"
     json: Annotated[Path | None, typer.Option("--json", help="JSON file for all results with their protocols.")] = None
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page.")] = None
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page; replaces an earlier one.")] = None
 
     def check(self, named: Sequence[str], sampled: Sequence[str]) -> None:
         """Refuse incompatible options before reading any scan."""

@@ -133,7 +133,7 @@ def evaluation_page(
         *([remarks] if remarks else []),
         *verdict(comparisons),
         "## Sets",
-        table(sets, ("comparison", "as", "set", "scans", "details")),
+        table(sets, ("comparison", "as", "set", "scans", "details, as read")),
         "## Protocols",
         "Before every metric, returns beyond the mask are dropped from both sets. Figures of different protocols are "
         "not comparable.",
