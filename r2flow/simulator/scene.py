@@ -41,7 +41,6 @@ class SceneBuilder:
         self.ground = ground
         self.draws = draws
         self._rows: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in get_args(Shape)}
-        self._surfaces: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self._rows}
 
     def level(self, x: float, y: float) -> float:
         """Height of the ground at a position in metres, including the kerb."""
@@ -64,26 +63,18 @@ class SceneBuilder:
         base: float = 0.0,
     ) -> None:
         """Add a solid, whose fields are numbers, to the scene."""
-        kind = type(solid)
-        self._rows[kind].append(tuple(solid))
         albedo = self.albedo(material) if albedo is None else albedo
-        self._surfaces[kind].append((LABELS[label], INDEX[material], albedo, closed, pattern, base))
+        self._rows[type(solid)].append((*solid, LABELS[label], INDEX[material], albedo, closed, pattern, base))
 
     def build(self, rig: int | None = None) -> Scene:
         """The scene as tables."""
-        tables = tuple(
-            (shape(*_columns(rows)), _surface(_columns(self._surfaces[shape])))
-            for shape, rows in self._rows.items()
-            if rows
-        )
+        tables = tuple(_table(shape, rows) for shape, rows in self._rows.items() if rows)
         return Scene(self.ground, tables, rig)
 
 
-def _columns(rows: list[tuple[float, ...]]) -> np.ndarray:
+def _table(shape: type, rows: list[tuple[float, ...]]) -> tuple[Shape, Surface]:
     # Rounded to 1 / 16384, since the last bit of sines depends on the machine.
-    return np.ascontiguousarray((np.rint(np.array(rows) * 16384) / 16384).astype(np.float32).T)
-
-
-def _surface(columns: np.ndarray) -> Surface:
-    label, material, albedo, closed, pattern, base = columns
-    return Surface(label.astype(np.uint16), material.astype(np.uint8), albedo, closed, pattern.astype(np.uint8), base)
+    columns = np.ascontiguousarray((np.rint(np.array(rows) * 16384) / 16384).astype(np.float32).T)
+    *solid, label, material, albedo, closed, pattern, base = columns
+    label, material, pattern = label.astype(np.uint16), material.astype(np.uint8), pattern.astype(np.uint8)
+    return shape(*solid), Surface(label, material, albedo, closed, pattern, base)
