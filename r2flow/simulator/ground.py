@@ -77,10 +77,10 @@ class Ground:
     The bracket has zero height and slope at the origin, the position of the car.
     """
 
+    streets: tuple[Street, ...]  # the car's, and others
     waves: tuple[tuple[float, float, float, float], ...] = ()  # rows (A in metres, k_x and k_y in radians / metre, phi)
     lean: tuple[float, float] = (0.0, 0.0)  # slope along x and y relative to the car, which leans on its springs
     drop: float = 0.0  # how far the ground is below its default height under the sensor, in metres
-    streets: tuple[Street, ...] = ()  # the streets; without streets, all ground is verge
     kerb: float = 0.0  # height of the kerb in metres
     tufts: float = 0.0  # height in metres of grass and rubble beyond the pavements
     banks: tuple[float, float] = (0.0, 0.0)  # rise next to the first street, left and right, in metres
@@ -107,6 +107,11 @@ class Ground:
         left, right = self.banks
         return (right + (left - right) * (lateral > 0)) * t * t * (3 - 2 * t)
 
+    @property
+    def pavement(self) -> float:
+        """Width of the widest pavement in metres."""
+        return max(street.pavement for street in self.streets)
+
     def off_street(self, x: Where, y: Where) -> Where:
         """Distance to the nearest carriageway in metres, negative on a carriageway; corners are rounded."""
         first, *others = self.streets
@@ -126,14 +131,12 @@ class Ground:
             dx, dy = x - patch.x, y - patch.y
             on = (abs(dx * c + dy * s) * 2 <= patch.length) & (abs(dy * c - dx * s) * 2 <= patch.width)
             label[on], material[on] = LABELS["parking"], INDEX["paving"]
-        if self.streets:
-            away = self.off_street(x, y)
-            pavement = max(street.pavement for street in self.streets)
-            near, on = away <= pavement, away <= 0
-            label[near], material[near] = LABELS["sidewalk"], INDEX["paving"]
-            label[on], material[on] = LABELS["road"], INDEX["asphalt"]
-            painted = self._painted(x, y)
-            label[painted], material[painted] = LABELS["lane-marking"], INDEX["marking"]
+        away = self.off_street(x, y)
+        near, on = away <= self.pavement, away <= 0
+        label[near], material[near] = LABELS["sidewalk"], INDEX["paving"]
+        label[on], material[on] = LABELS["road"], INDEX["asphalt"]
+        painted = self._painted(x, y)
+        label[painted], material[painted] = LABELS["lane-marking"], INDEX["marking"]
         # Repairs, wear and damp: reflectance varies over a few metres.
         stains = 0.03 * sine(1.1 * x + 0.4 * y) * sine(0.5 * x - 1.3 * y) + 0.02 * sine(0.23 * x + 0.31 * y)
         return label, material, self.albedo[material] + stains
@@ -141,8 +144,6 @@ class Ground:
     def _painted(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Whether points are on a painted line of the first street, outside crossings."""
         street, *others = self.streets
-        if not street.lines:
-            return np.zeros(x.shape, bool)
         u, lateral = street.locate(x, y)
         on = np.zeros(x.shape, bool)
         for place in street.lines:
@@ -167,7 +168,7 @@ class Ground:
             distance[rows], steepness[rows] = _meet_profile(s, z, rays.slope[rows], rays.height[rows])
         approach = steepness - rays.slope[:, None]  # approach of ray and ground per metre of s
         cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + steepness**2))
-        if self.kerb > 0 and self.streets:
+        if self.kerb > 0:
             distance, cosine = self._step_up(rays, distance, approach, cosine)
         if self.tufts > 0:
             distance = self._overgrown(rays, distance, approach)
@@ -197,11 +198,7 @@ class Ground:
         met = np.isfinite(distance)
         s, c, sine_ = (np.broadcast_to(q, met.shape)[met] for q in (distance, rays.cos, rays.sin))
         x, y = s * c, s * sine_
-        if self.streets:
-            beyond = self.off_street(x, y) - max(street.pavement for street in self.streets)
-            share = np.clip(beyond * 2, 0, 1)  # grows over half a metre
-        else:
-            share = np.float32(1)
+        share = np.clip((self.off_street(x, y) - self.pavement) * 2, 0, 1)  # grows over half a metre
         h = 0.25 * (2 + sine(2.3 * x + 1.1 * y) * sine(0.7 * x - 2.9 * y) + sine(4.1 * x - 3.3 * y)) * self.tufts
         out = distance.copy()
         out[met] = np.maximum(s - share * h / np.maximum(approach[met], np.float32(0.02)), np.float32(0.5) * s)

@@ -16,8 +16,7 @@ def free(b: SceneBuilder, x: float, y: float, room: float) -> bool:
     """Whether a position is `room` metres off all carriageways and pavements, within reach and not too near."""
     if not CLEAR < math.hypot(x, y) < END + 5:
         return False
-    pavement = max(street.pavement for street in b.ground.streets)
-    return bool(b.ground.off_street(x, y) > pavement + room)
+    return bool(b.ground.off_street(x, y) > b.ground.pavement + room)
 
 
 def line_front(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:

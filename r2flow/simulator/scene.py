@@ -44,8 +44,7 @@ class SceneBuilder:
 
     def level(self, x: float, y: float) -> float:
         """Height of the ground at a position in metres, including the kerb."""
-        raised = bool(self.ground.streets) and self.ground.off_street(x, y) > 0
-        return float(self.ground.height(x, y)) + self.ground.kerb * raised
+        return float(self.ground.height(x, y)) + self.ground.kerb * (self.ground.off_street(x, y) > 0)
 
     def albedo(self, material: str) -> float:
         """Draw the reflectance of an object of a material."""

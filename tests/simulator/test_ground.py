@@ -12,11 +12,12 @@ HDL64E = SENSORS["hdl64e"]
 HEIGHT = HDL64E.height
 RAYS = Rays(along_rows(HDL64E), HDL64E.columns, HEIGHT)
 STRAIGHT = Street(heading=0.0, offset=0.0, curvature=0.0, half_width=4.0, pavement=2.0)
+OPEN = (STRAIGHT._replace(offset=1e6),)  # no street in sight
 
 
 @pytest.mark.parametrize("lean", [(0.05, 0.0), (-0.03, 0.02), (0.0, -0.04)])
 def test_a_slope_is_met_where_ray_and_plane_cross(lean):
-    distance, _ = Ground(lean=lean).meet(RAYS)
+    distance, _ = Ground(OPEN, lean=lean).meet(RAYS)
     closing = (lean[0] * RAYS.cos + lean[1] * RAYS.sin) - RAYS.slope[:, None]
     exact = HEIGHT / np.where(closing > 0.03, closing, np.nan)
     clear = exact < 85
@@ -25,7 +26,7 @@ def test_a_slope_is_met_where_ray_and_plane_cross(lean):
 
 
 def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
-    distance, cosine = Ground(lean=(0.1, 0.0)).meet(RAYS)
+    distance, cosine = Ground(OPEN, lean=(0.1, 0.0)).meet(RAYS)
     column = HDL64E.columns // 2  # ahead, to within a fifth of a degree
     e = RAYS.lasers.elevation
     met = np.isfinite(distance[:, column])
@@ -33,7 +34,7 @@ def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
 
 
 def test_on_waves_a_ray_ends_where_it_first_meets_the_surface():
-    ground = Ground(waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)))
+    ground = Ground(OPEN, waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)))
     distance, _ = ground.meet(RAYS)
     met = np.isfinite(distance)
     s, a = np.where(met, distance, 1.0), np.broadcast_to(RAYS.azimuth, RAYS.shape)

@@ -6,7 +6,7 @@ import pytest
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator.draws import ScalarDraws
-from r2flow.simulator.ground import Ground
+from r2flow.simulator.ground import Ground, Street
 from r2flow.simulator.lasers import Rays, along_rows, lasers_of
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.scene import SceneBuilder
@@ -16,12 +16,12 @@ HDL64E = SENSORS["hdl64e"]
 HEIGHT = HDL64E.height
 
 
-def look(*solids, ground=None, sensor=HDL64E, lasers=None, material="concrete"):
-    """Hits of all rays on a few solids over flat ground, and r = s / cos e."""
-    b = SceneBuilder(ground or Ground(), ScalarDraws(np.random.default_rng(0)))
+def look(*solids, lasers=None):
+    """Hits of all rays on a few solids over flat ground far from any street, and r = s / cos e."""
+    b = SceneBuilder(Ground((Street(0.0, 1e6, 0.0, 4.0, 2.0),)), ScalarDraws(np.random.default_rng(0)))
     for label, solid in solids:
-        b.add(solid, label, material)
-    rays = Rays(lasers or along_rows(sensor), sensor.columns, sensor.height)
+        b.add(solid, label, "concrete")
+    rays = Rays(lasers or along_rows(HDL64E), HDL64E.columns, HEIGHT)
     hits = cast(b.build(), rays, np.random.default_rng(1))
     return hits, hits.distance / np.cos(rays.lasers.elevation)[:, None], rays
 

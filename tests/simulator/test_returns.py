@@ -7,7 +7,7 @@ from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import observe
 from r2flow.simulator.draws import ScalarDraws
-from r2flow.simulator.ground import Ground
+from r2flow.simulator.ground import Ground, Street
 from r2flow.simulator.lasers import HDL64E, RIGS, along_rows, hidden, lasers_of, rows_of
 from r2flow.simulator.materials import INDEX, MATERIALS
 from r2flow.simulator.scene import SceneBuilder
@@ -15,11 +15,12 @@ from r2flow.simulator.shapes import Boxes, Cylinders
 
 SENSOR = SENSORS["hdl64e"]
 VLP16 = SENSORS["vlp16"]
+OPEN = Ground((Street(0.0, 1e6, 0.0, 4.0, 2.0),))  # flat, without a street in sight
 
 
 def wall(material: str, distance: float = 10.0, sensor=VLP16, albedo: float | None = None):
     """The scan of a wall ahead of the sensor, and the pixels that look at it within 30 degrees."""
-    b = SceneBuilder(Ground(), ScalarDraws(np.random.default_rng(0)))
+    b = SceneBuilder(OPEN, ScalarDraws(np.random.default_rng(0)))
     usual = MATERIALS[INDEX[material]].albedo if albedo is None else albedo
     b.add(Boxes(distance + 5, 0, 0, 10, 200, -1, 100), "building", material, usual)
     scan = observe(b.build(), sensor, np.random.default_rng(1))
@@ -112,7 +113,7 @@ def test_neighbouring_lasers_see_the_own_car_from_either_side():
 def test_a_pixel_keeps_the_nearest_of_several_lasers():
     # at 16 rows about four lasers share a row: a thin near bar must not be overwritten by what is behind
     coarse = SENSOR.resized(16, 1024)
-    b = SceneBuilder(Ground(), ScalarDraws(np.random.default_rng(0)))
+    b = SceneBuilder(OPEN, ScalarDraws(np.random.default_rng(0)))
     b.add(Boxes(20, 0, 0, 1, 200, -1, 50), "building", "plaster", 0.4)
     b.add(Cylinders(10, 0, 0.5, 1.6, 1.7), "pole", "plaster", 0.4)  # a bar seen by two lasers at most
     assert (observe(b.build(), coarse, np.random.default_rng(1)).labels[:, 512] == LABELS["pole"]).any()
