@@ -50,8 +50,7 @@ class Boxes(NamedTuple):
     top: Column
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
-        k, w, near, far = _box_spans(self, rays)
-        return _upright(self, rays, k, w, near, far)
+        return _upright(self, rays, *_box_spans(self, rays))
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
         u, v, c, s = _into(self, k, x, y)
@@ -128,8 +127,6 @@ class Cylinders(NamedTuple):
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
         k, w, middle, half = _chords(self, rays)
-        ahead = middle + half > NEAR
-        k, w, middle, half = k[ahead], w[ahead], middle[ahead], half[ahead]
         return _upright(self, rays, k, w, np.maximum(middle - half, NEAR), middle + half)
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
@@ -233,17 +230,17 @@ _CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 def _chords(solids: "Cylinders | Blobs", rays: Rays) -> tuple[np.ndarray, ...]:
-    """Chords of columns in the circular footprints of solids: solid k, column w, midpoint and half length."""
+    """Chords ahead in the circular footprints of solids: solid k, column w, midpoint and half length."""
     x, y, radius = solids.x, solids.y, solids.radius
     distance = hypotenuse(x, y)
-    inside = distance <= radius
-    half = np.where(inside, np.pi, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1)))
-    k, w = column_windows(np.arctan2(y, x).astype(np.float64), half.astype(np.float64) + EDGE, rays.columns)
+    angle = np.where(distance <= radius, np.pi, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1)))
+    k, w = column_windows(np.arctan2(y, x).astype(np.float64), angle.astype(np.float64) + EDGE, rays.columns)
     middle = x[k] * rays.cos[w] + y[k] * rays.sin[w]
     across = y[k] * rays.cos[w] - x[k] * rays.sin[w]
     square = radius[k] ** 2 - across**2
-    met = (square > 0) & ((middle > 0) | inside[k])
-    return k[met], w[met], middle[met], np.sqrt(square[met])
+    half = np.sqrt(np.maximum(square, 0))
+    met = (square > 0) & (middle + half > NEAR)
+    return k[met], w[met], middle[met], half[met]
 
 
 def _upright(
