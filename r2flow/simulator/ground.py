@@ -168,41 +168,35 @@ class Ground:
             distance[rows], steepness[rows] = _meet_profile(s, z, rays.slope[rows], rays.height[rows])
         approach = steepness - rays.slope[:, None]  # approach of ray and ground per metre of s
         cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + steepness**2))
+        met = np.isfinite(distance)
+        cos, sin, approach = (np.broadcast_to(q, met.shape)[met] for q in (rays.cos, rays.sin, approach))
         if self.kerb > 0:
-            distance, cosine = self._step_up(rays, distance, approach, cosine)
+            distance[met], cosine[met] = self._step_up(distance[met], cos, sin, approach, cosine[met])
         if self.tufts > 0:
-            distance = self._overgrown(rays, distance, approach)
+            distance[met] = self._overgrown(distance[met], cos, sin, approach)
         return distance, cosine
 
     def _step_up(
-        self, rays: Rays, low: np.ndarray, approach: np.ndarray, cosine: np.ndarray
+        self, low: np.ndarray, c: np.ndarray, s: np.ndarray, approach: np.ndarray, cosine: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Raise everything except carriageways by the kerb.
 
         A ray reaches the raised level first, kerb / approach before the low level. Off the street it ends there; over
         the street it continues to the low level, or to the kerb's face if that is nearer.
         """
-        met = np.isfinite(low)
-        s_low, c, s = (np.broadcast_to(q, met.shape)[met] for q in (low, rays.cos, rays.sin))
-        s_high = np.maximum(s_low - np.float32(self.kerb) / approach[met], 0)
-        d_high, d_low = self.off_street(s_high * c, s_high * s), self.off_street(s_low * c, s_low * s)
+        high = np.maximum(low - np.float32(self.kerb) / approach, 0)
+        d_high, d_low = self.off_street(high * c, high * s), self.off_street(low * c, low * s)
         face = (d_high <= 0) & (d_low > 0)
         share = d_high / np.where(face, d_high - d_low, 1)
-        out, facing = low.copy(), cosine.copy()
-        out[met] = np.where(d_high > 0, s_high, np.where(face, s_high + share * (s_low - s_high), s_low))
-        facing[met] = np.where(face, np.maximum(cosine[met], 0.6), cosine[met])
-        return out, facing
+        distance = np.where(d_high > 0, high, np.where(face, high + share * (low - high), low))
+        return distance, np.where(face, np.maximum(cosine, 0.6), cosine)
 
-    def _overgrown(self, rays: Rays, distance: np.ndarray, approach: np.ndarray) -> np.ndarray:
+    def _overgrown(self, distance: np.ndarray, c: np.ndarray, s: np.ndarray, approach: np.ndarray) -> np.ndarray:
         """Move intersections with the verge forward by h / approach, for grass and rubble of height h."""
-        met = np.isfinite(distance)
-        s, c, sine_ = (np.broadcast_to(q, met.shape)[met] for q in (distance, rays.cos, rays.sin))
-        x, y = s * c, s * sine_
+        x, y = distance * c, distance * s
         share = np.clip((self.off_street(x, y) - self.pavement) * 2, 0, 1)  # grows over half a metre
         h = 0.25 * (2 + sine(2.3 * x + 1.1 * y) * sine(0.7 * x - 2.9 * y) + sine(4.1 * x - 3.3 * y)) * self.tufts
-        out = distance.copy()
-        out[met] = np.maximum(s - share * h / np.maximum(approach[met], np.float32(0.02)), np.float32(0.5) * s)
-        return out
+        return np.maximum(distance - share * h / np.maximum(approach, np.float32(0.02)), np.float32(0.5) * distance)
 
 
 def _meet_profile(s: np.ndarray, z: np.ndarray, slope: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
