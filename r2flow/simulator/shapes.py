@@ -53,13 +53,8 @@ class Boxes(NamedTuple):
         return _upright(self, rays, *_box_spans(self, rays))
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        u, v, c, s = _into(self, k, x, y)
-        sides = np.abs(u) - self.length[k] / 2, np.abs(v) - self.width[k] / 2
-        face = np.stack([*sides, z - self.top[k], self.bottom[k] - z]).argmax(0)
-        nu = np.where(face == 0, np.sign(u), 0)
-        nv = np.where(face == 1, np.sign(v), 0)
-        nz = (face == 2).astype(np.float32) - (face == 3)
-        return Normal(nu * c - nv * s, nu * s + nv * c, nz, np.where(face == 0, v, u), face == 0, face < 2)
+        upright = [np.zeros_like(self.x)] * 3
+        return Frusta(*self, *upright).normal(k, x, y, z)
 
 
 class Frusta(NamedTuple):
