@@ -47,8 +47,8 @@ class Scan:
 
     @cached_property
     def surfaces(self) -> tuple[np.ndarray, np.ndarray]:
-        """z-components of the normals and cosines of the angle of incidence, (1, H, W) each."""
-        return normals(self.r[None], self.sensor)
+        """z-components of the normals and cosines of the angle of incidence, (H, W) each."""
+        return normals(self.r, self.sensor)
 
 
 def histogram(x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
@@ -104,7 +104,7 @@ def drop_range(scan: Scan) -> np.ndarray:
 
 def drop_incidence(scan: Scan) -> np.ndarray:
     """`drop_rate` per bin of the angle of incidence, (3, 10), estimated as in `drop_range`."""
-    cosine = scan.surfaces[1][0]
+    _, cosine = scan.surfaces
     return drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, INCIDENCES)
 
 

@@ -13,21 +13,21 @@ GAP = 16  # columns; longer gaps are sky or occluded, not dropped rays
 def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals n ~ (p(h - 1, w) - p(h + 1, w)) x (p(h, w - 2) - p(h, w + 2)), p = r d, towards the sensor.
 
-    n_z, the upward part, and |n . d| = cos i, i the angle of incidence, (N, H, W) float32 each as the ranges r in
-    metres; NaN where one of the five pixels is missing or its range differs by more than 15 % from the centre.
+    n_z, the upward part, and |n . d| = cos i, i the angle of incidence, (H, W) float32 each as the ranges r in metres;
+    NaN where one of the five pixels is missing or its range differs by more than 15 % from the centre.
     """
     e, a = sensor.rays().numpy()
     d = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    p = r[:, None] * d
+    p = r * d
     left, right = np.roll(p, SPAN, axis=-1), np.roll(p, -SPAN, axis=-1)  # azimuth falls with w
     above, below = _above_and_below(p)
-    n = np.cross(above - below, left - right, axis=1)
-    size = np.sqrt((n**2).sum(1))
+    n = np.cross(above - below, left - right, axis=0)
+    size = np.sqrt((n**2).sum(0))
     usable = (r > 0) & (size > 0)
     for other in (*_above_and_below(r), np.roll(r, SPAN, -1), np.roll(r, -SPAN, -1)):
         usable &= (other > 0) & (np.abs(other - r) < STEP * r)
-    n = n / np.where(usable, size, np.nan)[:, None]
-    return n[:, 2], np.abs((n * d).sum(1))
+    n = n / np.where(usable, size, np.nan)
+    return n[2], np.abs((n * d).sum(0))
 
 
 def _above_and_below(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

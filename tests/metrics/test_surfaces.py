@@ -41,7 +41,7 @@ def inner(r: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("lean", [0.0, 0.2])
 def test_the_normal_of_the_ground_leans_as_it_does_and_its_incidence_is_the_angle_to_it(lean):
     r, upright = ground(lean), math.cos(math.atan(lean))
-    up, cosine = (q[0] for q in normals(r[None], SENSOR))
+    up, cosine = normals(r, SENSOR)
     near = inner(r) & (r < 7)  # farther away rows lie more than 15 % apart
     assert near.sum() > 1000
     np.testing.assert_allclose(up[near], upright, atol=1e-3)
@@ -52,16 +52,16 @@ def test_the_normal_of_the_ground_leans_as_it_does_and_its_incidence_is_the_angl
 def test_the_normal_of_a_wall_is_level_and_its_incidence_is_the_angle_to_it():
     ahead = np.abs(A) < 0.6
     r = np.where(ahead, 10 / (np.cos(E) * np.where(ahead, np.cos(A), 1)), 0).astype(np.float32)
-    up, cosine = (q[0] for q in normals(r[None], SENSOR))
+    up, cosine = normals(r, SENSOR)
     on = inner(r)
     np.testing.assert_allclose(up[on], 0, atol=1e-3)
     np.testing.assert_allclose(cosine[on], (np.cos(E) * np.cos(A))[on], atol=1e-3)
 
 
 def test_edges_have_no_normal():
-    r = np.full((1, *SENSOR.shape), 10, np.float32)
-    r[..., 256:] = 20
-    up = normals(r, SENSOR)[0][0]
+    r = np.full(SENSOR.shape, 10, np.float32)
+    r[:, 256:] = 20
+    up, _ = normals(r, SENSOR)
     assert np.isnan(up[:, 254:258]).all()
     assert np.isfinite(up[1:-1, 4:254]).all()
 
