@@ -201,16 +201,9 @@ def _into(solids: "Boxes | Frusta", k: np.ndarray, x: Column, y: Column) -> tupl
 
 def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
     """Distances at which columns w enter and leave the footprints of solids k: k, w, near < far in metres."""
-    u, v, c, s = _into(solids, np.arange(len(solids.x)), np.float32(0), np.float32(0))
-    a, b = solids.length / 2, solids.width / 2
-    corner_x = [solids.x + i * a * c - j * b * s for i, j in _CORNERS]
-    corner_y = [solids.y + i * a * s + j * b * c for i, j in _CORNERS]
-    middle = np.arctan2(solids.y, solids.x).astype(np.float64)
-    turn = np.arctan2(corner_y, corner_x) - middle
-    half = np.abs((turn + np.pi) % (2 * np.pi) - np.pi).max(0)
-    half[(np.abs(u) <= a) & (np.abs(v) <= b)] = np.pi  # the sensor's axis is inside
-    k, w = column_windows(middle, half + EDGE, rays.columns)
-    u, v, c, s, a, b = (q[k] for q in (u, v, c, s, a, b))
+    k, w = _crossed(solids, hypotenuse(solids.length, solids.width) / 2, rays)
+    u, v, c, s = _into(solids, k, np.float32(0), np.float32(0))
+    a, b = solids.length[k] / 2, solids.width[k] / 2
     du, dv = rays.cos[w] * c + rays.sin[w] * s, rays.sin[w] * c - rays.cos[w] * s
     near, far = np.full(len(k), NEAR, np.float32), np.full(len(k), np.inf, np.float32)
     for position, direction, reach in ((u, du, a), (v, dv, b)):
@@ -221,15 +214,17 @@ def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
     return k[met], w[met], near[met], far[met]
 
 
-_CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+def _crossed(solids: Shape, radius: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of a solid k and a column w that may cross the circle of a radius around the solid."""
+    x, y, distance = solids.x, solids.y, hypotenuse(solids.x, solids.y)
+    angle = np.where(distance <= radius, np.pi, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1)))
+    return column_windows(np.arctan2(y, x).astype(np.float64), angle.astype(np.float64) + EDGE, rays.columns)
 
 
 def _chords(solids: "Cylinders | Blobs", rays: Rays) -> tuple[np.ndarray, ...]:
     """Chords ahead in the circular footprints of solids: solid k, column w, midpoint and half length."""
     x, y, radius = solids.x, solids.y, solids.radius
-    distance = hypotenuse(x, y)
-    angle = np.where(distance <= radius, np.pi, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1)))
-    k, w = column_windows(np.arctan2(y, x).astype(np.float64), angle.astype(np.float64) + EDGE, rays.columns)
+    k, w = _crossed(solids, radius, rays)
     middle = x[k] * rays.cos[w] + y[k] * rays.sin[w]
     across = y[k] * rays.cos[w] - x[k] * rays.sin[w]
     square = radius[k] ** 2 - across**2
