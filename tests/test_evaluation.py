@@ -44,7 +44,7 @@ def test_figures_do_not_depend_on_order_batches_or_reading_processes(real, gener
     there = open_scans(str(real), READING)
     expected = figures(there, open_scans(str(generated), READING))
     backwards = folder(tmp_path / "backwards", images(10, 2)[::-1])
-    found = figures(there.part(range(11, -1, -1), "backwards"), open_scans(str(backwards), READING), work=Work(3, 1))
+    found = figures(there.part(range(11, -1, -1), "backwards"), open_scans(str(backwards), READING), work=Work(1, 1))
     assert found == pytest.approx(expected, rel=1e-10)
 
 
