@@ -97,19 +97,15 @@ def test_a_turn_changes_the_sectors_alone_and_a_mirror_image_sides_and_signs():
     torch.testing.assert_close(slant[0], -slant[1], atol=0.01, rtol=0)
 
 
-@pytest.mark.parametrize("shape", [(16, 100), (3, 5), (40, 2048)])
+@pytest.mark.parametrize("shape", [(16, 100), (3, 5), (40, 800)])  # three of the last are computed in parts
 @pytest.mark.parametrize("sensor", ["vlp16", "os1_64"])
 def test_any_sensor_and_size_with_and_without_reflectance(sensor, shape):
     resized = SENSORS[sensor].resized(*shape)
-    some = scans_of(2, sensor=resized)
-    assert BOTH.features(some).shape == (2, BOTH.dim)
+    some = scans_of(3, sensor=resized)
+    assert BOTH.features(some).shape == (3, BOTH.dim)
     assert BOTH.features(some).isfinite().all()
+    torch.testing.assert_close(BOTH.features(some)[2:], BOTH.features(Scans(some.images[2:], resized)))
     of_range = RANGE.features(Scans(some.images[:, :1], resized))
-    assert of_range.shape == (2, RANGE.dim)
+    assert of_range.shape == (3, RANGE.dim)
     same = {name: x for name, x in by_name(BOTH.features(some)).items() if "reflectance" not in name}
     torch.testing.assert_close(of_range, torch.cat(list(same.values()), 1))
-
-
-def test_a_scan_among_many_has_its_own_features():
-    many = scans_of(40, sensor=SENSORS["hdl64e"].resized(64, 256))  # more than are computed at once
-    torch.testing.assert_close(BOTH.features(many)[17:18], BOTH.features(Scans(many.images[17:18], many.sensor)))
