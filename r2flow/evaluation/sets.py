@@ -62,7 +62,7 @@ class SampledScans(MadeScans):
     drawn, word = True, "sample"
 
     def __init__(
-        self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int, precision: Precision = "32-true"
+        self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int, precision: Precision
     ) -> None:
         self.flow, self.numbers, self.sampler, self.seed, self.precision = flow, numbers, sampler, seed, precision
         self.unsolved = 0  # samples so far that missed the tolerance
@@ -113,19 +113,19 @@ def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None
 class Baseline(MadeScans):
     """Scans (2 or 1, H, W) of the baseline `word` of `BASELINES`; `training` are real scans, (N, 2 or 1, H, W)."""
 
-    def __init__(self, word: str, training: np.ndarray, sensor: Sensor, numbers: Sequence[int], seed: int = 0) -> None:
-        self.word, self.training, self.sensor, self.numbers, self.seed = word, training, sensor, numbers, seed
+    def __init__(self, word: str, training: np.ndarray, sensor: Sensor, numbers: Sequence[int]) -> None:
+        self.word, self.training, self.sensor, self.numbers = word, training, sensor, numbers
 
     def __getitem__(self, index: int) -> np.ndarray:
         return BASELINES[self.word](self, self.numbers[index])
 
     def about(self) -> dict[str, object]:
-        return {"kind": "baseline", "seed": self.seed, "reflectance": self.training.shape[1] > 1}
+        return {"kind": "baseline", "seed": 0, "reflectance": self.training.shape[1] > 1}
 
     def noise(self, number: int) -> np.ndarray:
         """Decoded x_0 ~ N(0, I)."""
         encoding = Encoding(self.sensor, reflectance=self.training.shape[1] > 1)
-        return encoding.decode(standard_normal(self.training.shape[1:], self.seed, "evaluation", number)).numpy()
+        return encoding.decode(standard_normal(self.training.shape[1:], 0, "evaluation", number)).numpy()
 
     def flat_ground(self, number: int) -> np.ndarray:
         """r = -height / sin e within the sensor's range limits."""
@@ -144,7 +144,7 @@ class Baseline(MadeScans):
     def shuffled_pixels(self, number: int) -> np.ndarray:
         """Each pixel from a random training scan."""
         rows, columns = np.indices(self.sensor.shape)
-        scan = generator(self.seed, "shuffle", number).integers(len(self.training), size=self.sensor.shape)
+        scan = generator(0, "shuffle", number).integers(len(self.training), size=self.sensor.shape)
         return np.moveaxis(self.training[scan, :, rows, columns], -1, 0)
 
 

@@ -64,10 +64,10 @@ def role_of(checkpoint: Checkpoint, label: str) -> str:
 def paper_page(
     runs: Sequence[PaperRun],
     rows: Sequence[Row],
-    real: ScanSet | None = None,
-    num: int = 16,
-    steps: int = 256,
-    device: str = "cpu",
+    real: ScanSet | None,
+    num: int,
+    steps: int,
+    device: str,
 ) -> Page:
     """Build the page from rows of `read_results`; without `real` scans it has no figure 3.
 

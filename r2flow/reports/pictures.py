@@ -156,7 +156,7 @@ def _show(axes: Any, values: np.ndarray, title: str, cmap: Any, ticks: Mapping[f
         _bar(axes, drawn, ticks)
 
 
-def class_colours(labels: np.ndarray, most: int | None = None) -> dict[int, tuple[str, str]]:
+def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
     """Name and colour of the `most` most frequent semantic ids in labels, (N,), in order of frequency.
 
     Names are SemanticKITTI's if it defines all ids, else numbers.

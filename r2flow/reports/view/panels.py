@@ -136,10 +136,10 @@ def way_panels(
     return [Panel(f"{label}, seed {seed}, sample {n}", image, rays, None, frames) for n, image in enumerate(images)]
 
 
-def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, title: str = "r2flow") -> Path:
-    """Write a page with one panel per set, with `num` evenly spread scans as frames."""
+def write_sets(path: Path, sets: Mapping[str, ScanSet], title: str) -> Path:
+    """Write a page with one panel per set, with four evenly spread scans as frames."""
     panels = [
-        Panel(f"{name}: {scans.label}", scans.spread(num)[:].nan_to_num(0.0).numpy(), scans.sensor.rays())
+        Panel(f"{name}: {scans.label}", scans.spread(4)[:].nan_to_num(0.0).numpy(), scans.sensor.rays())
         for name, scans in sets.items()
     ]
     return write_page(path, panels, title)
