@@ -111,14 +111,12 @@ def _visible(shape: Shape, surface: Surface, rays: Rays, limit: np.ndarray, rng:
 
 def _on_ground(scene: Scene, rays: Rays, distance: np.ndarray, cosine: np.ndarray) -> Hits:
     """Hits on the ground without solids, (B W,) each."""
-    label = np.zeros(distance.shape, np.uint16)
-    material = np.zeros(distance.shape, np.uint8)
+    label, material, albedo = (np.zeros(distance.shape, kind) for kind in (np.uint16, np.uint8, np.float32))
     met = np.flatnonzero(np.isfinite(distance))
     w = met % rays.columns
     x, y = distance[met] * rays.cos[w], distance[met] * rays.sin[w]
-    albedo = np.zeros(distance.shape, np.float32)
     label[met], material[met], albedo[met] = scene.ground.surface(x, y)
-    return Hits(distance, cosine.copy(), label, material, albedo)
+    return Hits(distance, cosine, label, material, albedo)
 
 
 def _on_solid(hits: Hits, rays: Rays, shape: Shape, surface: Surface, fragments: Fragments) -> None:
