@@ -17,7 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count
-from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, outlive_parent
+from r2flow.signals import LATER, STOPPING, Stopped, code_of, hear, listening, outlive_parent
 
 from .checkpoints import Checkpoints
 
@@ -73,9 +73,7 @@ class Stopping(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._training = True
         with suppress(ValueError):  # only the main thread can set handlers
-            for number in self.signals:
-                if signal.getsignal(number) is not signal.SIG_IGN:
-                    signal.signal(number, self.hear)
+            hear(self.hear, self.signals)
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int

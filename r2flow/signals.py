@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from types import FrameType
+from typing import Any
 
 Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
@@ -41,17 +42,22 @@ def outlive_parent(seconds: float = 10.0) -> None:
         time.sleep(0.1)
 
 
-@contextmanager
-def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
-    """Handle signals within a block; without effect outside the main thread, which alone receives them.
+def hear(handler: Handler, signals: Sequence[int] = STOPPING) -> dict[int, Any]:
+    """Handle signals, and return their former handlers.
 
     Signals stay ignored if they were, as Ctrl-C in background jobs of a shell and SIGHUP under nohup.
     """
+    heard = [number for number in signals if signal.getsignal(number) is not signal.SIG_IGN]
+    return {number: signal.signal(number, handler) for number in heard}
+
+
+@contextmanager
+def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
+    """Handle signals within a block as `hear`; without effect outside the main thread, which alone receives them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heard = [number for number in signals if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, handler) for number in heard}
+    before = hear(handler, signals)
     try:
         yield
     finally:
@@ -88,20 +94,14 @@ def heard_from_the_first_import() -> Iterator[None]:
         try:
             yield
         finally:
-            atexit.unregister(_hear_at_exit)
-            atexit.register(_hear_at_exit)  # registered last, so that it is called first
+            atexit.unregister(hear)
+            atexit.register(hear, end_at_once)  # registered last, so that it is called first
 
 
 def _end_in_peace() -> None:
     """Ignore signals while the interpreter shuts down."""
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
-
-
-def _hear_at_exit() -> None:
-    for number in STOPPING:
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, end_at_once)
 
 
 def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exit(1)) -> None:
@@ -138,9 +138,8 @@ def outlive_the_signal(worker: int = 0) -> None:
     """
     end_with_parent()
 
-    def hear(number: int, frame: FrameType | None) -> None:
+    def end_later(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(30)
 
-    for number in STOPPING:
-        signal.signal(number, hear)
+    hear(end_later)

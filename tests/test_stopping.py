@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from r2flow.errors import InputError
-from r2flow.signals import STOPPING, Stopped, listening, out_of_reach, stop_at_once
+from r2flow.signals import STOPPING, Stopped, listening, out_of_reach, outlive_the_signal, stop_at_once
 from r2flow.store import Store
 from tests.conftest import ROOT
 from tests.killing import is_gone, wait_until
@@ -56,21 +56,16 @@ def test_told_to_stop_during_an_import(tmp_path: Path, command: str, argv: list[
 
 LOADER = """
 import os, time
-from pathlib import Path
 from torch.utils.data import DataLoader
 from r2flow.signals import end_with_parent
 
-class Big:
-    def __len__(self):
-        return 100
-    def __getitem__(self, index):
-        Path(f"pid-{os.getpid()}").touch()
-        return b"x" * 2**20  # more than a pipe takes: a worker waits for its reader
+def big(item):
+    open(f"pid-{os.getpid()}", "w").close()
+    return b"x" * 2**20  # more than a pipe takes: a worker waits for its reader
 
-if __name__ == "__main__":
-    loader = iter(DataLoader(Big(), batch_size=None, num_workers=2, worker_init_fn=end_with_parent))
-    next(loader)
-    time.sleep(100)
+loader = iter(DataLoader(range(100), batch_size=None, num_workers=2, collate_fn=big, worker_init_fn=end_with_parent))
+next(loader)
+time.sleep(100)
 """
 
 
@@ -92,6 +87,12 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path, script: str):
         parent.wait()
     wait_until(lambda: is_gone(parent.pid), seconds=20)
     assert not list(tmp_path.glob(".*"))  # locks of a store
+
+
+def test_a_worker_does_not_hear_what_its_run_ignores():
+    with listening(signal.SIG_IGN):  # as a hang-up under nohup
+        outlive_the_signal()
+        assert {signal.getsignal(number) for number in STOPPING} == {signal.SIG_IGN}
 
 
 WORKERS = """
