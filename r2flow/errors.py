@@ -108,12 +108,14 @@ class PlainFormatter(logging.Formatter):
 
 
 class _Unbroken(io.FileIO):
-    """A file descriptor that can be written to after its reader (`| head`) has ended."""
+    """A file descriptor that can be written to after its reader (`| head`) has ended or its terminal is closed."""
 
     def write(self, data: Any) -> int:
         try:
             return super().write(data)
-        except BrokenPipeError:
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.EIO):
+                raise
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self.fileno())
             os.close(null)
