@@ -1,7 +1,7 @@
 """Entry point of `train.py` and `r2flow train`: Hydra, sweeps, chains, exit codes, one-line error messages.
 
 Exit codes: 0 for a finished run, 2 for a user error, 75 if the same command resumes (`trainer.max_time`, SLURM's time
-limit), 130 after Ctrl-C, 143 after SIGTERM.
+limit), 129 after a hang-up, 130 after Ctrl-C, 143 after SIGTERM.
 """
 
 import functools
@@ -38,7 +38,7 @@ from r2flow.runs.composing import (
     plain,
     with_choices,
 )
-from r2flow.signals import LATER, Stopped, listening, stop_at_once
+from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, stop_at_once
 
 
 class JobEnded(RuntimeError):
@@ -208,7 +208,7 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
 
     run_dir = HydraConfig.get().runtime.output_dir
     code = run_process([*_restart(command), *given, override("run_dir", str(run_dir))])
-    if code in (130, 143):
+    if code in map(code_of, STOPPING):
         raise Stopped(code, "the sweep stopped; the same command resumes there")
     if code:
         ended.append((code, str(run_dir)))

@@ -209,12 +209,13 @@ def test_a_sweep_refuses_one_folder_for_all_of_its_runs(train: Run, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_a_killed_sweep_takes_its_job_with_it(scans: Path, tmp_path: Path):
+@pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGHUP])
+def test_a_killed_sweep_takes_its_job_with_it(scans: Path, tmp_path: Path, by: int):
     command = ["-m", *tiny(scans, "stage.loss=mse,pseudo_huber", *hold_at(3, tmp_path / "held"))]
     process = start(tmp_path, command)
     wait_for(tmp_path / "held", process)
     (job,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    os.kill(process.pid, signal.SIGKILL)
+    os.kill(process.pid, by)
     # Its output, into which the job writes too, ends when both are gone; the job would wait for a minute.
     process.communicate(timeout=30)
     state = Path("/proc", job, "stat")
@@ -298,8 +299,7 @@ def test_a_mixture_goes_on_where_it_stopped_and_may_move(train: Run, scans: Path
     for name, frames in (("a", range(0, 5)), ("b", range(5, 12))):
         (tmp_path / name).mkdir()
         for frame in frames:
-            points = read_points(scans / f"{frame:06d}.bin")
-            write_points(tmp_path / name / f"{frame:06d}.ply", points.xyz)
+            write_points(tmp_path / name / f"{frame:06d}.ply", read_points(scans / f"{frame:06d}.bin").xyz)
 
     def options(root_a: Path, name: str) -> list[str]:
         parts = f"[{{name: folder, root: {root_a}, weight: 3}}, {{name: folder, root: {tmp_path / 'b'}, weight: 1}}]"
