@@ -225,8 +225,7 @@ def test_the_discriminator_begins_at_its_step_and_ends_there_as_published():
 
 def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
     case = load_case(shared, "lidm_data.pt")
-    nearest, farthest = case["depth_range"]
-    sensor = build_sensor("hdl64e", 16, 64, nearest, farthest)
+    sensor = build_sensor("hdl64e", 16, 64, *case["depth_range"])
     encoding = Encoding(sensor, "shifted_log", reflectance=False)
     assert encoding.format.scale == case["depth_scale"]
     x = encoding.encode(case["metres"][None])
@@ -291,8 +290,7 @@ def test_an_option_that_changes_the_images_and_is_not_read_is_refused(published:
 
 def test_points_fall_into_the_published_pixels(published: tuple[Path, dict[str, Any]], shared: Path):
     case = load_case(shared, "lidm_data.pt")
-    nearest, farthest = case["depth_range"]
-    sensor = build_sensor("hdl64e", 16, 64, nearest, farthest)
+    sensor = build_sensor("hdl64e", 16, 64, *case["depth_range"])
     chosen = yaml.safe_load((CONF / "data" / "kitti_360_lidm.yaml").read_text())
     readings = chosen["reading"], chosen["validation"]["data"]["reading"]
     for how in (reading_for([], load_checkpoint(published[0])).convention, *(r["convention"] for r in readings)):
@@ -410,6 +408,7 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
         ({"schedule": {"name": "cosine", "steps": 1}}, "steps must be a whole number of at least 2"),
         ({"schedule": {"name": "square_root_linear", "last": 2.0}}, r"last must be a finite number in \(0, 1\)"),
+        ({"schedule": {"name": "sigmoid", "start": 3.0}}, "log-SNRs beyond 80 or none in generator.schedule"),
     ],
 )
 def test_sizes_that_cannot_work_are_one_line(change: dict[str, Any], said: str):
