@@ -31,7 +31,7 @@ MODELS: Registry[Model] = Registry(
     ),
     densify=Model(
         "scans of few beams or points completed to all, in one evaluation, learned from simulated scans",
-        "620e21cc5ef1b7568fd80afb729e65ce47462d5596b3bee04d0838c0072422c0",
+        "3bf412e171f7e822f6411250b090af8a920d20b00c1a5f86f6d61eb62a213712",
     ),
 )
 DEFAULT = "street"
