@@ -60,7 +60,7 @@ class EvaluateOptions:
         ),
     ] = None
     train: Annotated[
-        str | None, typer.Option(help=f"Training scans, to detect copies by nearest-neighbour distances: {SETS}.")
+        str | None, typer.Option(help=f"Training scans, to find copies by their distances: {SETS}.")
     ] = None
     train_split: Annotated[str | None, typer.Option(help="Part of TRAIN's standard split.")] = None
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Recompute the statistics of the real scans.")] = False
@@ -81,7 +81,7 @@ class EvaluateOptions:
     batch_size: Annotated[int, typer.Option(min=1, help="Scans per batch.")] = 8
     workers: Annotated[int, typer.Option(min=0, help="Additional processes that read scans.")] = 2
     device: DeviceOption = "auto"
-    json: Annotated[Path | None, typer.Option("--json", help="JSON file for all results with their protocols.")] = None
+    json: Annotated[Path | None, typer.Option("--json", help="JSON file of results with their protocols.")] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page; replaces an earlier one.")] = None
 
     def check(self, named: Sequence[str], sampled: Sequence[str]) -> None:
