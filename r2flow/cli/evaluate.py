@@ -59,9 +59,7 @@ class EvaluateOptions:
             "--baselines/--no-baselines", help="Noise, flat ground, mean scan, shuffled pixels.", show_default="on"
         ),
     ] = None
-    train: Annotated[
-        str | None, typer.Option(help=f"Training scans, to find copies by their distances: {SETS}.")
-    ] = None
+    train: Annotated[str | None, typer.Option(help=f"Training scans, to find copies by distance: {SETS}.")] = None
     train_split: Annotated[str | None, typer.Option(help="Part of TRAIN's standard split.")] = None
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Recompute the statistics of the real scans.")] = False
     num: Annotated[
