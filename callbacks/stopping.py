@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class Stopping(L.Callback):
-    """On SIGTERM, Ctrl-C and, in a SLURM job, SIGUSR1: writes a checkpoint after the step and raises `Stopped`.
+    """On SIGTERM, SIGHUP, Ctrl-C and, in a SLURM job, SIGUSR1: writes a checkpoint after the step and raises `Stopped`.
 
     SLURM sends SIGUSR1 before a time limit: the job is requeued by `scontrol requeue`. Until training starts, a run
     stops at once without a checkpoint; on several machines it ends, since Python hears nothing while it waits for them.

@@ -20,7 +20,7 @@ LATER = 75  # exit code EX_TEMPFAIL of an unfinished run: the same command resum
 
 
 class Stopped(BaseException):
-    """Work was stopped by a signal; `code` is the exit code of the process: 143 after SIGTERM, 130 after Ctrl-C.
+    """Work was stopped by a signal; `code` is the exit code of the process, as 130 after Ctrl-C: `code_of`.
 
     Not an `Exception`, so that handlers of errors (in readers, in Hydra) do not catch it.
     """
@@ -88,7 +88,7 @@ def end_at_once(number: int, frame: FrameType | None = None) -> None:
 
 @contextmanager
 def heard_from_the_first_import() -> Iterator[None]:
-    """Answer Ctrl-C and SIGTERM by one line during a whole program, including slow imports and its exit."""
+    """Answer stop signals by one line during a whole program, including slow imports and its exit."""
     atexit.register(_end_in_peace)  # registered first, so that it is called last
     with listening(end_at_once):
         try:

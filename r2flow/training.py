@@ -277,7 +277,7 @@ def check_trainer(options: Mapping[str, Any]) -> None:
 def fit(run: Run) -> Result:
     """Train a run in its folder, resuming from its last checkpoint, and draw its samples.
 
-    SIGTERM and Ctrl-C stop it after the current step, with a checkpoint; before the first step, at once.
+    SIGTERM, SIGHUP and Ctrl-C stop it after the current step, with a checkpoint; before the first step, at once.
 
     Raises:
         InputError: unreadable scans, another run in its folder, non-finite weights, a full disk.

@@ -408,7 +408,7 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
         ({"schedule": {"name": "cosine", "steps": 1}}, "steps must be a whole number of at least 2"),
         ({"schedule": {"name": "square_root_linear", "last": 2.0}}, r"last must be a finite number in \(0, 1\)"),
-        ({"schedule": {"name": "sigmoid", "start": 3.0}}, "log-SNRs beyond 80 or none in generator.schedule"),
+        ({"schedule": {"name": "sigmoid", "start": 3.0}}, "log-SNRs must lie within 80 of 0"),
     ],
 )
 def test_sizes_that_cannot_work_are_one_line(change: dict[str, Any], said: str):

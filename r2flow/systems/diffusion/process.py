@@ -90,23 +90,23 @@ def of_steps(beta: Tensor) -> Tensor:
 
 
 def square_root_linear(first: Beta = 0.0015, last: Beta = 0.0195, steps: Steps = 1000) -> Tensor:
-    """lambda_t, (steps,) float64, of beta_t with evenly spaced square roots, as in LiDM."""
+    """lambda_t, (N,), of beta_t with evenly spaced square roots, as in LiDM (Ran et al. 2024)."""
     return of_steps(torch.linspace(first**0.5, last**0.5, steps, dtype=torch.float64) ** 2)
 
 
 def linear_steps(steps: Annotated[int, Bound("above 20", lambda n: n > 20)] = 1000) -> Tensor:
-    """lambda_t of beta_t from 0.1 / N to 20 / N: 0.0001 to 0.02 in 1,000 steps (Ho et al. 2020)."""
+    """lambda_t, (N,), of beta_t evenly from 0.1 / N to 20 / N: 0.0001 to 0.02 in 1,000 steps (Ho et al. 2020)."""
     return of_steps(torch.linspace(0.1 / steps, 20 / steps, steps, dtype=torch.float64))
 
 
 def cosine_steps(steps: Steps = 1000, offset: NonNegative = 0.008) -> Tensor:
-    """lambda_t of alpha_t = cos(pi / 2 (t / N + offset) / (1 + offset)), beta_t <= 0.999 (Nichol and Dhariwal 2021)."""
+    """lambda_t, (N,), of alpha_t ~ cos(pi / 2 (t / N + offset) / (1 + offset)) (Nichol and Dhariwal 2021, eq. 17)."""
     t = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
     return _of_signal(torch.cos((t + offset) / (1 + offset) * math.pi / 2).square())
 
 
 def sigmoid_steps(steps: Steps = 1000, start: float = -3.0, end: float = 3.0) -> Tensor:
-    """lambda_t of alpha_t^2 ~ sigmoid(end) - sigmoid(start + (end - start) t / N), 1 at t = 0, beta_t <= 0.999.
+    """lambda_t, (N,), of alpha_t^2 ~ sigmoid(end) - sigmoid(start + (end - start) t / N), 1 at t = 0.
 
     From Jabri et al. 2022, "Scalable adaptive computation for iterative generation".
     """
@@ -115,7 +115,7 @@ def sigmoid_steps(steps: Steps = 1000, start: float = -3.0, end: float = 3.0) ->
 
 
 def _of_signal(alpha_squared: Tensor) -> Tensor:
-    """lambda_t of steps between alpha^2 that are given up to a factor, (N + 1,)."""
+    """lambda_t, (N,) float64, of steps between alpha^2 given up to a factor, (N + 1,), with beta_t <= 0.999."""
     return of_steps((1 - alpha_squared[1:] / alpha_squared[:-1]).clamp(max=0.999))
 
 

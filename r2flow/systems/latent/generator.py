@@ -60,7 +60,7 @@ class LatentDiffusion(Generator):
         self.run_by(LatentDDIM())
         with torch.device("cpu"):
             log_snr = DISCRETE.build(schedule or {"name": "square_root_linear"})
-        check(bool((log_snr.abs() < 80).all()), f"log-SNRs beyond 80 or none in generator.schedule, found {schedule}.")
+        check(bool((log_snr.abs() < 80).all()), f"generator.schedule: log-SNRs must lie within 80 of 0: {schedule}.")
         self.first_stage_model = construct("generator.autoencoder", Autoencoder, autoencoder, space.shape[0])
         self.noise_shape = shape = self.first_stage_model.latent_shape(*space.shape[1:])
         self.model = nn.ModuleDict({"diffusion_model": construct("generator.unet", LatentUNet, unet, shape)})
