@@ -39,7 +39,7 @@ def test_a_published_checkpoint_computes_what_its_authors_did(shared):
     assert loaded.format == "published"
     assert loaded.sensor.shape == (16, 192)
     with torch.no_grad():
-        output = loaded.generator.backbone(case["t"], case["x"])
+        output = loaded.model(case["t"], case["x"])
     assert (output - case["output"]).norm() / case["output"].norm() < 5e-5
 
 

@@ -76,6 +76,11 @@ class Checkpoint:
         """Encoding between model space and metres."""
         return self.generator.space.encoding
 
+    @property
+    def model(self) -> Any:
+        """The network v(t, x) of a flow; a flow map's also takes s."""
+        return self.generator.backbone
+
     def sample(self, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
         """Scans 0 to num - 1 of a seed: range in metres and reflectance, (num, 2 or 1, H, W), 0 without a return.
 
