@@ -47,12 +47,6 @@ def affine(network: Affine | None = None) -> Field:
 M, S = 0.7, 0.25  # x_1 ~ N(M, S^2), x_0 ~ N(0, 1), independent: the flow carries x_0 to M + S x_0
 
 
-def independent(step: int) -> dict[str, torch.Tensor]:
-    draw = torch.Generator().manual_seed(step)
-    x_0, x_1 = torch.randn(2, 512, 1, 2, 2, generator=draw)
-    return {"x_0": x_0, "x_1": M + S * x_1, "u": torch.rand(512, generator=draw)}
-
-
 def pairs(step: int) -> dict[str, torch.Tensor]:
     draw = torch.Generator().manual_seed(step)
     x_0 = torch.randn(256, 1, 2, 2, generator=draw)
@@ -84,8 +78,8 @@ def test_an_untrained_stage_has_the_loss_of_predicting_nothing():
 @pytest.mark.parametrize("wrong", [torch.Tensor.sum, lambda loss: loss[:1], lambda loss: loss[:, None]])
 def test_a_loss_gives_a_value_a_scan(monkeypatch, wrong):
     monkeypatch.setitem(LOSSES._entries, "wrong", lambda v_t, u_t: wrong((v_t - u_t).square().flatten(1).mean(1)))
-    with pytest.raises(InputError, match=r"one value a scan, \(512,\), found"):
-        Rectify(affine(), loss="wrong").training_step(independent(0), 0)
+    with pytest.raises(InputError, match=r"one value a scan, \(256,\), found"):
+        Rectify(affine(), loss="wrong").training_step(pairs(0), 0)
 
 
 X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
