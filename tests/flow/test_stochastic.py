@@ -137,9 +137,3 @@ def test_without_fresh_noise_mmps_needs_no_draws():
     known[:, :, ::2] = 1
     told = {"image": 0.3 * known, "known": known}
     assert flow(x_0, told, sampler=build_sampler("mmps", products=1, churn=0, steps=2)).converged.all()
-
-
-def test_pairs_are_the_ends_of_paths():
-    ways = [build_sampler(way) for way in ("sde", "renoise", "jump", "adams3")]
-    assert [way.draws for way in ways] == [True, True, False, False]
-    assert [way.paired for way in ways] == [False, True, True, True]
