@@ -244,18 +244,6 @@ def test_a_measured_return_without_reflectance_has_one(scans, sampler):
     assert image[:, 1][returned].allclose(torch.tensor(0.4), atol=1e-5)
 
 
-@pytest.mark.parametrize("sensor", [("hdl64e", 16, 64), ("vlp16", 16, 128), ("os1_128", 128, 64)])
-def test_it_completes_the_images_of_any_sensor(flow, sensor):
-    other = flow.at(flow.space.through(build_sensor(*sensor)))
-    images = torch.full((1, 2, *sensor[1:]), 0.5)
-    images[:, 0] = 20
-    state = measured(images, "rows:2")
-    r = other.space.decode(answered(other, images, state).x)[0, 0]
-    assert r.shape == sensor[1:]
-    assert (r[::2] - 20).abs().max() < 1e-4
-    assert flow.space.shape == (2, 8, 32)
-
-
 def test_rows_far_beyond_the_measured_ones_stay_empty(flow):
     images = torch.full((1, 2, 8, 32), 0.5)
     images[:, 0] = 20
