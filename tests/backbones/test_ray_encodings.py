@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.backbones.encodings import Rotary, SphericalHarmonics, position_name, rotate
-from r2flow.errors import InputError
+from r2flow.backbones.encodings import Rotary, SphericalHarmonics, rotate
 from tests.reference import load_case
 
 
@@ -49,10 +48,3 @@ def test_rotation_keeps_lengths_and_depends_on_angle_differences_only():
     torch.testing.assert_close(turned[0].norm(dim=-1), q.norm(dim=-1))
     here, there = (turned[0] * turned[1]).sum(-1), (turned[2] * turned[3]).sum(-1)
     torch.testing.assert_close(here, there, rtol=0, atol=1e-12)
-
-
-def test_published_names_are_understood_and_wrong_ones_explained():
-    assert position_name("polar_coordinates") == "polar"
-    assert position_name(None, "none") == "none"
-    with pytest.raises(InputError, match="no position named 'fourier'; known: fourier_features, none"):
-        position_name("fourier", "none")
