@@ -224,7 +224,8 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path, ranks):
     def run(out: Path, *launcher: str) -> dict[str, float]:
-        options = ("--metrics", "jsd,mmd,frechet_handcrafted", "--size", "8x64", "--batch-size", "2", "--workers", "0")
+        metrics = "jsd,mmd,jsd_lidm,mmd_lidm,auc,frechet_handcrafted,manifold_handcrafted"
+        options = ("--metrics", metrics, "--size", "8x64", "--batch-size", "2", "--workers", "0")
         command = [*launcher, "-m", "r2flow", "evaluate", str(real), str(generated), *options, "--json", str(out)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "R2FLOW_CACHE": str(out.with_suffix(""))}
         done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, timeout=300)

@@ -1,4 +1,4 @@
-"""One, two and three real processes: the same figures."""
+"""One, two and three real processes: the same figures; test_cli_evaluate.py has all classes of metrics by the verb."""
 
 import json
 
@@ -12,11 +12,9 @@ from r2flow.metrics import METRICS
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.features import Manifold
 from r2flow.metrics.frechet import FrechetDistance
-from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import scans_of
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
-PLAIN = ("jsd", "mmd", "jsd_lidm", "mmd_lidm", "auc")
 
 
 def images(seed, n):
@@ -26,20 +24,8 @@ def images(seed, n):
 
 
 def measure(rank, ranks):
-    """Figures and remarks of all metrics, of two generated sets one after the other; figures of some on their own."""
-    network = EXTRACTORS["handcrafted"].trained()
-    metrics = [METRICS[name]() for name in PLAIN]
-    metrics += [FrechetDistance(network), Manifold(network)]
-    found = []
-    for metric in metrics:
-        give(metric, images(1, 14), True, rank, ranks)
-        kept = metric.real_state()
-        for seed in (2, 3):
-            metric.reset()
-            metric.load_real_state(kept)
-            give(metric, images(seed, 11), False, rank, ranks)
-            found.append([metric.compute(), metric.remarks()])
-    # without a common folder, of images that nobody numbers; twice, with more scans in between
+    """Figures and remarks without a common folder, of images that nobody numbers; twice, with scans in between."""
+    network, found = EXTRACTORS["handcrafted"].trained(), []
     metrics = [METRICS[name](sensor=SENSOR) for name in ("jsd", "mmd")]
     metrics += [FrechetDistance(network, sensor=SENSOR), Manifold(network, sensor=SENSOR)]
     for metric in metrics:
@@ -51,12 +37,6 @@ def measure(rank, ranks):
             found.append([metric.compute(), metric.remarks()])
             assert not metric.keeping or len(metric.kept("real")) == kept  # its own again
     return found
-
-
-def give(metric, scans, real, rank, ranks):
-    starts = list(range(0, len(scans), 3))
-    for first in starts[rank::ranks][:: -1 if rank else 1]:
-        metric.update(Scans(scans[first : first + 3], SENSOR), real, first)
 
 
 def work(rank, ranks, folder):
