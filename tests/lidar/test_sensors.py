@@ -14,13 +14,6 @@ from tests.conftest import refused
 CONF = Path(__file__).resolve().parents[2] / "conf" / "sensor"
 
 
-def test_hdl64e_is_the_paper_s_image():
-    sensor = SENSORS["hdl64e"]
-    assert sensor.shape == (64, 1024)
-    assert (sensor.min_range, sensor.max_range) == (1.45, 80.0)
-    np.testing.assert_allclose(sensor.row_edges, 3 - 28 * np.arange(65) / 64, atol=1e-12)
-
-
 def test_rays_are_the_middles_of_their_bins(sensor):
     e, a = sensor.rays()
     height, width = sensor.shape
