@@ -7,14 +7,6 @@ from r2flow.errors import InputError
 from r2flow.registry import MISSING, Registry, check_options, options_of
 
 
-def test_a_wrong_option_lists_the_known_ones_and_the_closest():
-    def make(width: int = 1, depth: int = 2) -> int:
-        return width
-
-    with pytest.raises(InputError, match=r"no option 'widht'; it knows: width, depth. Did you mean 'width'\?"):
-        Registry("thing", make=make).build({"name": "make", "widht": 3})
-
-
 def test_a_name_that_is_taken_is_refused():
     table = Registry("thing", a=1)
     table.add("b", 2)

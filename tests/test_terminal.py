@@ -79,11 +79,6 @@ def test_a_bar_goes_to_standard_error_with_count_unit_and_note(capsys, monkeypat
     assert all(words in err for words in ("sampling", "3/4", "scans", "12 evaluations"))
 
 
-def test_track_gives_every_item_once_and_shows_nothing_without_a_terminal(capsys):
-    assert list(track(iter([3, 1, 2]), "reading", total=3)) == [3, 1, 2]
-    assert capsys.readouterr() == ("", "")
-
-
 def test_without_a_terminal_there_is_a_line_every_half_minute(capsys, monkeypatch):
     now = 100.0
     monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)

@@ -74,12 +74,6 @@ def test_values_are_short(value, text):
     assert shown(value) == text
 
 
-def test_rows_are_markdown_by_key_or_in_order():
-    text = "| solver | RMS |\n|---|---|\n| euler | 0.5 |\n| a\\|b, c | - |"
-    assert table(ROWS, {"solver": "solver", "error": "RMS"}) == text
-    assert table([("euler", 0.5), ("a|b, c", math.nan)], ["solver", "RMS"]) == text
-
-
 def test_in_the_terminal_numbers_stand_to_the_right_and_nothing_is_cut(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
     long = "[1, 2] " + 30 * "long "
