@@ -127,15 +127,10 @@ def test_several_sets_stand_in_one_table_with_references_and_baselines(
     assert len(lines) == len(set(lines))
     assert sum("no full rank" in line for line in lines) == 1
     assert sum("r2flow weights" in line for line in warned.splitlines()) == 1
-    content = json.loads((tmp_path / "e.json").read_text())["comparisons"]
-    assert {one["comparison"]: one["kind"] for one in content} == {
-        "generated": "judged", "other": "judged", "real halves": "reference",
-        "generated, as many": "reference", "other, as many": "reference",
-        **dict.fromkeys(("noise", "flat ground", "mean scan", "shuffled pixels"), "baseline"),
-    }  # fmt: skip
-    assert {"jsd", "mmd_lidm", "kid_handcrafted"} <= {one["metric"] for one in content[0]["metrics"]}
-    (jsd,) = (one for one in content[0]["metrics"] if one["metric"] == "jsd")
-    assert jsd["figures"]["jsd"] == figure(measured[0], generated, PAPER)
+    metrics = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"]
+    figures = {one["metric"]: one["figures"] for one in metrics}
+    assert figures["jsd"] == {"jsd": figure(measured[0], generated, PAPER)}
+    assert {"mmd_lidm", "kid_handcrafted"} <= figures.keys()
 
 
 @pytest.mark.parametrize(
