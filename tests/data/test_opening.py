@@ -15,7 +15,7 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairSource, PairStore, make_pairs
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve_reflectance
-from r2flow.data.sources import ScanSource
+from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
@@ -222,29 +222,13 @@ def test_a_function_that_finds_drives_and_one_line_are_a_data_set(tmp_path: Path
     assert numbers(open_scans(tmp_path / "shards", split="test").source) == [6, 7, 8]
 
 
-class Walls(ScanSource):
-    """Scan i is a wall at i + 1 + the seed metres."""
-
-    def __init__(self, shape: tuple[int, int], walls: list[int]) -> None:
-        self.shape, self.walls = shape, walls
-
-    def __len__(self) -> int:
-        return len(self.walls)
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        return np.full((1, *self.shape), self.walls[index], np.float32)
-
-    @property
-    def names(self) -> list[str]:
-        return [f"wall at {wall} m" for wall in self.walls]
-
-    def subset(self, indices) -> "Walls":
-        return Walls(self.shape, [self.walls[i] for i in indices])
-
-
 class WallKind(SourceKind):
-    def open(self, options, reading, seed=0, first_scene=0) -> Walls:
-        return Walls(reading.sensor.shape, list(range(2, 2 + int(options.root))))
+    """Scan i is a wall at i + 2 metres."""
+
+    def open(self, options, reading, seed=0, first_scene=0) -> InMemory:
+        walls = range(2, 2 + int(options.root))
+        images = np.ones((1, *reading.sensor.shape), np.float32) * np.float32(walls).reshape(-1, 1, 1, 1)
+        return InMemory(images, [f"wall at {wall} m" for wall in walls])
 
     def lacks_reflectance(self, options, on_bad_scan="error") -> str:
         return "walls have no reflectance"
