@@ -25,7 +25,6 @@ REFUSED = {
     "stage.init=3": "no checkpoint at 3",
     "stage=null": "leaves the run without its stage: give one of autoencoder, diffusion, ",
     "~backbone": "~backbone leaves the run without its backbone",
-    "stage.time={name: logit_normal, men: 2.0}": "Did you mean 'mean'?",
     "stage.time={name: logit_normal, std: 0}": "std must be a finite number above 0",
     "callbacks.ema={evry: 3}": "no key 'callbacks.ema.evry'. Did you mean 'callbacks.ema.every'?",
     "+callbacks.emaa={}": "Did you mean 'ema'?",
@@ -66,7 +65,6 @@ REFUSED = {
     # What would be passed over.
     "data=folder & data.root=. & data.scenes=5": "no simulated scenes: leave data.scenes out",
     "data=mixed & data.parts=[{name: simulated}] & data.split=train": "has its own: leave data.split",
-    "data=simulated_sensors & stage=transfer & data.scenes=9": "data.parts has its own: leave data.scenes out",
     "data.root=typo": "simulated scans are not files (data=folder for yours): leave data.root out",
     "data.pairs.num=5": "data.pairs.num are of data=pairs, found data=simulated",
     "stage=reflow & data=pairs & stage.init=street & data.drives=[1]": "pairs are drawn, not read: leave data.drives",
