@@ -37,11 +37,6 @@ def test_a_state_may_be_one_number_of_each_scene(method):
     torch.testing.assert_close(found.x, logistic_solution(X_0[:, 0], 1), rtol=0, atol=0.02)
 
 
-def asymptotic(method):
-    """Steps from which on the leading term of the error is all of it: a multistep method has a start to get over."""
-    return 128 if SOLVERS[method].multistep else 16
-
-
 @pytest.mark.parametrize("method", ADAPTIVE)
 def test_an_adaptive_method_of_equal_steps_has_its_order(method):
     # A tolerance of 1000 accepts every step, and none may be longer than its share of the interval.
@@ -62,8 +57,8 @@ def test_halving_the_steps_shrinks_the_error_by_the_order(method, grid):
         end = solve(logistic, X_0, method=method, steps=steps, grid=waves if grid == "waves" else grid).x
         return (end - logistic_solution(X_0, 1)).abs().max().item()
 
-    steps = asymptotic(method) if grid == "uniform" else 2 * asymptotic(method)
-    within = 0.25 if grid == "uniform" else 0.3
+    few = 128 if SOLVERS[method].multistep else 16  # a multistep method has a start to get over
+    steps, within = (few, 0.25) if grid == "uniform" else (2 * few, 0.3)
     assert math.log2(error(steps) / error(2 * steps)) == pytest.approx(SOLVERS[method].order, abs=within)
 
 
