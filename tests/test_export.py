@@ -13,9 +13,9 @@ import torch
 from r2flow import __version__
 from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
-from r2flow.generators import RectifiedFlow, build_generator
+from r2flow.generators import USUAL, RectifiedFlow, build_generator
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.export import NOTES, compare, export, tableau
+from r2flow.model.export import NOTES, compare, export, exportable, tableau
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import ROOT, tiny_options
@@ -87,6 +87,14 @@ def test_a_sampler_that_is_no_fixed_number_of_steps_of_the_ode_is_refused(sample
     with pytest.raises(InputError, match="cannot be exported|renoise needs noise"):
         export(flow("efficient_unet", "flow_map"), tmp_path / "flow.pt2", build_sampler(sampler))
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_flow_drawn_with_fresh_noise_is_exported_as_an_ode():
+    generator = flow("efficient_unet", "flow_map").generator
+    generator.run_by(build_sampler("refine"))
+    assert exportable(generator) == USUAL
+    assert exportable(generator, name="chord", steps=2) == build_sampler("chord", steps=2)
+    assert exportable(generator, steps=2) == build_sampler("refine", steps=2)  # and refused
 
 
 class Clipped(RectifiedFlow):

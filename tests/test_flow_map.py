@@ -54,6 +54,9 @@ class Exact(FlowMap):
         moved = s * self.problem.mean + scale[1] / scale[0] * (x - t * self.problem.mean) - x
         return moved / (s - t)
 
+    def velocity(self, t, x, condition=None):
+        return self.problem(t, x)
+
 
 @pytest.fixture
 def exact() -> Exact:
@@ -132,6 +135,22 @@ def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
     between = 0.5 * draws.step(exact.noise_shape, 1) + 0.5 * (0.7 + 0.25 * x_0)
     expected = 0.7 + 0.25 / (0.25 + 0.25 * 0.25**2) ** 0.5 * (between - 0.5 * 0.7)
     torch.testing.assert_close(twice, expected, rtol=0, atol=1e-5)
+
+
+def test_refined_samples_follow_the_path_then_renoise(exact):
+    draws = Draws(5, range(2))
+    x_0 = draws.start(exact.noise_shape)
+    found = exact(x_0, sampler=build_sampler("refine", steps=100, jumps=2), draws=draws)
+    s = 1 - 0.1 / 6.4**0.5  # the middle of 0.1 to 1 / 64 in the logarithm
+    between = s * (0.7 + 0.25 * x_0) + (1 - s) * draws.step(exact.noise_shape, 1)
+    expected = 0.7 + 0.25 / ((1 - s) ** 2 + (0.25 * s) ** 2) ** 0.5 * (between - 0.7 * s)
+    torch.testing.assert_close(found.x, expected, rtol=0, atol=1e-4)
+    assert found.evaluations.tolist() == [100, 100]
+    few = [exact(x_0, sampler=build_sampler(name, steps=6), draws=draws).x for name in ("refine", "renoise")]
+    assert torch.equal(*few)
+    grid = [0, 0.3, 0.6, 0.8, 0.9, 1]
+    times = build_sampler("refine", jumps=2, grid=grid).times()
+    torch.testing.assert_close(times, torch.tensor(grid).double())
 
 
 OWN = build_sampler("adams3", steps=16, grid="power:1.75")

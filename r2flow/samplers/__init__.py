@@ -16,15 +16,15 @@ from r2flow.errors import InputError, check
 from r2flow.flow.solvers import SOLVERS, usual_grid
 from r2flow.registry import Registry, lazy
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _with_steps
-from r2flow.samplers.maps import Chord, Jump, Renoise, Transport
+from r2flow.samplers.maps import Chord, Jump, Refine, Renoise, Transport
 from r2flow.samplers.ode import Adaptive, FixedSteps, ODESampler, TorchDiffEq
 from r2flow.samplers.posterior import MMPS, Posterior, Repaint, Replace
 from r2flow.samplers.stochastic import SDE
 
 __all__ = [
     "MMPS", "SAMPLERS", "SDE", "Adaptive", "Chord", "Condition", "FixedSteps", "Generated", "Jump", "Noise",
-    "ODESampler", "OnGrid", "Posterior", "Progress", "Renoise", "Repaint", "Replace", "Sampler", "TorchDiffEq",
-    "Transport", "build_sampler", "parse_sampler",
+    "ODESampler", "OnGrid", "Posterior", "Progress", "Refine", "Renoise", "Repaint", "Replace", "Sampler",
+    "TorchDiffEq", "Transport", "build_sampler", "parse_sampler",
 ]  # fmt: skip
 
 
@@ -56,6 +56,7 @@ SAMPLERS = _Samplers(
     jump=Jump,
     chord=Chord,
     renoise=Renoise,
+    refine=Refine,
     transport=Transport,
     replace=Replace,
     repaint=Repaint,
