@@ -61,17 +61,12 @@ def save_array(path: str | Path, array: np.ndarray) -> None:
         np.save(file, array)
 
 
-def parse_json(text: str) -> Any:
-    """Parse JSON; raises ValueError if it is invalid or nested too deeply."""
+def read_json(path: Path) -> Any:
+    """Read a JSON file; raises ValueError if it is invalid or nested too deeply."""
     try:
-        return json.loads(text)
+        return json.loads(path.read_text(encoding="utf-8"))
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
-
-
-def read_json(path: Path) -> Any:
-    """Read a JSON file; raises the errors of `parse_json`."""
-    return parse_json(path.read_text(encoding="utf-8"))
 
 
 @contextmanager

@@ -34,7 +34,8 @@ from safetensors.numpy import save
 
 from r2flow.config import at_most_three, differences
 from r2flow.errors import InputError, check
-from r2flow.files import parse_json, read_json, write_file
+from r2flow.files import read_json, write_file
+from r2flow.hashing import state_hash
 from r2flow.lidar.scan_files import FIRM_ENDINGS
 from r2flow.signals import code_of, end_with_parent, out_of_reach
 
@@ -115,7 +116,7 @@ class Store:
 
     def write(self, item: int, tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> None:
         """Write an item; it then counts as made."""
-        note = {"recipe": self.digest, "item": item, "sha256": _digest(tensors, notes or {}), "notes": notes or {}}
+        note = {"recipe": self.digest, "item": item, "sha256": state_hash(tensors, notes or {}), "notes": notes or {}}
         (path,) = self.files(item)
         if path.is_symlink() and not path.exists():
             path.unlink()
@@ -129,7 +130,7 @@ class Store:
         """
         with self._opened(item) as (file, note):
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  not a mapping
-            if note["sha256"] != _digest(tensors, note["notes"]):
+            if note["sha256"] != state_hash(tensors, note["notes"]):
                 raise Damaged("its checksum differs")
             return tensors, note["notes"]
 
@@ -145,7 +146,7 @@ class Store:
             raise FileNotFoundError(path)
         try:
             with safe_open(path, framework="numpy") as file:
-                note = parse_json((file.metadata() or {})["r2flow"])
+                note = json.loads((file.metadata() or {})["r2flow"])
                 if note["recipe"] != self.digest:
                     raise InputError(
                         f"{path} holds {self.kind} of another recipe: give the settings that they were made with, or "
@@ -156,7 +157,7 @@ class Store:
                 yield file, note
         except InputError:
             raise
-        except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise Damaged(str(error)) from None
 
     def mend(self, items: Iterable[int], advance: Advance = lambda item: None) -> None:
@@ -356,11 +357,3 @@ def manifest_of(folder: str | Path) -> dict[str, Any]:
 def checksum(content: Any) -> str:
     """SHA-256 of a JSON-serialisable value."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def _digest(tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any]) -> str:
-    digest = hashlib.sha256(json.dumps(notes, sort_keys=True).encode())
-    for name, values in sorted(tensors.items()):
-        digest.update(f"{name} {values.shape} {values.dtype}".encode())
-        digest.update(np.ascontiguousarray(values).data)
-    return digest.hexdigest()

@@ -87,7 +87,7 @@ def test_compressed_tensors_are_refused_before_they_are_unpacked(saved):
 def test_notes_without_end_or_of_another_kind_are_refused(tmp_path: Path, notes: str):
     path = tmp_path / "model.safetensors"
     safetensors.torch.save_file({"x": torch.zeros(1)}, path, metadata={"r2flow": notes})
-    with pytest.raises(InputError, match=r"not a model of r2flow, or damaged|nested too deeply"):
+    with pytest.raises(InputError, match=r"not a model of r2flow, or damaged|Is it damaged"):
         load_checkpoint(path)
 
 

@@ -22,7 +22,7 @@ from r2flow.config import check_tree, learned
 from r2flow.data.opening import own_reading, reading_for
 from r2flow.data.partial import PartialScan, open_partial
 from r2flow.errors import InputError, check, naming
-from r2flow.files import parse_json, telling, write_file
+from r2flow.files import telling, write_file
 from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding, build_space
@@ -294,7 +294,7 @@ def weights_hash(checkpoint: Checkpoint) -> str:
     """Hash of a generator in 16 hex digits: averaged weights, sensor and encoding, independent of the file format."""
     meaning = {key: checkpoint.config[key] for key in ("sensor", "encoding")}
     state = {name.removeprefix(BACKBONE): value for name, value in checkpoint.generator.state_dict().items()}
-    return state_hash(state, json.dumps(meaning, sort_keys=True).encode())[:16]
+    return state_hash(state, meaning)[:16]
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -306,18 +306,14 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 def read_safetensors(path: Path) -> dict[str, Any]:
     """Read weights and config of an r2flow `.safetensors`, in the layout of the other checkpoints."""
     weights, metadata = read_tensors(path)
-    notes = parse_json(metadata.get(NOTES, "{}"))
-    if not isinstance(notes, dict) or notes.pop("digest", None) != _digest(notes, weights):
+    notes = json.loads(metadata.get(NOTES, "{}"))
+    if not isinstance(notes, dict) or notes.pop("digest", None) != state_hash(weights, notes):
         raise InputError(f"{path} is not a model of r2flow, or damaged: its checksum differs. Use another checkpoint.")
     config, step = notes["config"], int(notes["step"])
     check_tree(config)
     state = {PREFIX + name: value for name, value in weights.items()}
     drawing = {key: notes.get(key) for key in ("sampler", "few", "fixed")}
     return {"config": config, "global_step": step, "state_dict": state, **drawing}
-
-
-def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
-    return state_hash(weights, json.dumps(notes, sort_keys=True).encode())
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False) -> None:
@@ -341,7 +337,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     config = learned(checkpoint.config) | ({"plugins": plugins} if plugins else {})
     notes = {"config": config, "step": checkpoint.step, **checkpoint.generator.drawing()}
     # Under one key, since the order of several metadata keys is not fixed.
-    write_file(path, save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})}))
+    write_file(path, save(weights, metadata={NOTES: json.dumps({**notes, "digest": state_hash(weights, notes)})}))
 
 
 def is_dense(value: object) -> bool:

@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from r2flow.errors import InputError, check, naming
-from r2flow.files import atomic_write, cache_folder, parse_json, reading, telling
+from r2flow.files import atomic_write, cache_folder, reading, telling
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.scans import Scans
@@ -204,4 +204,4 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read the tensors of a safetensors file, and the notes of `add`."""
     with telling(path):
         tensors, metadata = read_tensors(path)
-        return tensors, {"config": {}, "weights": "", "source": path.name, **parse_json(metadata.get(NOTES, "{}"))}
+        return tensors, {"config": {}, "weights": "", "source": path.name, **json.loads(metadata.get(NOTES, "{}"))}
