@@ -6,7 +6,6 @@ import os
 import random
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from r2flow.models import name_of
 from r2flow.processes import place
 from r2flow.progress import Bar
 from r2flow.samplers import build_sampler
-from r2flow.store import Damaged, Store
+from r2flow.store import Store
 
 
 class PairStore(Store):
@@ -70,11 +69,8 @@ class PairStore(Store):
 
     def has(self, item: int) -> bool:
         """Whether a shard exists and has all batches that the first `num` pairs need."""
-        try:
-            usable = self.head(item)["usable"]
-        except (FileNotFoundError, Damaged):
-            return False
-        return len(usable) >= len(self.batches_of(item)) * self.options.batch_size
+        needed = len(self.batches_of(item)) * self.options.batch_size
+        return super().has(item) and len(self.head(item)["usable"]) >= needed
 
     def missing_pairs(self) -> int:
         return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.options.batch_size
@@ -84,18 +80,10 @@ class PairStore(Store):
         return noise.standard_normal(self.noise_shape, self.options.seed, "pairs", index)
 
 
-@dataclass
-class Made:
-    """Progress of one process."""
-
-    pairs: int = 0
-    evaluations: int = 0
-    unusable: int = 0  # pairs left out
-    seconds: float = 0.0
-
-
-def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> Made:
+def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> list[bool]:
     """Make the missing or damaged pairs of a store, with a progress bar; `wait`: await those that others are making.
+
+    The result is whether each pair that this process has drawn is usable.
 
     x_1 is the generator's sample for x_0 = `store.noise`, neither clamped nor snapped, in half precision. With `chord`
     or `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function
@@ -106,26 +94,25 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> Mad
     flow, sampler = as_flow(generator, "a reflow pair"), store.sampler
     sampler.check(flow)
     check(sampler.paired, f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
-    made, start = Made(), time.monotonic()
+    usable, evaluations, ends = list[bool](), list[int](), [time.monotonic()]
 
     def make_shard(shard: int) -> None:
         store.mend([shard])
         batches = []
         for batch in store.batches_of(shard):
             batches.append(solve_batch(store, flow, batch))
-            made.pairs += store.options.batch_size
-            made.evaluations += int(batches[-1]["evaluations"].sum())
-            made.unusable += int((~batches[-1]["usable"]).sum())
-            made.seconds = time.monotonic() - start
-            bar.set(made.pairs)
-            if made.unusable == made.pairs and (made.pairs > 64 or batch == store.batches_of(shard)[-1]):
+            evaluations.append(int(batches[-1]["evaluations"].sum()))
+            usable.extend(batches[-1]["usable"].tolist())
+            ends.append(time.monotonic())
+            bar.set(len(usable))
+            if not any(usable) and (len(usable) > 64 or batch == store.batches_of(shard)[-1]):
                 raise InputError(
-                    f"none of {made.pairs} pairs came to an end with sampler {sampler.name}: the flow is broken, or "
+                    f"none of {len(usable)} pairs came to an end with sampler {sampler.name}: the flow is broken, or "
                     "the tolerance out of its reach."
                 )
         tensors = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
-        usable = tensors.pop("usable").astype(int).tolist()
-        store.write(shard, tensors, {"usable": usable})
+        flags = tensors.pop("usable").astype(int).tolist()
+        store.write(shard, tensors, {"usable": flags})
 
     with Bar("drawing", store.missing_pairs(), "pairs", lines="WORLD_SIZE" in os.environ) as bar:
         store.begin()
@@ -134,12 +121,12 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> Mad
         missing = store.missing(store.shards)
         random.Random().shuffle(missing)  # processes rarely meet, also where locks do not reach other machines
         store.make(missing, make_shard, wait=wait)
-    if made.pairs:
-        unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
-        rate, cost = made.pairs / made.seconds, made.evaluations / made.pairs
-        drawn = f"{made.pairs} pairs drawn in whole batches"
+    if usable:
+        unusable = "" if all(usable) else f", {usable.count(False)} did not converge and are left out"
+        rate, cost = len(usable) / (ends[-1] - ends[0]), sum(evaluations) / len(usable)
+        drawn = f"{len(usable)} pairs drawn in whole batches"
         print(f"{drawn}, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
-    return made
+    return usable
 
 
 def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.ndarray]:

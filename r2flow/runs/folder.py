@@ -67,8 +67,7 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
         leftover.unlink(missing_ok=True)
     old, last = read_config(run), None
     if old and (last := next((path for path, _ in _readable(run, RESUMED)), None)):
-        if differing := contradictions(old, config):
-            raise InputError(_another_config(run, differing))
+        _refuse_another_config(run, old, config)
         samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]
         if samplers and step_of(last) >= config["trainer"]["max_steps"]:
             raise InputError(
@@ -86,20 +85,19 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     if old is None or not checkpoints_of(run):
         return
     later = ("scans.", "parent.", "encoding.reflectance.", "encoding.levels.", "data.pairs.parent.")
-    compared = [{k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config)]
-    differing = contradictions(*compared)
-    if differing:
-        raise InputError(_another_config(run, differing))
+    compared = ({k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config))
+    _refuse_another_config(run, *compared)
 
 
-def _another_config(run: str | Path, differing: list[str]) -> str:
-    length = all(text.startswith("trainer.max_steps=") for text in differing)
-    last = next((path for path, _ in _readable(run)), run)  # not the folder: the run may not be finished
-    more_steps = f", stage.init={last} name=OTHER to learn on from its weights" if length else ""
-    return (
-        f"{run} holds a run of another config: {at_most_three(differing)}. "
-        f"Give the same command to resume it{more_steps}, or name=OTHER for a new one."
-    )
+def _refuse_another_config(run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
+    if differing := contradictions(old, new):
+        length = all(text.startswith("trainer.max_steps=") for text in differing)
+        last = next((path for path, _ in _readable(run)), run)  # not the folder: the run may not be finished
+        more_steps = f", stage.init={last} name=OTHER to learn on from its weights" if length else ""
+        raise InputError(
+            f"{run} holds a run of another config: {at_most_three(differing)}. "
+            f"Give the same command to resume it{more_steps}, or name=OTHER for a new one."
+        )
 
 
 RESUMED = ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step")
