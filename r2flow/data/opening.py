@@ -183,27 +183,22 @@ def reading_for(
     model: Any = None,
     sensor: Sensor | str | None = None,
     size: tuple[int, int] | None = None,
-    projection: str | None = None,
-    convention: str | None = None,
-    reflectance_scale: float | None = None,
-    columns: Sequence[str] | None = None,
     estimate_scale: bool = False,
+    **fields: Any,
 ) -> Reading:
-    """How scans become images: arguments first, then the model's training scans, the scans' manifest, the defaults.
+    """How scans become images: `fields` first, then the model's training scans, the scans' manifest, the defaults.
 
-    The default sensor is hdl64e, or the built-in sensor whose beams plain scan files have. Scans have names as for
-    `open_scans`; None is skipped. `model` is the checkpoint that they are for: another sensor or size than its own is
-    refused. `estimate_scale` leaves None for plain scan files whose sensor does not tell it: an estimate.
+    `fields` are those of `Reading`; None is not given. The default sensor is hdl64e, or the built-in sensor whose beams
+    plain scan files have. Scans have names as for `open_scans`; None is skipped. `model` is the checkpoint that they
+    are for: another sensor or size than its own is refused. `estimate_scale` leaves None for plain scan files whose
+    sensor does not tell it: an estimate.
     """
     specs = [str(spec) for spec in scans if spec is not None]
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
     options = parse(specs[0])[0] if specs else SourceOptions(FOLDER)
     reading = _reading_of(model) if model else stored or Reading(SENSORS[SOURCES[options.name].sensor])
-    given: dict[str, Any] = {
-        "projection": projection, "convention": convention, "reflectance_scale": reflectance_scale,
-        "columns": columns and tuple(columns),
-    }  # fmt: skip
-    reading = replace(reading, **{key: value for key, value in given.items() if value is not None})
+    given = {key: value for key, value in fields.items() if value is not None}
+    reading = replace(reading, **given)
     if specs and not (model or stored or sensor):
         sensor = _detected(specs[0], reading)
     chosen = named_sensor(sensor or reading.sensor, size)
@@ -211,7 +206,7 @@ def reading_for(
         expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
         raise InputError(f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out.")
     reading = replace(reading, sensor=reading.sensor if model else chosen)
-    if reflectance_scale is not None or not specs:
+    if "reflectance_scale" in given or not specs:
         return reading
     trained = reading.reflectance_scale  # 1: also of scans that were scaled before the training
     scale = trained if model and trained != 1 else reading.sensor.reflectance_scale
