@@ -228,17 +228,7 @@ class Store:
                     end.send(item)
             while doing:
                 for end in doing.keys() & connection.wait(doing):
-                    try:
-                        result = end.recv()
-                    except (EOFError, OSError):
-                        result = InputError(
-                            f"a process that wrote {self.folder} was killed or could not start; is there memory for "
-                            f"{workers} of them? The same command resumes."
-                        )
-                    if isinstance(result, Exception):
-                        raise result
-                    if isinstance(result, logging.LogRecord):
-                        logging.getLogger(result.name).handle(result)
+                    if (result := self._result(end)) is None:
                         continue
                     item = doing.pop(end)
                     if (following := next(left, None)) is not None:
@@ -252,6 +242,22 @@ class Store:
                 end.close()  # if compiled code of the process has swallowed the exception
             for process in processes.values():
                 process.join()
+
+    def _result(self, end: connection.Connection) -> bool | None:
+        """The result of a process, whose errors are raised; None for a line of its log, which is passed on."""
+        try:
+            result: Any = end.recv()
+        except (EOFError, OSError):
+            raise InputError(
+                f"a process that wrote {self.folder} was killed or could not start; is there memory for as many "
+                "processes? The same command resumes."
+            ) from None
+        if isinstance(result, Exception):
+            raise result
+        if not isinstance(result, logging.LogRecord):
+            return bool(result)
+        logging.getLogger(result.name).handle(result)
+        return None
 
     def attempt(self, item: int, work: Callable[[int], None]) -> bool:
         """Make an item unless it exists; False if another process is making it.
