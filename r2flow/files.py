@@ -74,10 +74,8 @@ def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Ite
     """Read a regular file of `least` to `largest` bytes: every error becomes an InputError that names it."""
     with telling(path):
         problem = ""
-        if path.is_symlink() and not path.exists():
-            problem = f"is a link to {path.readlink()}, which does not exist."
-        elif not path.exists():
-            problem = "does not exist. Is the path right?"
+        if not path.exists():
+            problem = "does not exist, or is a broken link. Is the path right?"
         elif path.is_dir():
             problem = f"is a folder, not a {what}; name a file in it."
         elif not path.is_file():  # reading a pipe or a device may never end

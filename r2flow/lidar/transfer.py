@@ -115,10 +115,9 @@ def points_of_same(
 def image_of_same(image: np.ndarray, target: Sensor) -> Partial:
     """The measured image from an image of the same sensor, (2 or 1, H, W); rays without a return are empty."""
     r = image[0]
-    near, far = (r > 0) & (r < target.min_range), r > target.max_range
-    returned = (r > 0) & ~near & ~far
+    returned = (r >= target.min_range) & (r <= target.max_range)
     state = np.where(returned, int(Ray.RETURN), int(Ray.EMPTY)).astype(np.uint8)
-    state[near] = Ray.UNKNOWN
+    state[(r > 0) & (r < target.min_range)] = Ray.UNKNOWN
     kept = np.where(returned, image, np.float32(0))
     kept[1:] = kept[1:].clip(0, 1)
     return Partial(kept, state)
