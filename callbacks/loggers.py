@@ -5,7 +5,7 @@ config, which the run's folder and its checkpoints store.
 """
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +76,6 @@ class LearningRates(LearningRateMonitor):
             # Lightning counts one step too many after a stop by `trainer.max_time` at the step of a validation.
             trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
             super().on_train_batch_start(trainer, pl_module, batch, batch_idx)
-
-
-def build_loggers(names: Sequence[str] | None, run_dir: Path) -> list[Logger]:
-    return [LOGGERS[name](run_dir) for name in names or []]
 
 
 def log_picture(loggers: Iterable[Logger], name: str, pixels: np.ndarray, step: int) -> None:

@@ -26,7 +26,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.callbacks import build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
-from r2flow.callbacks.loggers import build_loggers, log_config, log_figures
+from r2flow.callbacks.loggers import LOGGERS, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule
@@ -41,7 +41,7 @@ from r2flow.noise import seed_torch
 from r2flow.plugins import loaded_plugins, made_with
 from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
 from r2flow.reports.training import finish, read_curves
-from r2flow.runs.composing import check_keys, compose
+from r2flow.runs.composing import Keys, compose
 from r2flow.runs.folder import check_run, open_run, read_config, run_lock
 from r2flow.runs.lineage import Parent, find_parent, inherit
 from r2flow.signals import LATER, STOPPING, Stopped, listening
@@ -145,7 +145,7 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
     Raises:
         InputError: an invalid value, an unknown name or option, a parent that is missing or not finished.
     """
-    check_keys(config)
+    check_options("the config", Keys, config)
     if config.get("chain"):
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
     if config.get("preview"):
@@ -171,7 +171,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
 
     The result is completed with values of its parent; `parent` is one that has not been trained yet.
     """
-    check_keys(config)
+    check_options("the config", Keys, config)
     config = _checked(config, asked, parent or find_parent(config["stage"].get("init")))
     if config["encoding"].get("reflectance", AUTO) == AUTO:
         config["encoding"]["reflectance"] = True  # decided when the scans are read
@@ -247,7 +247,7 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     if isinstance(interval := options["val_check_interval"], int):  # a short run is validated once, at its end
         options["val_check_interval"] = min(interval, options["max_steps"]) * options["accumulate_grad_batches"]
     callbacks = build_callbacks(config)
-    loggers = build_loggers(config["loggers"], Path(config["run_dir"]))
+    loggers = [LOGGERS[name](Path(config["run_dir"])) for name in config["loggers"] or ()]
     try:
         with _quiet():
             trainer = L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])

@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from r2flow.config import flatten, key_of, override
 from r2flow.errors import InputError, check
-from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
+from r2flow.registry import Bound, Seed, did_you_mean, options_of
 
 T = TypeVar("T")
 
@@ -88,10 +88,6 @@ class Keys:
     plugins: Sequence[str] = ()
     parent: Mapping[str, Any] | None = None
     scans: Any = None
-
-
-def check_keys(config: Mapping[str, Any]) -> None:
-    check_options("the config", Keys, config)
 
 
 @contextmanager

@@ -26,12 +26,13 @@ from r2flow import __version__
 from r2flow.config import key_of, override
 from r2flow.errors import InputError, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
+from r2flow.registry import check_options
 from r2flow.runs.composing import (
     CONF,
     REGISTRIES,
+    Keys,
     add_choices,
     as_hydra_takes,
-    check_keys,
     choices,
     compose,
     explain,
@@ -178,7 +179,7 @@ def _job(
                 raise JobEnded(*ended[-1])
             return
         settings = plain(config)
-        check_keys(settings)
+        check_options("the config", Keys, settings)
         if settings["chain"]:
             code = _chain(settings, given, command)
         else:  # imported here, so that errors in the config are reported before torch is loaded

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread, imsave
 
-from r2flow.callbacks.loggers import build_loggers, log_config, log_figures, log_picture
+from r2flow.callbacks.loggers import LOGGERS, log_config, log_figures, log_picture
 from r2flow.errors import InputError
 
 PIXELS = np.arange(8 * 16 * 3, dtype=np.uint8).reshape(8, 16, 3)
@@ -17,7 +17,7 @@ PIXELS = np.arange(8 * 16 * 3, dtype=np.uint8).reshape(8, 16, 3)
 def test_a_missing_package_names_its_extra(name, tmp_path, monkeypatch):
     monkeypatch.setattr("r2flow.errors.find_spec", lambda package: None)
     with pytest.raises(InputError, match=rf"loggers=\[{name}\] needs .* install 'r2flow\[{name}\]'"):
-        build_loggers([name], tmp_path)
+        LOGGERS[name](tmp_path)
     assert not [*tmp_path.iterdir()]
 
 
@@ -29,7 +29,7 @@ def write_figures(run: Path) -> None:
 
 def log_all(run: Path, name: str, loss: float, step: int) -> None:
     """What a run logs from its start to its end."""
-    (logger,) = loggers = build_loggers([name], run)
+    loggers = [logger := LOGGERS[name](run)]
     log_config(loggers, {"seed": step, "stage": {"name": "rectify"}})
     logger.log_metrics({"train/loss": loss}, step)
     log_picture(loggers, "samples", PIXELS, step)
