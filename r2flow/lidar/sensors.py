@@ -12,9 +12,9 @@ import torch
 import yaml
 from torch import Tensor
 
-from r2flow.errors import InputError, check, naming
+from r2flow.errors import InputError, check
 from r2flow.files import atomic_write, reading
-from r2flow.registry import Registry, UnknownName, check_options
+from r2flow.registry import Registry, UnknownName, construct
 
 Rays = Literal["centre", "reference"]
 Convention = Literal[Rays, "lidargen", "lidm"]
@@ -215,13 +215,11 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
     path = Path(path)
     with reading(path, LARGEST_FILE, "sensor's YAML"):
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
-    if not isinstance(options, dict) or not all(isinstance(key, str) for key in options):
-        raise InputError(f"{path} is no sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
-    sized = {"rows": rows, "columns": columns}
-    options.update({key: value for key, value in sized.items() if value is not None})
-    check_options(str(path), build_sensor, options)
-    with naming(path):
-        return build_sensor(**options)
+        named = isinstance(options, dict) and all(isinstance(key, str) for key in options)
+        check(named, "it is no sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
+        size = {"rows": rows, "columns": columns}
+        options |= {key: value for key, value in size.items() if value is not None}
+        return construct(str(path), build_sensor, options)
 
 
 def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
