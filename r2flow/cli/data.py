@@ -49,7 +49,8 @@ def simulate(
     missing = folder.missing(range(num))
     with Bar("simulating", len(missing), "scans") as advance:
         folder.make(missing, folder.simulate, workers or cores(), lambda scan: advance())
-    made, kept = len(missing), f", {num - len(missing)} there already" if len(missing) < num else ""
+    made, there = len(missing), num - len(missing)
+    kept = f", {there} there already" if there else ""
     print(f"{made} scan{'s' * (made != 1)} ({', '.join(formats)}{', labels' * labels}) in {out}{kept}")
 
 
@@ -85,16 +86,14 @@ def prepare(
     store = plan_files(out, options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
     shards, levels = len(store.shards), store.described["levels"]
     with Bar("checking", shards, "shards") as checked, Bar("preparing", shards, "shards") as made:
-        notes = make(store, on_bad_scan, workers or cores(), lambda shard: checked(), lambda shard: made())
+        left_out = make(store, on_bad_scan, workers or cores(), lambda shard: checked(), lambda shard: made())
     size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)
-    left_out = sum(len(note["left_out"]) for note in notes)
-    usable = len(store.names) - left_out
-    kept = "no reflectance in the scans" if levels is None else f"reflectance as n/{levels}"
+    usable, there = len(store.names) - left_out, shards - round(made.tasks[0].completed)
+    content = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"
+    kept = f" ({there} there already)" if there else ""
+    reflectance = "no reflectance in the scans" if levels is None else f"reflectance as n/{levels}"
     skipped = f"; {left_out} scans left out" if left_out else ""
-    there = shards - round(made.tasks[0].completed)
-    of = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"
-    of += f" ({there} there already)" if there else ""
-    print(f"{out}: {of}, {size / 2**20:.1f} MiB; {kept}{skipped}")
+    print(f"{out}: {content}{kept}, {size / 2**20:.1f} MiB; {reflectance}{skipped}")
 
 
 @app.command(epilog="Example: r2flow sensor my/scans --out conf/sensor/mine.yaml")

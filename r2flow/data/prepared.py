@@ -112,10 +112,8 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
 
 def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
     assert store.source is not None
-    numbers, left_out = store.parts[shard], list[int]()
-    shape = (len(numbers), *store.reading.sensor.shape)
-    tensors = {name: np.empty(shape, coder.dtype) for name, coder in store.codes.items()}
-    for number in numbers:
+    left_out, codes = list[int](), {name: list[np.ndarray]() for name in store.codes}
+    for number in store.parts[shard]:
         try:
             image = store.source[number]
         except InputError as error:
@@ -124,11 +122,11 @@ def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
             log.warning("left out: %s", error)
             left_out.append(number)
             continue
-        row = number - numbers.start - len(left_out)
         for channel, (name, coder) in zip(image, store.codes.items(), strict=True):
-            tensors[name][row] = coder.encode(channel)
-    kept = {name: codes[: len(numbers) - len(left_out)] for name, codes in tensors.items()}
-    store.write(shard, kept, {"left_out": left_out, "files": store.sources_of(shard)})
+            codes[name].append(coder.encode(channel))
+    empty = np.empty((0, *store.reading.sensor.shape))
+    tensors = {name: np.array(codes[name] or empty, coder.dtype) for name, coder in store.codes.items()}
+    store.write(shard, tensors, {"left_out": left_out, "files": store.sources_of(shard)})
 
 
 def prepare(
@@ -137,14 +135,14 @@ def prepare(
     workers: int = 1,
     checked: Advance = lambda shard: None,
     made: Advance = lambda shard: None,
-) -> list[dict[str, Any]]:
+) -> int:
     """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves out unusable scans.
 
     The headers of the shards have the numbers of the scans left out and a digest of the files: shards of files that
-    have changed since are refused. `checked` and `made` are called with each shard.
+    have changed since are refused. `checked` and `made` are called with each shard. The result is the number of scans
+    left out.
     """
-    if not store.check() or store.missing(store.shards):
-        store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
+    store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
 
     def look(shard: int) -> None:
         file = store.files(shard)[0]
@@ -156,10 +154,9 @@ def prepare(
 
     store.mend(store.shards, look)
     store.make(store.missing(store.shards), partial(_make_shard, store, on_bad_scan == "skip"), workers, made)
-    notes = [store.head(shard) for shard in store.shards]
-    if sum(len(note["left_out"]) for note in notes) == len(store.names):
-        raise InputError(f"all {len(store.names)} scans were left out as unusable; remove {store.folder}.")
-    return notes
+    left_out = sum(len(store.head(shard)["left_out"]) for shard in store.shards)
+    check(left_out < len(store.names), f"all {left_out} scans were left out as unusable; remove {store.folder}.")
+    return left_out
 
 
 # Reading
