@@ -11,7 +11,7 @@ import numpy as np
 
 from r2flow.errors import InputError, check, naming, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
-from r2flow.lidar.labels import labels_beside, read_labels
+from r2flow.lidar.labels import read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.sensors import Sensor
@@ -102,15 +102,9 @@ def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPoint
     )
 
 
-def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, np.ndarray | None]:
-    """The image of a scan file, and the semantic id of each pixel's return, (H, W) uint16, 0 for no return.
-
-    The ids are None if the scan has no label file.
-    """
+def read_labelled_scan(path: Path, file: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
+    """The image of a scan, and from its label file each pixel's semantic id, (H, W) uint16, 0 for no return."""
     image, points, pixels, chosen = read_projected(path, reading)
-    file = labels_beside(path)
-    if file is None:
-        return image, None
     labels = read_labels(file, path, points)[chosen]
     return image, scatter(reading.sensor, pixels, [labels])[0].astype(np.uint16)
 

@@ -40,7 +40,6 @@ def label(scan: Path) -> Path:
 
 def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Path, tmp_path: Path):
     assert labels_beside(scan) is None
-    assert read_labelled_scan(scan, Reading(SENSOR, reflectance=False))[1] is None
     beside = scan.with_name("000000.label")
     beside.symlink_to("gone")  # a link to nothing was meant to be a file
     assert labels_beside(scan) == beside
@@ -69,7 +68,7 @@ def test_each_pixel_has_the_label_of_its_nearest_return(scan: Path, label: Path)
     xyz = ranges * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     write_points(scan, xyz.T, np.zeros(7))
     label.write_bytes(ids.astype("<u4").tobytes())
-    image, labels = read_labelled_scan(scan, Reading(SENSOR, reflectance=True))
+    image, labels = read_labelled_scan(scan, label, Reading(SENSOR, reflectance=True))
     assert labels.dtype == np.uint16
     assert (labels[3, 5], labels[3, 9], np.count_nonzero(labels)) == (70, 10, 2)
     assert np.array_equal(labels > 0, image[0] > 0)
@@ -101,11 +100,10 @@ def test_real_labels(shared: Path):
         (real / "odometry/sequences/00/velodyne/000000.bin", "hdl64e", {10, 40, 50, 70}),
         (real / "other_sensors/rellis_os1_64/000104.bin", "hdl64e", {3, 4, 19}),
     ):
-        image, labels = read_labelled_scan(scan, Reading(SENSORS[sensor], reflectance=True))
+        image, labels = read_labelled_scan(scan, labels_beside(scan), Reading(SENSORS[sensor], reflectance=True))
         assert classes <= set(np.unique(labels[image[0] > 0]).tolist())
-    image, labels = read_labelled_scan(
-        real / "odometry/sequences/08/velodyne/000000.bin", Reading(SENSORS["hdl64e"], reflectance=True)
-    )
+    scan = real / "odometry/sequences/08/velodyne/000000.bin"
+    image, labels = read_labelled_scan(scan, labels_beside(scan), Reading(SENSORS["hdl64e"], reflectance=True))
     r, road, building = image[0], labels == 40, labels == 50
     elevation = SENSORS["hdl64e"].rays()[0].numpy()
     height = 1.73 + r * np.sin(elevation)  # of what is seen, above the ground that the car stands on

@@ -73,10 +73,11 @@ def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray |
     if isinstance(source, SimulatedScans):
         made = simulate(source.sensor, source.seed, source.numbers[number])
         return made.image[: 1 + source.reflectance], made.labels
-    path = points_beside(Path(source.paths[number])) if isinstance(source, ScanFiles) else None
-    if path is None or labels_beside(path) is None or read_range_image(path) is not None:
-        return source[number], None
-    return read_labelled_scan(path, replace(source.reading, on_bad_scan="error"))  # type: ignore[attr-defined]
+    if isinstance(source, ScanFiles):
+        path = points_beside(Path(source.paths[number]))
+        if (file := labels_beside(path)) and read_range_image(path) is None:
+            return read_labelled_scan(path, file, replace(source.reading, on_bad_scan="error"))
+    return source[number], None
 
 
 def in_turn(panels: Sequence[Panel], caption: str) -> Panel:
