@@ -56,9 +56,8 @@ class Stopping(L.Callback):
             try:
                 yield
             except Exception:
-                if self.told is None:
+                if self.told is None:  # other errors, as of a killed worker, follow from the signal
                     raise
-                self._leave("stopped")  # other errors, as of a killed worker, follow from the signal
             if self.told is not None:
                 self._leave("stopped")
 

@@ -43,7 +43,12 @@ class Bar(Progress):
 
     def __call__(self, units: float = 1) -> None:
         self.advance(self._task, units)
-        self._print()
+        now, task = time.monotonic(), self.tasks[0]
+        if self._lines and now - self._printed >= self.every and task.speed:
+            self._printed = now
+            counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
+            line = f"{counted}  {task.speed:.2f}/s  {duration(task.time_remaining or 0)} left  {task.fields['note']}"
+            print(line.rstrip(), file=sys.stderr, flush=True)
 
     def evaluated(self) -> None:
         """Count an evaluation of the network."""
@@ -57,14 +62,6 @@ class Bar(Progress):
             self.update(self._task, note=note)
         if done is not None:
             self(done - self.tasks[0].completed)
-
-    def _print(self) -> None:
-        now, task = time.monotonic(), self.tasks[0]
-        if self._lines and now - self._printed >= self.every and task.speed:
-            self._printed = now
-            counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
-            line = f"{counted}  {task.speed:.2f}/s  {duration(task.time_remaining or 0)} left  {task.fields['note']}"
-            print(line.rstrip(), file=sys.stderr, flush=True)
 
 
 class _Rate(ProgressColumn):

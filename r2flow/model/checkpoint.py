@@ -131,7 +131,7 @@ class Checkpoint:
         self, specs: Sequence[str], sensor: Sensor | str | None = None, **how: Any
     ) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
         """This model for the sensor of scans to complete, the scans, and remarks; see `r2flow.data.partial`."""
-        reading = replace(reading_for([], self), columns=how.pop("columns", None))
+        reading = reading_for([], self, columns=how.pop("columns", None))
         scans, remarks = open_partial(specs, reading, None if sensor is None else named_sensor(sensor), **how)
         if not remarks or not isinstance(self.generator, TransferFlow) or all(map(self._coarser, specs)):
             return self, scans, remarks
@@ -189,8 +189,6 @@ def find_checkpoint(path: str | Path) -> Path:
         problem = f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt)."
         runs = sorted(str(folder.parent) for folder in path.glob(f"*/{FOLDER}") if checkpoints_of(folder.parent))
         hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
-    elif path.exists():  # reading a pipe would block
-        problem = f"{path} is not a regular file."
     raise InputError(f"{problem} {hint}")
 
 

@@ -59,8 +59,7 @@ def write_completed(
     Scans whose answers are all in the folder are skipped. The result has the others by name, with their `hidden_errors`
     if a mask has hidden rays, else None. `about` has the other settings that affect the answers, as plain values.
     """
-    digits = len(str(job.num - 1))
-    numbers = [""] if job.num == 1 else [f"_{answer:0{digits}d}" for answer in range(job.num)]
+    numbers = [""] if job.num == 1 else [f"_{answer:0{len(str(job.num - 1))}d}" for answer in range(job.num)]
     written = [ending for ending in WRITTEN if ending != ".bin" or checkpoint.encoding.reflectance]
     files: dict[str, list[Path]] = {}
     for scan in scans:
