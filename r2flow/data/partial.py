@@ -24,15 +24,7 @@ from r2flow.lidar.encoding import FAR, wrong_with
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.lidar.transfer import (
-    Partial,
-    image_of_same,
-    image_through,
-    points_of_same,
-    points_through,
-    rows_of,
-    sensor_of,
-)
+from r2flow.lidar.transfer import Partial, image_through, points_of_same, points_through, rows_of, sensor_of
 
 log = logging.getLogger(__name__)
 
@@ -160,7 +152,7 @@ def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None
     def opened(number: int) -> PartialScan:
         name = f"{kind}-{number:06d}"
         content = name.encode if simulated else lambda: scans[number].tobytes()
-        return PartialScan(name, ".npy", lambda: _seen(scans[number], stored.sensor, target), content)
+        return PartialScan(name, ".npy", lambda: image_through(scans[number], stored.sensor, target), content)
 
     lines = [] if stored.sensor.same_image(target) else _described(spec, stored.sensor, target)
     return [opened(number) for number in spread(len(scans), most or len(scans))], lines
@@ -222,14 +214,10 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     if image is None:  # empty, or points (1, N, 4)
         raise InputError(other)
     if source is not None and image.shape[1] == source.shape[0]:
-        return _seen(image, source.resized(columns=image.shape[2]), target)
+        return image_through(image, source.resized(columns=image.shape[2]), target)
     if source is not None or image.shape[1:] != target.shape:
         size, model = ("x".join(map(str, shape)) for shape in (image.shape[1:], target.shape))
         found = f" ({source.name} has {source.shape[0]})" if source else ""
         advice = f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone with densify"
         raise InputError(f"{path} is a range image of {size}, those of the model are {model}: {advice}.")
-    return image_of_same(image, target)
-
-
-def _seen(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:
-    return image_of_same(image, target) if source.same_image(target) else image_through(image, source, target)
+    return image_through(image, target, target)

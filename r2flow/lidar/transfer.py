@@ -75,7 +75,9 @@ def points_through(points: Points, source: Sensor, target: Sensor, reflectance: 
 
 
 def image_through(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:
-    """The target's partially measured image, from a fully measured image of another sensor, (2 or 1, H, W)."""
+    """The target's partially measured image, from a fully measured image of a sensor, (2 or 1, H, W)."""
+    if source.same_image(target):
+        return image_of_same(image, target)
     e, a = source.rays().double().numpy()
     row = rows_of(np.asarray(source.elevations), target)
     pixel = row[:, None] * target.columns + _columns(a, target.columns)
