@@ -110,20 +110,20 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in resolved.items()}
 
 
-def add_choices(group: str) -> None:
-    """Add a Hydra choice for each registry entry of a group without a YAML file, from its constructor's options."""
-    module, table, given_by_run = REGISTRIES[group]
-    for name, entry in getattr(import_module(module), table).items():
-        if (CONF / group / f"{name}.yaml").is_file():
-            continue
-        if group == "data":
-            node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
-        elif group == "sensor":
-            node = {**options_of(import_module(module).build_sensor), "name": name}
-        else:
-            node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
-            node = {"name": name, **({"init": None} if group == "stage" else {}), **node}
-        ConfigStore.instance().store(name, node, group=group)
+def add_choices() -> None:
+    """Add a Hydra choice for each registry entry without a YAML file, from its constructor's options."""
+    for group, (module, table, given_by_run) in REGISTRIES.items():
+        for name, entry in getattr(import_module(module), table).items():
+            if (CONF / group / f"{name}.yaml").is_file():
+                continue
+            if group == "data":
+                node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
+            elif group == "sensor":
+                node = {**options_of(import_module(module).build_sensor), "name": name}
+            else:
+                node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
+                node = {"name": name, **({"init": None} if group == "stage" else {}), **node}
+            ConfigStore.instance().store(name, node, group=group)
 
 
 def with_choices(compose: Callable[[], T]) -> T:
@@ -142,8 +142,7 @@ def with_choices(compose: Callable[[], T]) -> T:
         misspelt = module not in sys.modules and did_you_mean(name, choices(group))
         if misspelt or name not in getattr(import_module(module), table):
             raise
-        for registered in REGISTRIES:
-            add_choices(registered)
+        add_choices()
         return compose()
 
 
@@ -153,6 +152,8 @@ def choices(group: str) -> list[str]:
     files = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
     return sorted(files | {name.removesuffix(".yaml") for name in ConfigStore.instance().repo.get(group, {})})
 
+
+OmegaConf.register_new_resolver("choices", lambda group: ", ".join(choices(group)), replace=True)  # for --help
 
 MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # keys that ~KEY may delete from
 

@@ -27,18 +27,7 @@ from r2flow.config import key_of, override
 from r2flow.errors import InputError, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.registry import check_options
-from r2flow.runs.composing import (
-    CONF,
-    REGISTRIES,
-    Keys,
-    add_choices,
-    as_hydra_takes,
-    choices,
-    compose,
-    explain,
-    plain,
-    with_choices,
-)
+from r2flow.runs.composing import CONF, Keys, add_choices, as_hydra_takes, compose, explain, plain, with_choices
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, stop_at_once
 
 
@@ -64,8 +53,8 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
                 return 0
             arguments, plugins = _plugins_of(list(arguments) or ["experiment=demo"])
             load_plugins(plugins)
-            for group in REGISTRIES if plugins else ():
-                add_choices(group)
+            if plugins:
+                add_choices()
             arguments = _checked_arguments(arguments)
             _run_hydra(arguments, functools.partial(_job, arguments, command, ended, os.getpid()))
             if ended:
@@ -141,7 +130,6 @@ def _run_hydra(arguments: Sequence[str], job: Callable[[DictConfig], None]) -> N
 
     decorated = hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(task)
     OmegaConf.register_new_resolver("job_folder", functools.partial(job_folder, arguments), replace=True)
-    OmegaConf.register_new_resolver("choices", lambda group: ", ".join(choices(group)), replace=True)
 
     def composed() -> None:
         sys.argv = [original[0], *arguments]
