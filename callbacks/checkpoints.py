@@ -39,9 +39,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         # On the CPU, as in Lightning, so that a run can resume without the GPU that it started on.
         checkpoint = read_checkpoint(path, map_location or "cpu")
         # Lightning's timer would resume with its time used up; trainer.max_time applies to each command.
-        checkpoint["callbacks"] = {
-            k: v for k, v in (checkpoint.get("callbacks") or {}).items() if not k.startswith("Timer")
-        }
+        states = checkpoint.get("callbacks") or {}
+        checkpoint["callbacks"] = {name: state for name, state in states.items() if not name.startswith("Timer")}
         return checkpoint
 
 

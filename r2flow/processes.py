@@ -54,9 +54,8 @@ def joined(device: str) -> Iterator[str]:
         torch.cuda.set_device(device)
     # Counts are exchanged on the CPU, statistics on their device. The timeout covers the search for copies by the first
     # process, which can take hours.
-    torch.distributed.init_process_group(
-        "cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo", timeout=timedelta(days=7)
-    )
+    backend = "cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo"
+    torch.distributed.init_process_group(backend, timeout=timedelta(days=7))
     try:
         yield device
         torch.distributed.barrier()

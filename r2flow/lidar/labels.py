@@ -46,8 +46,6 @@ def read_labels(path: Path, scan: str | Path, points: Points) -> np.ndarray:
     rows = len(points.xyz) + points.dropped
     with reading(path, LARGEST_FILE, "file of labels", least=0):
         size = path.stat().st_size  # checked first: a file of the wrong size is not loaded
-        check(
-            size == 4 * rows, f"it holds {size} bytes; {scan} has {rows} points, which need {4 * rows}: a uint32 each."
-        )
+        check(size == 4 * rows, f"it holds {size} bytes; {scan} has {rows} points, which need {4 * rows}: uint32 each.")
         ids = (np.fromfile(path, dtype="<u4") & 0xFFFF).astype(np.uint16)
     return ids if points.kept is None else ids[points.kept]

@@ -109,9 +109,7 @@ def draw(
         whole = space.shape[1:]
         generator, noise = generator.part(evaluated), evaluated.crop(noise)
         if condition is not None:  # crop per-pixel conditions
-            condition = {
-                n: evaluated.crop(value) if value.shape[-2:] == whole else value for n, value in condition.items()
-            }
+            condition = {n: evaluated.crop(x) if x.shape[-2:] == whole else x for n, x in condition.items()}
     start = time.perf_counter()
     generated = generator(noise, condition, sampler=sampler, draws=draws, precision=precision, progress=progress)
     x_1 = generated.x.cpu()  # also synchronises the GPU

@@ -89,9 +89,8 @@ def paper_page(
     flows = [run for run in runs if isinstance(run.checkpoint.generator, Flow)]
     if real is not None and len(real) > 1 and flows and flows[0].role not in SYSTEMS.values():
         figures["figure_3"] = between_figure(flows[0].checkpoint, real)
-    samples = {
-        run.label: run.checkpoint.sample(num).nan_to_num(0.0).numpy() for run in track(runs, "sampling", "generators")
-    }
+    tracked = track(runs, "sampling", "generators")
+    samples = {run.label: run.checkpoint.sample(num).nan_to_num(0.0).numpy() for run in tracked}
     scans = None if real is None else real.spread(num)[:].numpy()
     figures["figure_5"] = birds_eye_figure(
         {run.label: _birds_eye(samples[run.label], run.checkpoint) for run in runs},

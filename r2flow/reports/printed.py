@@ -9,9 +9,7 @@ from typing import NamedTuple
 from r2flow.reports.evaluation import PRINTED
 
 # Name in `r2flow.metrics` -> (heading, factor of the printed values).
-COLUMNS = {
-    name: PRINTED.get(name, (name.upper(), 1.0)) for name in ("frd", "frid", "fpd", "fpvd", "fsvd", "jsd", "mmd")
-}
+COLUMNS = {key: PRINTED.get(key, (key.upper(), 1.0)) for key in ("frd", "frid", "fpd", "fpvd", "fsvd", "jsd", "mmd")}
 
 
 class Printed(NamedTuple):

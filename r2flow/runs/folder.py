@@ -35,9 +35,7 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
         lock = FileLock(path, timeout=patience).acquire(poll_interval=0.2)
     except Timeout:
         owner = holder.read_text(encoding="utf-8") if holder.is_file() else "unknown"
-        raise InputError(
-            f"{run} is being trained by another process ({owner}). Wait for it, or give name=OTHER."
-        ) from None
+        raise InputError(f"{run} is trained by another process ({owner}). Wait for it, or give name=OTHER.") from None
     with lock:
         # Not in the lock file itself, which other processes may truncate when they try to lock it.
         holder.write_text(f"pid {os.getpid()} on {platform.node()}", encoding="utf-8")

@@ -114,9 +114,7 @@ def _checked_arguments(arguments: list[str]) -> list[str]:
     for text in overrides if parsed.multirun or "hydra.mode=MULTIRUN" in overrides else ():
         # A sweep over several names is valid.
         if key_of(text) == "run_dir" or (key_of(text) == "name" and "," not in text):
-            raise InputError(
-                f"a sweep gives each run a folder of its own: leave {text} out, or give hydra.sweep.dir=FOLDER."
-            )
+            raise InputError(f"a sweep names its runs' folders: leave {text} out, or give hydra.sweep.dir=FOLDER.")
     return [*(text for text in arguments if text not in overrides), *as_hydra_takes(overrides)]
 
 

@@ -47,9 +47,8 @@ def read_npz(path: Path) -> Table:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         check_unpacked(path, sum(info.file_size for info in members.values()))
         lower = {name.lower(): name for name in members}
-        table = next(
-            (lower[name] for name in TABLES if name in lower), next(iter(members)) if len(members) == 1 else None
-        )
+        alone = next(iter(members)) if len(members) == 1 else None
+        table = next((lower[name] for name in TABLES if name in lower), alone)
         others = [name for name in _named(members) if name != table]
         arrays = {}
         for name in [*([table] if table else []), *others]:
@@ -190,8 +189,5 @@ def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
         check(len(columns) == width, f"it has {width} columns, but {len(columns)} were named: {','.join(columns)}.")
         return columns
     example = ",".join(["x", "y", "z", "intensity", *("_" * width)][:width])
-    check(
-        width in (3, 4),
-        f"{width} columns without names: give --columns {example} (data.reading.columns=[{example}]).",
-    )
+    check(2 < width < 5, f"{width} columns without names: give --columns {example} (data.reading.columns=[{example}]).")
     return ("x", "y", "z", "reflectance")[:width]
