@@ -36,12 +36,12 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     if run.name == MIXED:
         data["parts"] = [whole(part, reading) for part in _checked_parts(run)]
     if run.scans is not None:
-        _check_set("data.scans", run.scans)
+        _check_set("data.scans", SourceOptions, run.scans)
         data["scans"] = whole(run.scans, {})
     other = run.validation_options.data
     if other is not None and run.name != PAIRS:
         held = {"name": run.name, "root": run.root, "scenes": run.scenes, **other}
-        _check_set("data.validation.data", held, split=False)
+        _check_set("data.validation.data", SourceOptions, held, split=False)
         if held["name"] != run.name:  # other files, with other columns and scale
             reading = {key: value for key, value in reading.items() if key not in ("columns", "reflectance_scale")}
             held["root"] = other.get("root")
@@ -66,7 +66,7 @@ def _checked_parts(run: DataOptions) -> list[Data]:
     for number, part in enumerate(parts):
         if isinstance(name := part.get("sensor"), str):
             part["sensor"] = options_of_sensor(read_sensor(name)) if name.endswith(ENDINGS) else {"name": name}
-        _check_set(f"data.parts[{number}]", part, kind=PartOptions)
+        _check_set(f"data.parts[{number}]", PartOptions, part)
         if part.get("sensor") is not None:
             check_options(f"data.parts[{number}].sensor", build_sensor, part["sensor"])
     if len({part.get("weight") is None for part in parts}) > 1:
@@ -74,9 +74,7 @@ def _checked_parts(run: DataOptions) -> list[Data]:
     return parts
 
 
-def _check_set(
-    what: str, options: Mapping[str, Any], split: bool = True, kind: type[SourceOptions] = SourceOptions
-) -> None:
+def _check_set(what: str, kind: type[SourceOptions], options: Mapping[str, Any], split: bool = True) -> None:
     """Refuse options that do not name a single set of scans or, with `split`, lack the split of a standard data set."""
     check_options(what, kind, options)
     name: Any = options.get("name")

@@ -1,7 +1,7 @@
 """A set of scans for commands and reports: numbered range images with their metadata."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
 
@@ -76,16 +76,14 @@ class ScanSet:
 
     def batches(
         self, numbers: Sequence[int], batch_size: int, workers: int = 0, with_points: bool = False
-    ) -> Iterator[Any]:
+    ) -> Iterable[Any]:
         """Batches of these scans in order, read by `workers` further processes: images, (B, 2 or 1, H, W), or pairs of
         images and the measured points of the pixels, (B, 3, H, W) (`ScanSource.with_points`)."""
         read = partial(_with_points, self.source) if with_points else self.source.batch
         chunks: Any = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
         # Processes take seconds to start; samples are drawn in the process of the network.
         workers = 0 if self.source.drawn or len(chunks) < 8 else workers
-        return iter(
-            DataLoader(chunks, batch_size=None, collate_fn=read, num_workers=workers, worker_init_fn=end_with_parent)
-        )
+        return DataLoader(chunks, batch_size=None, collate_fn=read, num_workers=workers, worker_init_fn=end_with_parent)
 
 
 def _with_points(source: ScanSource, numbers: list[int]) -> tuple[Tensor, Tensor]:

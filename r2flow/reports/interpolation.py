@@ -10,7 +10,7 @@ from torch import Tensor
 
 from r2flow.data.sources import spread
 from r2flow.generators import Sampler
-from r2flow.inversion import TIGHT, Real, interpolate_scans, round_trip
+from r2flow.inversion import Real, interpolate_scans, round_trip
 from r2flow.lidar.projection import write_scan
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.sampling import warn_unsolved
@@ -28,13 +28,7 @@ ENDS = {
 }  # fmt: skip
 
 
-def interpolation(
-    checkpoint: Checkpoint,
-    scans: Sequence[Real],
-    frames: int,
-    out: str | Path,
-    sampler: Sampler = TIGHT,
-) -> Page:
+def interpolation(checkpoint: Checkpoint, scans: Sequence[Real], frames: int, out: Path, sampler: Sampler) -> Page:
     """Write `frames` interpolated scans as `out/frames/NNN.ply` and `.npy`; return the page, not yet written."""
     pair, names, rays = torch.stack([scan.image for scan in scans]), [s.name for s in scans], checkpoint.sensor.rays()
     with Bar("interpolating", frames, evaluations=frames * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
@@ -43,7 +37,7 @@ def interpolation(
     images, weights = result.images.nan_to_num(0.0).numpy(), result.weights.tolist()
     rows = []
     for number, (weight, image) in enumerate(zip(weights, images, strict=True)):
-        write_scan(image, rays, Path(out, "frames"), f"{number:03d}", ("ply", "npy"))
+        write_scan(image, rays, out / "frames", f"{number:03d}", ("ply", "npy"))
         rows.append({
             "frame": number, "weight": weight, "returns": int((image[0] > 0).sum()),
             "evaluations": int(result.evaluations[number]), "converged": bool(result.converged[number]),
@@ -61,7 +55,7 @@ def interpolation(
     chosen = spread(len(images), most_images(images.shape) - 2)
     captions = [f"w = {weights[i]:.2f}" for i in chosen]
     panels = [first, Panel("between", images[chosen], rays, None, captions), last]
-    write_page(Path(out, "interpolation.html"), panels, "Interpolation")
+    write_page(out / "interpolation.html", panels, "Interpolation")
     figures = {"interpolation": interpolation_figure(pair.numpy(), images, weights, rays, names)}
     return Page("interpolation", "Interpolation", text, rows, figures, device=str(checkpoint.generator.device))
 

@@ -69,14 +69,12 @@ def smooth(steps: np.ndarray, values: np.ndarray) -> Curve:
     return np.convolve(steps, kernel, "valid"), np.convolve(values, kernel, "valid")
 
 
-def finish(
-    run: str | Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int, kept: bool = True
-) -> None:
+def finish(run: Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int, kept: bool) -> None:
     """Draw the loss curve and a few scans of a run; print its files and the commands that come next.
 
     `kept`: the run keeps checkpoints.
     """
-    curves = read_curves(run := Path(run))
+    curves = read_curves(run)
     if curves:
         save_figure(curves_figure([(run.name, curves)]), run / "loss.png")
     if not checkpoints_of(run):
