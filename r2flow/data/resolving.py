@@ -90,9 +90,8 @@ def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
         return wanted
     check(wanted == AUTO, f"encoding.reflectance must be true, false or auto, found {wanted!r}.")
     run = DataOptions(**resolve(data))
-    for options in (*run.sets, *([run.held_out] if run.held_out else [])):
-        lacking = SOURCES[options.name].lacks_reflectance(options, options.chosen["on_bad_scan"])
-        if lacking:
+    for options in filter(None, (*run.sets, run.held_out)):
+        if lacking := SOURCES[options.name].lacks_reflectance(options, options.chosen["on_bad_scan"]):
             log.info("range alone is learned (encoding.reflectance=auto): %s", lacking)
             return False
     log.info("the scans have reflectance, which is learned too (encoding.reflectance=auto)")
