@@ -132,11 +132,9 @@ class Guard(L.Callback):
 
 def describe_gradients(module: torch.nn.Module) -> str:
     """Describe the first parameter, in the module's order, with a non-finite gradient."""
-    gradients = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
-    broken = _not_finite(gradients)
-    return (
-        f"gradient of {broken[0]} non-finite first, {len(broken)} of {len(gradients)}" if broken else "gradients finite"
-    )
+    named = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
+    broken = _not_finite(named)
+    return f"gradient of {broken[0]} non-finite first, {len(broken)} of {len(named)}" if broken else "gradients finite"
 
 
 def describe_batch(trainer: L.Trainer) -> str:

@@ -85,9 +85,7 @@ class TrainerRanges:
     overfit_batches: Annotated[float, Bound("equal to 0 (data.scenes, data.drives choose few scans)", lambda n: n == 0)]
     limit_train_batches: Annotated[None, Bound("(trainer.max_steps is the length of a run)", lambda n: True)]
     val_check_interval: Positive | str | Mapping[str, Any] | None
-    check_val_every_n_epoch: Annotated[
-        None, Bound("(a run is one epoch: give trainer.val_check_interval)", lambda n: True)
-    ]
+    check_val_every_n_epoch: Annotated[None, Bound("(a run is one epoch: give val_check_interval)", lambda n: True)]
     use_distributed_sampler: Annotated[Literal[False], Bound("(each device is given its own scans)", lambda n: True)]
     log_every_n_steps: Count
     accumulate_grad_batches: Count

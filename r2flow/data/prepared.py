@@ -259,7 +259,6 @@ class PreparedScans(ScanSource):
                 file = safe_open(path, framework="numpy")
                 self._shards[shard] = [file.get_slice(name) for name, _ in codes]
         stored = [image[row : row + 1][0] for image in self._shards[shard]]
+        values = [coder.values for _, coder in codes]
         # No index is out of bounds; mode="clip" only skips the bounds check.
-        return np.stack(
-            [np.take(coder.values, code, mode="clip") for (_, coder), code in zip(codes, stored, strict=True)]
-        )
+        return np.stack([np.take(table, code, mode="clip") for table, code in zip(values, stored, strict=True)])

@@ -54,9 +54,8 @@ def read_pcd(path: Path) -> Table:
         table = text_table(body.decode("ascii").splitlines(), count, sum(widths))
         offsets = np.cumsum([0, *widths])
         return names, [table[:, i] if n == 1 else table[:, i : i + n] for i, n in zip(offsets, widths, strict=False)]
-    row = np.dtype(
-        [(str(i), f"<{k.lower()}", (n,) if n > 1 else ()) for i, (k, n) in enumerate(zip(kinds, widths, strict=True))]
-    )
+    fields = enumerate(zip(kinds, widths, strict=True))
+    row = np.dtype([(str(i), f"<{k.lower()}", (n,) if n > 1 else ()) for i, (k, n) in fields])
     size = count * row.itemsize
     if kind == "binary":
         check(len(body) >= size and not body[size:].strip(b"\0\r\n "), _wrong_size(size, len(body)))  # padded pages
