@@ -18,12 +18,12 @@ from r2flow.cli.options import (
     SamplerOptions,
     ScaleChoice,
     SizeOption,
-    choose_device,
     grouped,
     named_columns,
     parsed,
     rows_and_columns,
 )
+from r2flow.devices import choose_device
 from r2flow.errors import check, check_folder
 
 if TYPE_CHECKING:

@@ -10,17 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.options import (
-    SETS,
-    DeviceOption,
-    PrecisionOption,
-    ReadingOptions,
-    SamplerOptions,
-    choose_device,
-    grouped,
-    numbers,
-    separate,
-)
+from r2flow.cli.options import SETS, DeviceOption, PrecisionOption, ReadingOptions, SamplerOptions, grouped, numbers
+from r2flow.devices import choose_device
 from r2flow.errors import InputError, check, check_folder
 
 if TYPE_CHECKING:
@@ -217,8 +208,9 @@ def _judged(
 def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[str, ScanSet]":
     """One set per sampler and number of steps that suits the generator, by name."""
     from r2flow.evaluation.sets import sampled_set
+    from r2flow.samplers import split_samplers
 
-    names = separate(options.sampler) if options.sampler else [None]
+    names = split_samplers(options.sampler) if options.sampler else [None]
     steps = numbers("steps", options.steps) if options.steps else [None]
     sets, samplers = {}, _samplers(flow.generator, names, steps, options.tolerance)
     if not samplers:

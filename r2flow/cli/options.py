@@ -3,7 +3,6 @@
 import inspect
 import math
 import os
-import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
-from r2flow.devices import choose_device as choose_device  # re-exported for verbs
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -168,8 +166,3 @@ class DrawOptions:
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends only on the seed and i.")] = 0
     batch_size: Annotated[int, typer.Option(min=1, help="Scans per batch.")] = 1
     device: DeviceOption = "auto"
-
-
-def separate(samplers: str) -> list[str]:
-    """Split at commas, except those in a list of times."""
-    return re.split(r",(?![^\[]*\])", samplers)

@@ -20,12 +20,11 @@ from r2flow.cli.options import (
     SensorChoice,
     SensorOption,
     SizeOption,
-    choose_device,
     grouped,
     numbers,
     rows_and_columns,
-    separate,
 )
+from r2flow.devices import choose_device
 from r2flow.errors import check, check_folder
 
 if TYPE_CHECKING:
@@ -164,6 +163,7 @@ def completion(
     from r2flow.progress import Bar
     from r2flow.reports.compare import labels
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, measured_by, pictured
+    from r2flow.samplers import split_samplers
 
     paths, where = [Path(name) for name in models or [DENSIFY]], choose_device(device)
     loaded = {name: load_checkpoint(path, where) for name, path in zip(labels(paths), paths, strict=True)}
@@ -177,7 +177,7 @@ def completion(
     chosen = [
         (name, model, completing(model.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
         for name, model in loaded.items()
-        for sampler in (separate(samplers) if samplers else [None])
+        for sampler in (split_samplers(samplers) if samplers else [None])
     ]
     names = [f"{name}, {sampler}" for name, _, sampler in chosen]
     ways = {

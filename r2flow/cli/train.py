@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.options import DeviceOption, PrecisionOption, SamplerOptions, choose_device, grouped
+from r2flow.cli.options import DeviceOption, PrecisionOption, SamplerOptions, grouped
+from r2flow.devices import choose_device
 
 
 @app.command(

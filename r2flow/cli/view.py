@@ -12,7 +12,8 @@ from typing import Annotated, Literal
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, choose_device, grouped, numbers
+from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, grouped, numbers
+from r2flow.devices import choose_device
 from r2flow.errors import InputError, check
 
 SCANS, SAMPLES = 16, 4  # default numbers per folder and per generator

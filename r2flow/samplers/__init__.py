@@ -24,7 +24,7 @@ from r2flow.samplers.stochastic import SDE
 __all__ = [
     "MMPS", "SAMPLERS", "SDE", "Adaptive", "Chord", "Condition", "FixedSteps", "Generated", "Jump", "Noise",
     "ODESampler", "OnGrid", "Posterior", "Progress", "Refine", "Renoise", "Repaint", "Replace", "Sampler",
-    "TorchDiffEq", "Transport", "build_sampler", "parse_sampler",
+    "TorchDiffEq", "Transport", "build_sampler", "parse_sampler", "split_samplers",
 ]  # fmt: skip
 
 
@@ -78,6 +78,11 @@ def parse_sampler(text: str) -> dict[str, Any]:
         return {"name": name, **OmegaConf.to_object(OmegaConf.from_dotlist(fields))}  # type: ignore[dict-item]
     except Exception as error:  # of YAML, or of an interpolation
         raise InputError(f"a sampler's fields cannot be read: {text!r}.") from error
+
+
+def split_samplers(text: str) -> list[str]:
+    """Split texts of samplers at commas, except those in a list of times."""
+    return re.split(r",(?![^\[]*\])", text)
 
 
 def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
