@@ -52,8 +52,8 @@ def export(
         save_checkpoint(loaded, out, half)
         print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {sha256(out.read_bytes()).hexdigest()}")
         return
-    flow = loaded.generator  # others than rectified flows are refused whatever their sampler
-    sampler = writing.exportable(flow, **how.given) if isinstance(flow, RectifiedFlow) else None
+    # Other generators are refused whatever their sampler.
+    sampler = loaded.generator.choose(**how.given) if isinstance(loaded.generator, RectifiedFlow) else None
     check_folder(out.parent)
     logging.getLogger("r2flow.model.export").setLevel(logging.INFO)
     written = writing.export(loaded, out, sampler, what == "network")

@@ -21,7 +21,6 @@ from r2flow import __version__
 from r2flow.errors import InputError, check, require
 from r2flow.files import write_file
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
-from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.projection import unproject
 from r2flow.model.checkpoint import Checkpoint, weights_hash
@@ -138,7 +137,7 @@ def export(
 
     Args:
         path: Output file; its suffix sets the format.
-        sampler: Sampler or its name; None: `exportable`.
+        sampler: Sampler or its name; None: the flow's default.
         network: Export v(t, x) alone: `t` (B,) and `x` (B, C, H, W) to `v`; for a flow map also `s` (B,).
 
     Raises:
@@ -150,7 +149,7 @@ def export(
         kind = type(flow).__name__
         raise InputError(f"only rectified flows and flow maps can be exported, and {checkpoint.path} holds a {kind}.")
     write, flow = FORMATS[path.suffix.removeprefix(".")], deepcopy(flow)  # which tracing moves and changes
-    how = sampler if isinstance(sampler, Sampler) else exportable(flow, name=sampler)
+    how = sampler if isinstance(sampler, Sampler) else flow.choose(sampler)
     own = type(flow).velocity is not RectifiedFlow.velocity
     check(not (network and own), f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler.")
     steps = None if network else tableau(flow, how)
@@ -162,11 +161,6 @@ def export(
         data, any_batch = write(flow, steps, notes)
     write_file(path, data)
     return Exported(path, any_batch, notes)
-
-
-def exportable(flow: RectifiedFlow, **given: Any) -> Sampler:
-    """`Generator.choose`; without options, an ODE sampler if the flow's default draws noise at every step."""
-    return flow.choose(**given) if any(given.values()) or not flow.sampler.draws else ode_sampler(flow)
 
 
 def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[str, Any]:
