@@ -17,6 +17,7 @@ from r2flow.registry import Bound, Count, Portion, Positive
 
 GROUPS = 8
 EPS = 1e-6
+TimeChannels = Annotated[int, Bound("of at least 4 that is even", lambda n: n >= 4 and n % 2 == 0)]
 
 
 class RingConv2d(nn.Conv2d):
@@ -190,10 +191,10 @@ class UNet(Backbone, ABC):
     def __init__(
         self,
         rays: Tensor,
-        base_channels: Annotated[int, Bound("of at least 4 that is even", lambda n: n >= 4 and n % 2 == 0)] = 64,
+        base_channels: TimeChannels = 64,
         channel_multiplier: Sequence[int] = (1, 2, 4, 8),
         num_residual_blocks: int | Sequence[int] = (3, 3, 3, 3),
-        num_heads: int = 8,
+        num_heads: Count = 8,
         time_channels: Count | None = None,
         position: str | None = "fourier_features",
         ring: bool = True,

@@ -8,9 +8,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.base import Backbone, CommonOptions, integers
-from r2flow.backbones.convolutions import time_embedding
+from r2flow.backbones.convolutions import TimeChannels, time_embedding
 from r2flow.backbones.layers import uncast, wrapped, zero_initialised
-from r2flow.registry import Count
 
 
 class Local(Backbone):
@@ -29,7 +28,7 @@ class Local(Backbone):
     def __init__(
         self,
         rays: Tensor,
-        channels: Count = 48,
+        channels: TimeChannels = 48,
         dilations: Sequence[int] = (1, 2, 4, 8, 1),
         ring: bool = True,
         **common: Unpack[CommonOptions],
