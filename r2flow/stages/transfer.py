@@ -50,7 +50,8 @@ class Tasks:
             x_1 = scaled(x_1[None], gain_of(space, x_1[None], torch.ones_like(x_1[None])))[0]
         halve, silent, unnumbered, top, left = draws.random(5)
         elevations = space.rays[0, :, 0]
-        if halve < self.halved and x_1.shape[1] >= 2 * self.rows and x_1.shape[2] >= 4 * self.columns:
+        large = x_1.shape[1] >= 2 * self.rows and x_1.shape[2] >= 4 * self.columns
+        if halve < self.halved and large and x_1.shape[1] % 2 == x_1.shape[2] % 4 == 0:
             x_1, elevations = coarser(space, x_1), elevations.unflatten(0, (-1, 2)).mean(1)
         rows, columns = self.size(own)
         first = int(top * (x_1.shape[1] - rows + 1))

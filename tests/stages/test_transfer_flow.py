@@ -275,11 +275,13 @@ def test_a_part_of_a_scan_and_what_is_known_of_it_depend_on_the_image_alone(flow
         assert one["x_1"].shape == (2, 4, 16)
         assert torch.equal(one["image"], one["x_1"] * one["known"])
     assert len({float(one["known"].mean()) for one in parts[0]}) > 5
-    silent = Tasks(rows=4, columns=16, silent=0.99)(
-        flow.space, x_1, flow.space.sensor, noise.generator(0, "condition", 0)
-    )
+    rng = noise.generator(0, "condition", 0)
+    silent = Tasks(rows=4, columns=16, silent=0.99)(flow.space, x_1, flow.space.sensor, rng)
     assert silent["known"][0].any()
     assert not silent["known"][1].any()
+    for shape in ((9, 64), (8, 66)):  # not in whole blocks of 2 x 4 pixels
+        often, sensor = Tasks(rows=4, columns=16, halved=0.99), build_sensor("hdl64e", *shape)
+        assert often(flow.space, torch.zeros(2, *shape), sensor, rng)["x_1"].shape == (2, 4, 16)
 
 
 def stage(**changed) -> Transfer:
