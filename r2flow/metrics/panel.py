@@ -88,9 +88,9 @@ def run_lengths(scan: Scan) -> np.ndarray:
 def changes_row(scan: Scan) -> np.ndarray:
     """Per row, pairs of neighbours with exactly one return, all, and those of the image, (3, 1024); none beyond."""
     returned = scan.r > 0
+    changes = (returned != np.roll(returned, -1, -1)).sum(1)[:MOST_ROWS]
     counts = np.zeros((3, MOST_ROWS))
-    counts[0, : len(returned)] = (returned != np.roll(returned, -1, -1)).sum(1)
-    counts[1, : len(returned)], counts[2] = returned.shape[1], returned.size
+    counts[0, : len(changes)], counts[1, : len(changes)], counts[2] = changes, returned.shape[1], returned.size
     return counts
 
 

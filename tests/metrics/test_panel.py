@@ -67,6 +67,7 @@ def test_the_histograms_are_numpy_s_and_every_member_has_its_size():
         counts = member.counts(scan).ravel()
         assert counts.size == member.size, name
         np.testing.assert_array_equal(counts, expected.get(name, counts).ravel(), err_msg=name)
+    assert (lines.changes_row(scan_of(np.indices((1030, 64)).sum(0)[None] % 2))[:2] == 64).all()  # of 1024 rows
 
 
 def test_the_metric_has_the_distances_of_the_sets_and_their_mean():
