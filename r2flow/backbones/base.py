@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self, TypedDict
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -12,23 +12,14 @@ from r2flow.errors import InputError
 from r2flow.registry import Positive
 
 
-class CommonOptions(TypedDict, total=False):
-    """The options of every backbone: a subclass takes them as `**common` and passes them to `Backbone`."""
-
-    in_channels: int
-    out_channels: int | None
-    second_time: bool
-    data_std: Positive | None
-
-
 class Backbone(ExactBuffers):
     """A field v(t, x) on images, or the mean velocity u(x, t, s) of a flow from time t to time s.
 
     X_{t->s}(x) = x + (s - t) u(x, t, s), and u(x, t, t) = v(t, x) (Geng et al. 2025, "Mean flows for one-step
     generative modeling", with the sign of s - t).
 
-    A subclass implements `velocity`; layers with times as input are `ExactLinear`, since times stay float32. A class
-    declares its capabilities:
+    A subclass implements `velocity` and passes the options below on as `**common`; layers with times as input are
+    `ExactLinear`, since times stay float32. A class declares its capabilities:
 
     - unit: The rows and columns of the image, and of each part of it, are multiples of the unit.
     - follow_rays: Computes unsaved buffers from `coords`; called by the constructor and whenever `coords` is loaded.

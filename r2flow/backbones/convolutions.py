@@ -4,13 +4,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Unpack
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.base import Backbone, CommonOptions, integers
+from r2flow.backbones.base import Backbone, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
 from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, shared, wrapped, zero_initialised
 from r2flow.registry import Bound, Count, Portion, Positive
@@ -201,7 +201,7 @@ class UNet(Backbone, ABC):
         dropout: Portion = 0.0,
         groups: Count = GROUPS,
         eps: Positive = EPS,
-        **common: Unpack[CommonOptions],
+        **common: Any,
     ) -> None:
         levels = max(len(channel_multiplier), 1)
         multipliers = integers("channel_multiplier", channel_multiplier, levels)

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Annotated, NamedTuple, Self, Unpack, cast
+from typing import Annotated, Any, NamedTuple, Self, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.attention import BACKENDS, check_window, neighbourhood_attention
-from r2flow.backbones.base import Backbone, CommonOptions, integers
+from r2flow.backbones.base import Backbone, integers
 from r2flow.backbones.detail import Detail
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, mean_rays, position_name, rotate
 from r2flow.backbones.layers import (
@@ -72,7 +72,7 @@ class HDiT(Backbone):
         dropout: Portion = 0.0,
         attention: str = "auto",
         detail: Sequence[int] | None = None,
-        **common: Unpack[CommonOptions],
+        **common: Any,
     ) -> None:
         levels = max(len(depths), 1)
         depths = integers("depths", depths, levels)

@@ -1,13 +1,13 @@
 """A small convolutional network at full resolution, for tasks that need only a ray's neighbourhood."""
 
 from collections.abc import Sequence
-from typing import Unpack
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.base import Backbone, CommonOptions, integers
+from r2flow.backbones.base import Backbone, integers
 from r2flow.backbones.convolutions import TimeChannels, time_embedding
 from r2flow.backbones.layers import uncast, wrapped, zero_initialised
 
@@ -31,7 +31,7 @@ class Local(Backbone):
         channels: TimeChannels = 48,
         dilations: Sequence[int] = (1, 2, 4, 8, 1),
         ring: bool = True,
-        **common: Unpack[CommonOptions],
+        **common: Any,
     ) -> None:
         super().__init__(rays, (1, 1), **common)
         widths = integers("backbone.dilations", dilations, len(dilations))

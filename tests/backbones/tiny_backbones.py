@@ -1,13 +1,12 @@
 """Small backbones of every kind, whose weights are not zero."""
 
-from typing import Any, Unpack
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones import BACKBONES, Backbone, build_backbone
-from r2flow.backbones.base import CommonOptions
 from r2flow.backbones.layers import ExactLinear
 from r2flow.lidar.sensors import build_sensor
 from tests.conftest import tiny_options
@@ -47,7 +46,7 @@ class Plain(Backbone):
     It states nothing about itself: what any new backbone may be.
     """
 
-    def __init__(self, rays: Tensor, base_channels: int = 8, **common: Unpack[CommonOptions]) -> None:
+    def __init__(self, rays: Tensor, base_channels: int = 8, **common: Any) -> None:
         super().__init__(rays, **common)
         self.first = nn.Conv2d(self.in_channels, base_channels, 3, padding=1)
         self.time = ExactLinear(1, base_channels)
