@@ -22,7 +22,7 @@ class Diffusion(NetworkFlow):
     Samplers: `DDPM`, `DDIM` and those of flows; `Repaint` completes scans by ancestral steps.
 
     The flow is the diffusion's probability-flow ODE on straight lines: a line's state x_s = s x_1 + (1 - s) x_0 is
-    z_t / (alpha_t + sigma_t) at the t with alpha_t / (alpha_t + sigma_t) = s, so that
+    z_t / (alpha_t + sigma_t) at the t with alpha_t / (alpha_t + sigma_t) = sigmoid(lambda_t / 2) = s, so that
 
         v(s, x_s) = x(z_t, lambda_t) - eps(z_t, lambda_t).
 
@@ -50,7 +50,7 @@ class Diffusion(NetworkFlow):
         self.schedule = SCHEDULES.build(schedule or {"name": "cosine"})
         self.run_by(DDPM(256))  # as in the published scripts
         ends = torch.tensor([1.0, 0.0], dtype=torch.float64, device="cpu")  # real values, also under the meta device
-        self._ends = straight_time(self.schedule(ends)).tolist()
+        self._ends = torch.sigmoid(self.schedule(ends) / 2).tolist()
 
     def predict(self, z: Tensor, log_snr: Tensor) -> Tensor:
         """y, (B, C, H, W), of states z and log-SNRs of shape () or (B,)."""
@@ -63,7 +63,7 @@ class Diffusion(NetworkFlow):
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         assert condition is None
-        log_snr = log_snr_of(torch.as_tensor(t, device=x.device).clamp(*self._ends))
+        log_snr = 2 * torch.logit(torch.as_tensor(t, device=x.device).clamp(*self._ends))
         alpha, sigma = alpha_sigma(for_images(log_snr, x))
         z = (alpha + sigma) * x
         clean = self.denoise(z, log_snr)
@@ -107,16 +107,3 @@ class DDPM(DDIM):
     """Ancestral steps."""
 
     eta: Share = 1.0
-
-
-def straight_time(log_snr: Tensor) -> Tensor:
-    """alpha / (alpha + sigma) = sigmoid(lambda / 2): the time of a straight line from noise to data with equal log-SNR.
-
-    z_t = (alpha + sigma) [s x + (1 - s) eps] with this s, so a diffusion's states, rescaled, are those of a flow.
-    """
-    return torch.sigmoid(log_snr / 2)
-
-
-def log_snr_of(s: Tensor) -> Tensor:
-    """2 ln(s / (1 - s)): lambda of the straight line's time s, the inverse of `straight_time`."""
-    return 2 * torch.logit(s)
