@@ -13,7 +13,7 @@ Backends, with equal values and gradients:
 
 import functools
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -37,7 +37,7 @@ def neighbourhood_attention(
         wrap: Whether the columns are a ring; if not, windows are shifted inside in both directions.
         backend: A name in `BACKENDS`, or "auto" (above).
     """
-    check_window(window)
+    assert window[0] % 2 == window[1] % 2 == 1, window
     rows = _Axis(q.shape[1], window[0], wrap=False)
     columns = _Axis(q.shape[2], window[1], wrap=wrap)
     if backend == "auto":
@@ -45,12 +45,6 @@ def neighbourhood_attention(
         flex = supported and not torch.compiler.is_compiling() and importlib.util.find_spec("triton")
         backend = "flex" if flex else "tiles"
     return BACKENDS[backend](q, k, v, rows, columns)
-
-
-def check_window(window: Sequence[int]) -> None:
-    """Refuse windows of even size."""
-    if any(size < 1 or size % 2 == 0 for size in window):
-        raise InputError(f"the attention window must have odd sizes of at least 1, found {tuple(window)}.")
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,10 @@ Rays are elevation e and azimuth a in radians, shape (1, 2, H, W). All computati
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.backbones.layers import ExactBuffers
 from r2flow.registry import Registry
-
-
-def mean_rays(rays: Tensor, patch: tuple[int, int]) -> Tensor:
-    """Mean ray of each patch, (1, 2, H, W) to (1, 2, H / patch_h, W / patch_w)."""
-    # in float32: harmonics amplify the rounding of the mean, and the published weights were trained with it
-    return F.avg_pool2d(rays, patch)
 
 
 class Rotary(ExactBuffers):

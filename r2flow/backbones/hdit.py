@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.attention import BACKENDS, check_window, neighbourhood_attention
+from r2flow.backbones.attention import BACKENDS, neighbourhood_attention
 from r2flow.backbones.base import Backbone, integers
 from r2flow.backbones.detail import Detail
-from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, mean_rays, position_name, rotate
+from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, position_name, rotate
 from r2flow.backbones.layers import (
     AdaRMSNorm,
     ExactLinear,
@@ -26,7 +26,7 @@ from r2flow.backbones.layers import (
     unshuffle,
     zero_initialised,
 )
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.registry import Bound, Count, Portion
 
 
@@ -84,7 +84,7 @@ class HDiT(Backbone):
         self.patch, self.levels = (patch_h, patch_w), levels
         rows, columns = rays.shape[1] // patch_h, rays.shape[2] // patch_w
         span_h, span_w = integers("window", window, 2)
-        check_window((span_h, span_w))
+        check(span_h % 2 and span_w % 2, f"the attention window must have odd sizes, found {(span_h, span_w)}.")
         _ = attention == "auto" or BACKENDS[attention]  # refuses an unknown name early
         local = Neighbourhood((span_h, span_w), ring, attention)
         widths = [base_channels * 2**level for level in range(levels)]
@@ -108,7 +108,8 @@ class HDiT(Backbone):
         for level in range(levels - 1):
             for side in (self.down_levels, self.up_levels):
                 side[f"level_{level}"] = blocks(level)
-            self.down_levels[f"merge_{level}"] = Merge(widths[level])
+            merged = nn.Linear(4 * widths[level], 2 * widths[level], bias=False)
+            self.down_levels[f"merge_{level}"] = nn.Sequential(Shuffle(), merged)
             self.up_levels[f"expand_{level}"] = Expand(widths[level])
         self.mid_levels = blocks(levels - 1)
         pixels = zero_initialised(nn.Linear(base_channels, math.prod(self.patch) * self.out_channels, bias=False))
@@ -146,12 +147,13 @@ class HDiT(Backbone):
 
     def follow_rays(self) -> None:
         for level in range(self.levels):
-            rays = mean_rays(self.coords, (self.patch[0] << level, self.patch[1] << level))
+            # Means in float32: harmonics amplify their rounding, and the published weights were trained with it.
+            rays = F.avg_pool2d(self.coords, (self.patch[0] << level, self.patch[1] << level))
             table = _shared_rotation(level, self._blocks(level)).table(rays)
             self.register_buffer(f"table_{level}", table, persistent=False)
         if isinstance(self.spatial_pe, nn.Sequential):
             encoding = cast(RayFeatures, self.spatial_pe[0]).embedding
-            features = encoding(mean_rays(self.coords, self.patch)).permute(0, 2, 3, 1)
+            features = encoding(F.avg_pool2d(self.coords, self.patch)).permute(0, 2, 3, 1)
             self.register_buffer("features", features, persistent=False)
 
     @property
@@ -306,13 +308,6 @@ class FeedForward(nn.Module):
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         return self.linear(self.dropout(geglu(self.gegelu(self.adarms(x, condition)))))
-
-
-class Merge(nn.Sequential):
-    """2 x 2 tokens of C channels become one of 2C."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__(Shuffle(), nn.Linear(4 * channels, 2 * channels, bias=False))
 
 
 class Shuffle(nn.Module):
