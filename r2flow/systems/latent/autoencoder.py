@@ -7,7 +7,6 @@ import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -20,14 +19,6 @@ from r2flow.errors import InputError
 from r2flow.registry import Count, NonNegative
 
 AT_ONCE = 4096  # vectors per block of distances to all codes
-
-
-class Quantised(NamedTuple):
-    """Output of a quantiser for z, (B, C, H, W)."""
-
-    codes: Tensor  # nearest codes, (B, C, H, W), with straight-through gradient
-    loss: Tensor  # codebook and commitment loss, ()
-    indices: Tensor  # indices of the codes, (B H W,) int64
 
 
 class Quantiser(nn.Module):
@@ -45,26 +36,26 @@ class Quantiser(nn.Module):
         self.embedding = nn.Embedding(codes, channels)
         nn.init.uniform_(self.embedding.weight, -1 / codes, 1 / codes)
 
-    def forward(self, z: Tensor) -> Quantised:
+    def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """The codes nearest to z, (B, C, H, W), with straight-through gradient, and the loss, ()."""
         vectors = z.movedim(1, -1)
-        indices = self.nearest(vectors.detach().flatten(0, -2))
-        q = self.embedding(indices).view(vectors.shape)
+        q = self.embedding(self.nearest(vectors))
         codebook, commitment = (q - vectors.detach()).square().mean(), (q.detach() - vectors).square().mean()
         loss = self.beta * codebook + commitment if self.legacy else codebook + self.beta * commitment
         through = vectors + (q - vectors).detach()
-        return Quantised(through.movedim(-1, 1), loss, indices)
+        return through.movedim(-1, 1), loss
 
     @torch.no_grad()
     def nearest(self, vectors: Tensor) -> Tensor:
-        """Index of the code nearest to each vector, (N, C) to (N,)."""
+        """Index of the code nearest to each vector, (..., C) to (...)."""
         codes = self.embedding.weight.float()
         lengths = codes.square().sum(1)
         with torch.autocast(vectors.device.type, enabled=False):  # full precision, for differences of large numbers
             parts = [
                 (part.square().sum(1, keepdim=True) + lengths - 2 * part @ codes.T).argmin(1)
-                for part in vectors.float().split(AT_ONCE)
+                for part in vectors.flatten(0, -2).float().split(AT_ONCE)
             ]
-        return torch.cat(parts)
+        return torch.cat(parts).view(vectors.shape[:-1])
 
 
 GROUPS = 32
@@ -261,10 +252,10 @@ class Autoencoder(nn.Module):
 
     def decode(self, z: Tensor, quantise: bool = True) -> Tensor:
         """Decode latents, by default after quantisation; rays dropped by the mask are -1."""
-        image = self.decoder(self.post_quant_conv(self.quantize(z).codes if quantise else z))
+        image = self.decoder(self.post_quant_conv(self.quantize(z)[0] if quantise else z))
         return torch.where(image[:, -1:] < 0, -1.0, image[:, :-1]) if self.mask else image
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Quantised]:
-        """Reconstruction, including the mask channel, and output of the quantiser."""
-        quantised = self.quantize(self.encode(x))
-        return self.decoder(self.post_quant_conv(quantised.codes)), quantised
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Reconstruction, including the mask channel, and the quantiser's loss."""
+        codes, loss = self.quantize(self.encode(x))
+        return self.decoder(self.post_quant_conv(codes)), loss

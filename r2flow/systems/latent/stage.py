@@ -149,9 +149,9 @@ class LearnAutoencoder(Stage):
         x = batch["x_1"]
         mask = self.mask_of(x)
         factor = adversarial_factor(self.global_step, self.adversarial_start, self.inverted)
-        made, quantised = self.autoencoder(x)
+        made, codebook = self.autoencoder(x)
         reconstruction = reconstruction_loss(x, made, mask, self.mask_factor)
-        loss = reconstruction + self.codebook_weight * quantised.loss
+        loss = reconstruction + self.codebook_weight * codebook
         if factor:
             adversarial = -self.discriminator(made).mean()
             last = self.autoencoder.decoder.get_parameter("conv_out.weight")
@@ -162,7 +162,7 @@ class LearnAutoencoder(Stage):
         judged = hinge_loss(self.discriminator(real), self.discriminator(made.detach()))
         self.take_step(for_discriminator, factor * judged)
         self.log("train/loss", reconstruction, prog_bar=True, sync_dist=True)
-        self.log("train/codebook", quantised.loss, sync_dist=True)
+        self.log("train/codebook", codebook, sync_dist=True)
         self.log("train/discriminator", judged, sync_dist=True)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
