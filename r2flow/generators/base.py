@@ -24,15 +24,6 @@ Precision = Literal["32-true", "bf16-mixed"]  # names of Lightning's Trainer
 IMAGE, KNOWN = "image", "known"  # keys of the condition of a partial scan
 
 
-def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
-    """`image` and `known` of a condition, in x's dtype and on its device; zeros without a condition."""
-    if condition is None:
-        return torch.zeros_like(x), torch.zeros_like(x)
-    image, known = (condition[name].to(x) for name in (IMAGE, KNOWN))
-    assert image.shape == known.shape == x.shape
-    return image, known
-
-
 def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
     """Condition of partial scans: `image` and `known`, each (B, C, H, W) in model space.
 

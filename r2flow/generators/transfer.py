@@ -14,7 +14,7 @@ from r2flow.backbones import build_backbone
 from r2flow.errors import InputError, check
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
-from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator, parts_of
+from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator
 from r2flow.generators.flow import Conditioned, Flow
 from r2flow.generators.surroundings import FEATURES, ROW, STEEP, RowFeatures, Surroundings, encoded, steps_of
 from r2flow.lidar.encoding import ModelSpace
@@ -207,7 +207,7 @@ class TransferFlow(Flow):
             raise InputError("this model completes scans: give one of which a ray is known, as r2flow complete does.")
         weight = next(self.parameters())
         condition = {name: value.to(weight) for name, value in condition.items()}
-        image, known = parts_of(condition, noise.to(weight))
+        image, known = condition[IMAGE], condition[KNOWN]
         # Another sensor's intensities have another scale than those that the network has seen.
         gain = gain_of(self.space, image, known) if self.space.encoding.reflectance and self.foreign else None
         if gain is not None:

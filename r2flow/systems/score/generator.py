@@ -17,7 +17,7 @@ from torch import Tensor
 from r2flow.backbones.layers import halved
 from r2flow.errors import check
 from r2flow.flow.solvers.solution import finite
-from r2flow.generators.base import Generator, parts_of
+from r2flow.generators.base import IMAGE, KNOWN, Generator
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.registry import Count, Positive, Registry
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
@@ -133,10 +133,12 @@ class Langevin(Sampler):
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         x = torch.special.ndtr(noise)
-        image, known = parts_of(condition, x)
 
         def pull(x: Tensor) -> Tensor:
             """Likelihood gradient of the known pixels (Zyrianov et al. 2022, eq. 8)."""
+            if condition is None:
+                return torch.zeros_like(x)
+            image, known = condition[IMAGE].to(x), condition[KNOWN].to(x)
             return generator.pull * known * ((image + 1) / 2 - x)
 
         assert draws is not None
