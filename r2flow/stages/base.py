@@ -70,7 +70,7 @@ class Stage(L.LightningModule):
             raise InputError(f"{type(self).__name__} learns a {expected}, found a {actual}: give another stage.")
         super().__init__()
         self.generator = generator
-        self.learning_rate, self.betas, self.weight_decay = learning_rate, betas, weight_decay
+        self.learning_rate, self.betas, self.weight_decay = learning_rate, (betas[0], betas[1]), weight_decay
         self.muon = muon
         self.warmup_steps = warmup_images // batch_size
         self.seed = seed
@@ -101,8 +101,7 @@ class Stage(L.LightningModule):
 
     def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
         """AdamW or `Muon` with a schedule for each group of parameters, in the format of `configure_optimizers`."""
-        betas = self.betas[0], self.betas[1]
-        options: dict[str, Any] = {"lr": self.learning_rate, "betas": betas, "weight_decay": self.weight_decay}
+        options: dict[str, Any] = {"lr": self.learning_rate, "betas": self.betas, "weight_decay": self.weight_decay}
         total = max(int(self.trainer.max_steps), 1)
         warmup = min(self.warmup_steps, total)
 

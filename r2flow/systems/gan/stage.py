@@ -134,10 +134,9 @@ class LearnGan(Stage):
         self.augment = None if augment is None else construct("stage.augment", AdaptiveAugment, augment)
 
     def configure_optimizers(self) -> Any:
-        betas = self.betas[0], self.betas[1]
-        rate, lazy_betas = lazy_adam(self.learning_rate, betas, self.r1_every if self.r1 else 0)
+        rate, lazy_betas = lazy_adam(self.learning_rate, self.betas, self.r1_every if self.r1 else 0)
         return [
-            torch.optim.Adam(self.generator.parameters(), self.learning_rate, betas),
+            torch.optim.Adam(self.generator.parameters(), self.learning_rate, self.betas),
             torch.optim.Adam(self.discriminator.parameters(), rate, lazy_betas),
         ]
 
