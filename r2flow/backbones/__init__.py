@@ -31,12 +31,9 @@ def build_backbone(
 
     `in_channels` includes the channels of a condition; `out_channels` None means as many.
     """
-    arguments: dict[str, Any] = {"in_channels": in_channels}
-    if out_channels is not None:
-        arguments["out_channels"] = out_channels
-    if second_time:
-        arguments["second_time"] = True
-    built: Backbone = BACKBONES.build({**options, **arguments}, rays)
+    ends = {"in_channels": in_channels, "out_channels": out_channels}
+    times = {"second_time": True} if second_time else {}  # a plug-in may not know it
+    built: Backbone = BACKBONES.build({**options, **ends, **times}, rays)
     check(any(True for _ in built.parameters()), f"a {type(built).__name__} has no weights to learn.")
     return built
 
