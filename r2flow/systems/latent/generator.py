@@ -73,8 +73,7 @@ class LatentDiffusion(Generator):
 
     def expected(self, z: Tensor, t: Tensor) -> Tensor:
         """Expected latents given z (B, ...) at step t, ()."""
-        x, _ = PREDICTIONS["eps"].split(z, self.unet(z, t.to(z.device).expand(len(z))), self.log_snr[t])
-        return x
+        return PREDICTIONS["eps"].split(z, self.unet(z, t.to(z.device).expand(len(z))), self.log_snr[t])[0]
 
     def start_from(self, parent: Generator) -> None:
         """Load the weights of an autoencoder or another latent diffusion."""
