@@ -152,10 +152,9 @@ class OnGrid(Sampler):
             check(not finish, "a grid of times has its own last step: give finish=0.")
         self.times()
 
-    def times(self, t_1: float = 1.0, fewer: int = 0) -> Tensor:
-        """Time grid from 0 to t_1, (steps - fewer + 1,) float64."""
-        with torch.device("cpu"):  # even if the default device is meta
-            return build_grid(self.grid, 0.0, t_1, self.steps - fewer)
+    def times(self) -> Tensor:
+        """Time grid from 0 to 1, (steps + 1,) float64."""
+        return build_grid(self.grid, 0.0, 1.0, self.steps)
 
 
 def _with_steps(options: dict[str, Any]) -> dict[str, Any]:

@@ -56,8 +56,8 @@ class Chord(Jump):
     steps: Steps = 2
     grid: Grid | None = None  # type: ignore[assignment]  # None: `late`
 
-    def times(self, *args: Any, **how: Any) -> Tensor:
-        return late(self.steps, 1 / 2 if self.draws else 1 / 16) if self.grid is None else super().times(*args, **how)
+    def times(self) -> Tensor:
+        return late(self.steps, 1 / 2 if self.draws else 1 / 16) if self.grid is None else super().times()
 
     def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
         return x + (s - t) * u(t, x, torch.ones_like(t))

@@ -98,8 +98,8 @@ class Repaint(Posterior):
     repeats: Count = 4  # how often each step is taken
     jump: Count = 1  # number of equal parts of a step
 
-    def times(self, *args: Any, **options: Any) -> Tensor:
-        times = super().times(*args, **options)
+    def times(self) -> Tensor:
+        times = super().times()
         inner = torch.arange(self.jump, dtype=times.dtype, device=times.device) / self.jump
         return torch.cat([(times[:-1, None] + times.diff()[:, None] * inner).flatten(), times[-1:]])
 

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, stepped
 from r2flow.registry import NonNegative, Portion
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid
@@ -106,7 +107,7 @@ class SDE(OnGrid):
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         field, x, alive, times = generator.field(condition), noise, finite(noise), self.times()
         if self.finish and self.steps > 1:
-            times = torch.cat([self.times(1 - self.finish, fewer=1), times[-1:]])
+            times = torch.cat([build_grid(self.grid, 0.0, 1 - self.finish, self.steps - 1), times[-1:]])
 
         def estimate(t: Tensor, x: Tensor) -> Tensor:
             return x + (1 - t) * field(t, x).to(x)

@@ -14,8 +14,8 @@ from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity
 
 
 def uniform(t_0: float, t_1: float, steps: int) -> Tensor:
-    """Equal steps; (steps + 1,) float64."""
-    return torch.linspace(t_0, t_1, steps + 1, dtype=torch.float64)
+    """Equal steps; (steps + 1,) float64 on the CPU, even if the default device is meta."""
+    return torch.linspace(t_0, t_1, steps + 1, dtype=torch.float64, device="cpu")
 
 
 def power(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
