@@ -148,21 +148,19 @@ class TransferFlow(Flow):
         return Answers(logits, ranges, scales, returns, strengths.clamp(0, 1) if not self.training else strengths)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        return self._toward(t, x, condition, last=False)
+        return self.mean_velocity(t, x, torch.zeros(()), condition)
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
         """The velocity; for s = 1, that of the straight line to the point estimate of x_1."""
-        return self._toward(t, x, condition, last=bool((torch.as_tensor(s) >= 1).all()))
-
-    def map(self, condition: Condition | None = None) -> MeanVelocity:
-        return Conditioned(self, condition or {})
-
-    def _toward(self, t: Tensor, x: Tensor, condition: Condition | None, last: bool) -> Tensor:
         assert condition is not None
         t = torch.as_tensor(t, device=x.device, dtype=torch.float32)
         answers = self._answered(t, x, condition)
-        x_1 = torch.where(condition[KNOWN] > 0, condition[IMAGE], (self._chosen if last else self._mean)(answers)).to(x)
+        estimate = self._chosen if bool((torch.as_tensor(s) >= 1).all()) else self._mean
+        x_1 = torch.where(condition[KNOWN] > 0, condition[IMAGE], estimate(answers)).to(x)
         return ((x_1 - x) / (1 - expand_time(t, x)).clamp(min=LAST)).to(x)
+
+    def map(self, condition: Condition | None = None) -> MeanVelocity:
+        return Conditioned(self, condition or {})
 
     def transported(self, x_0: Tensor, condition: Condition, residual: float = 1.0) -> Tensor:
         """x_1 in one evaluation, by the monotone map of a normal number z per ray to its density: log r = F^-1(Phi(z)).
