@@ -163,10 +163,9 @@ class StepController:
         """h_new / h = S err^-(1/q - 3/4 beta) err_before^beta, the PI controller of dopri5.f; 1/5 if not finite."""
         error = np.where(finite, np.maximum(error, 1e-10), np.inf)
         q = 1 / self.method.order
-        steady = self.method.safety * error ** -(q - 0.75 * MEMORY) * self.last_error**MEMORY
         retry = self.method.safety * error ** -(q - 0.75 * MEMORY)
         shorter = np.minimum(np.clip(retry, SHRINK, 1.0), self.factor)
-        factors = np.where(good, np.clip(steady, SHRINK, self.grow), shorter)
+        factors = np.where(good, np.clip(retry * self.last_error**MEMORY, SHRINK, self.grow), shorter)
         # Rounded as in `norms`, so that differences of one ulp do not propagate.
         return factors.astype(np.float32).astype(np.float64)
 
