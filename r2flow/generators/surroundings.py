@@ -86,17 +86,14 @@ class RowFeatures(nn.Embedding):
         super().__init__(1 + len(rows), ROW)
         self.elevations = rows  # not a buffer: derived from the sensor
 
-    def known(self, elevations: Tensor) -> Tensor:
-        """Whether all rows of elevations (B, H) have a learned vector, (B,) bool."""
-        return ((elevations[..., None] - self.elevations.to(elevations)).abs().amin(-1) < SAME).all(1)
-
-    def forward(self, elevations: Tensor, steps: Tensor, known: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(self, elevations: Tensor, steps: Tensor, numbered: Tensor) -> Tensor:  # type: ignore[override]
         """Row features, (B, `FEATURES`, H, 1), from elevations in radians, (B, H), and `steps` of `Surroundings.of`.
 
-        `known`, (B,) bool, tells which scans use the vectors learned per row.
+        `numbered`, (B,) bool, tells which scans use the vectors learned per row, if all of their rows have one.
         """
-        nearest = (elevations[..., None] - self.elevations.to(elevations)).abs().argmin(-1)
-        number = (nearest + 1) * (self.known(elevations) & known)[:, None]
+        distance = (elevations[..., None] - self.elevations.to(elevations)).abs()
+        numbered = numbered & (distance.amin(-1) < SAME).all(1)
+        number = (distance.argmin(-1) + 1) * numbered[:, None]
         sizes = (steps / 0.007).log()[:, None].expand(*elevations.shape, 2)
         each = torch.cat([super().forward(number), STEEP * elevations[..., None], sizes], -1)
         return each.movedim(-1, 1)[..., None]

@@ -122,7 +122,7 @@ class TransferFlow(Flow):
         part = copy(self)
         part.space, part.noise_shape, part.elevations = space, space.shape, space.rays[0, :, 0]
         part.foreign = self.foreign or not numbered or space.sensor.name != self.space.sensor.name
-        part.numbered = numbered and bool(self.rows.known(part.elevations[None]))
+        part.numbered = numbered
         return part
 
     def answers(self, t: Tensor, x: Tensor, about: Surroundings, rows: Tensor) -> Answers:
