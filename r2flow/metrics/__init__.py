@@ -35,7 +35,7 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
 
 def add_network(name: str) -> None:
     """Register a network's metrics: Frechet distance, kernel distance, precision and recall."""
-    METRICS.add(FIELD_NAMES.get(name, f"frechet_{name}"), lazy(f"{__name__}.frechet:FrechetDistance", name))
+    METRICS.add(FIELD_NAMES.get(name, f"frechet_{name}"), lazy(f"{__name__}.features:FrechetDistance", name))
     METRICS.add(f"kid_{name}", lazy(f"{__name__}.features:KernelDistance", name))
     METRICS.add(f"manifold_{name}", lazy(f"{__name__}.features:Manifold", name))
 

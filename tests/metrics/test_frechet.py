@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.metrics.frechet import FrechetDistance, frechet_distance, gaussian
+from r2flow.metrics.features import FrechetDistance, frechet_distance, gaussian
 from tests.metrics.conftest import Summary, measured, scans_of
 
 
@@ -49,7 +49,7 @@ def test_reference_figures(shared):
 
 
 def test_float32_features_far_from_zero_lose_nothing(monkeypatch):
-    monkeypatch.setattr("r2flow.metrics.frechet.BLOCK", 400)  # 999 rows in three blocks
+    monkeypatch.setattr("r2flow.metrics.features.BLOCK", 400)  # 999 rows in three blocks
     far = (1e4 + 1e-2 * torch.randn(999, 12, dtype=torch.float64)).float()
     x = far.double().numpy()
     expected = np.cov(x, rowvar=False)

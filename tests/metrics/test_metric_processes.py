@@ -10,8 +10,7 @@ import torch.multiprocessing as mp
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.metrics.features import Manifold
-from r2flow.metrics.frechet import FrechetDistance
+from r2flow.metrics.features import FrechetDistance, Manifold
 from tests.metrics.conftest import scans_of
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
