@@ -171,5 +171,4 @@ def _flex(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tenso
     return out.transpose(1, 2).unflatten(1, (rows.size, columns.size))
 
 
-Backend = Callable[[Tensor, Tensor, Tensor, _Axis, _Axis], Tensor]
-BACKENDS: Registry[Backend] = Registry("attention backend", tiles=_tiles, flex=_flex)
+BACKENDS: Registry[Callable[..., Tensor]] = Registry("attention backend", tiles=_tiles, flex=_flex)

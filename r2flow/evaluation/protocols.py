@@ -16,8 +16,6 @@ from r2flow.lidar.scan_files import scan_ending
 from r2flow.lidar.sensors import Convention, Rays
 from r2flow.registry import Registry
 
-Points = Literal["measured"] | Rays
-
 WORDS = {"measured": "as measured", "centre": "on rays through bin centres", "reference": "on rays through bin corners"}
 
 
@@ -33,7 +31,7 @@ class Rules:
     """
 
     name: str
-    real: Points
+    real: Literal["measured"] | Rays
     generated: Rays
     convention: Convention | None
     choose: Callable[[ScanSet, int], Sequence[int]]

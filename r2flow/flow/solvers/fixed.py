@@ -51,16 +51,13 @@ def build_grid(grid: str | Sequence[float] | Tensor, t_0: float, t_1: float, ste
     return times
 
 
-Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
-
-
 @dataclass(frozen=True)
 class FixedStep:
     """A fixed-step method x(t) -> x(t + h)."""
 
     adapts: ClassVar[bool] = False  # whether step sizes follow from a tolerance
 
-    step: Callable[..., Any]  # function of v, t, h and x
+    step: Callable[..., Any]  # function of v, t, h and x: the next state
     order: int  # of the global error
     evaluations: int  # of v per step
     multistep: bool = False  # whether `step` makes such a function from the times of a solution, (N + 1,) float64
@@ -70,7 +67,7 @@ class FixedStep:
 
         A scene whose state becomes non-finite keeps its last finite state; other scenes are not affected.
         """
-        step: Step = self.step(times) if self.multistep else self.step
+        step = self.step(times) if self.multistep else self.step
         low, high = sorted((float(times[0]), float(times[-1])))
 
         def inside(t: Tensor, state: Tensor) -> Tensor:

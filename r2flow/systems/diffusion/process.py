@@ -145,9 +145,6 @@ def for_images(log_snr: Tensor, z: Tensor) -> Tensor:
     return expand_time(log_snr.to(z), z)
 
 
-Coefficients = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-
-
 class Prediction:
     """A prediction y = p x + q eps, which with z = alpha x + sigma eps determines x and eps.
 
@@ -156,7 +153,7 @@ class Prediction:
     Its error is |p - q alpha / sigma| times that of x. `coefficients` are p and q from alpha and sigma.
     """
 
-    def __init__(self, coefficients: Coefficients) -> None:
+    def __init__(self, coefficients: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> None:
         self.coefficients = coefficients
 
     def target(self, x: Tensor, eps: Tensor, log_snr: Tensor) -> Tensor:

@@ -12,9 +12,7 @@ from r2flow.stages.base import Batch, SingleLoss
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import noised
 
-Error = Callable[[Tensor, Tensor], Tensor]  # per element
-
-ERRORS: Registry[Error] = Registry(
+ERRORS: Registry[Callable[[Tensor, Tensor], Tensor]] = Registry(
     "error of an element",
     l2=lambda y, target: F.mse_loss(y, target, reduction="none"),
     l1=lambda y, target: F.l1_loss(y, target, reduction="none"),

@@ -14,7 +14,6 @@ from r2flow.model.published import Format, Published
 NETWORK = "network."  # prefix in the generator
 WRAPPED = "module."  # prefix of torch's DataParallel
 FIRST, LAST = "begin_conv.weight", "end_conv.weight"
-SENSOR = {"name": "hdl64e", "rows": 64, "columns": 1024, "min_range": 0.5, "max_range": 63.0}
 
 
 def holds(content: Any) -> bool:
@@ -31,7 +30,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     weights: dict[str, Tensor] = {name.removeprefix(WRAPPED): value for name, value in content[0].items()}
     sigmas = weights["sigmas"]
     config = {
-        "sensor": dict(SENSOR),
+        "sensor": {"name": "hdl64e", "rows": 64, "columns": 1024, "min_range": 0.5, "max_range": 63.0},
         "encoding": {"format": "shifted_log", "reflectance": len(weights[LAST]) > 1, "limits": "open"},
         "backbone": {"name": "refinenet"},
         "generator": {
