@@ -20,24 +20,18 @@ from r2flow.samplers import Adaptive
 TIGHT = Adaptive(tolerance=1e-5)
 
 
-class Real(NamedTuple):
-    """A real scan, projected for a flow: its name, and range in metres and reflectance, (2 or 1, H, W)."""
-
-    name: str
-    image: Tensor
-
-
 def real_scans(
     checkpoint: Checkpoint,
     specs: Sequence[str | Path],
     reflectance_scale: float | None = None,
     most: int = 16,
     need_reflectance: bool = True,
-) -> list[Real]:
+) -> tuple[list[str], Tensor]:
     """Read scans (`open_scans`), at most `most` per set, evenly spread, projected as the checkpoint's training scans.
 
-    `reflectance_scale` is the value of full reflectance in the files; None: by `reading_for`. `need_reflectance`: a set
-    without reflectance is refused if the checkpoint has it.
+    Returns names, and range in metres and reflectance, (N, 2 or 1, H, W). `reflectance_scale` is the value of full
+    reflectance in the files; None: by `reading_for`. `need_reflectance`: a set without reflectance is refused if the
+    checkpoint has it.
     """
     reflectance = checkpoint.encoding.reflectance and (need_reflectance or AUTO)
     sets = []
@@ -47,8 +41,7 @@ def real_scans(
         sets.append(open_scans(spec, reading).spread(most))
     stems = [Path(name).name.split(".")[0].replace(" ", "_") for scans in sets for name in scans.source.names]
     names = [stem if stems.count(stem) == 1 else f"{stem}_{stems[:i].count(stem) + 1}" for i, stem in enumerate(stems)]
-    images = [torch.from_numpy(scans.source[i]) for scans in sets for i in range(len(scans))]
-    return [Real(name, image) for name, image in zip(names, images, strict=True)]
+    return names, torch.stack([torch.from_numpy(scans.source[i]) for scans in sets for i in range(len(scans))])
 
 
 class Inversion(NamedTuple):

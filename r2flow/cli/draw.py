@@ -120,10 +120,10 @@ def interpolate(
     usual = ode_sampler(flow) if given.keys() & {"steps", "grid"} else Adaptive(tolerance=1e-4)
     sampler = build_sampler(given) if "name" in given else usual.changed(**given)
     sampler.check(flow)
-    ends = real_scans(loaded, [first, last], reflectance_scale)
-    check(len(ends) == 2, f"give two scans, found {len(ends)}.")
+    names, pair = real_scans(loaded, [first, last], reflectance_scale)
+    check(len(names) == 2, f"give two scans, found {len(names)}.")
     check_folder(out)
-    written = write_page(interpolation(loaded, ends, frames, out, sampler), out)
+    written = write_page(interpolation(loaded, names, pair, frames, out, sampler), out)
     pages = ", ".join(map(str, [*written, out / "interpolation.html"]))
     print(f"{frames} scans in {out / 'frames'}; {pages}")
 

@@ -151,7 +151,6 @@ def completion(
     out: OutOption = Path("reports"),
 ) -> None:
     """Mask scans and complete them by models and by interpolation: errors against evaluations."""
-    import numpy as np
 
     from r2flow.data.opening import own_reading
     from r2flow.generators import TransferFlow
@@ -188,8 +187,8 @@ def completion(
     masks = re.split(r"\s*,\s*(?=[a-z]+:)|\s+", tasks.strip()) if tasks else list(TASKS)
     for task in masks:
         measured_by(task, first.sensor, 0)
-    scans = real_scans(first, [real], reflectance_scale, num, need_reflectance=False)
-    truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
+    _, images = real_scans(first, [real], reflectance_scale, num, need_reflectance=False)
+    truths = [image for image in images.numpy() if image[0].any()]
     check(truths, f"{real}: no scan has a return, so there is nothing to hide.")
     check_folder(out)
     cost = sum(sampler.evaluations(model.generator) or 0 for model, sampler in ways.values()) * len(masks)

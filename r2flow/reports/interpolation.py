@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from r2flow.data.sources import spread
 from r2flow.generators import Sampler
-from r2flow.inversion import Real, interpolate_scans, round_trip
+from r2flow.inversion import interpolate_scans, round_trip
 from r2flow.lidar.projection import write_scan
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.sampling import warn_unsolved
@@ -28,9 +27,11 @@ ENDS = {
 }  # fmt: skip
 
 
-def interpolation(checkpoint: Checkpoint, scans: Sequence[Real], frames: int, out: Path, sampler: Sampler) -> Page:
-    """Write `frames` interpolated scans as `out/frames/NNN.ply` and `.npy`; return the page, not yet written."""
-    pair, names, rays = torch.stack([scan.image for scan in scans]), [s.name for s in scans], checkpoint.sensor.rays()
+def interpolation(
+    checkpoint: Checkpoint, names: Sequence[str], pair: Tensor, frames: int, out: Path, sampler: Sampler
+) -> Page:
+    """Write `frames` scans between two (`real_scans`) as `out/frames/NNN.ply` and `.npy`; return the unwritten page."""
+    rays = checkpoint.sensor.rays()
     with Bar("interpolating", frames, evaluations=frames * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
         result = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.set)
     warn_unsolved(result.converged)
