@@ -33,14 +33,12 @@ PAIRS = {"cpu": 1024, "cuda": 131072}  # pairs per block, by device: sized for t
 
 def described(scans: ScanSet, work: Work, device: str, doing: str) -> Iterator[Tensor]:
     """Yield log-range averaged over cells, (B, h, w) per batch; NaN for a scan without returns."""
-    rows, columns = scans.sensor.shape
+    rows, columns = (min(cells, size) for cells, size in zip(CELLS, scans.sensor.shape, strict=True))
     encoding = Encoding(scans.sensor, reflectance=False)
     with torch.no_grad(), bar(doing, len(scans)) as advance:
         for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
             batch = Scans(images.to(device), scans.sensor)
-            mean = adaptive_avg_pool2d(
-                encoding.encode(batch.images[:, :1]), (min(CELLS[0], rows), min(CELLS[1], columns))
-            )[:, 0]
+            mean = adaptive_avg_pool2d(encoding.encode(batch.images[:, :1]), (rows, columns))[:, 0]
             yield torch.where(batch.returned.flatten(1).any(1)[:, None, None], mean, torch.nan)
             advance(len(images))
 
