@@ -81,13 +81,14 @@ class Generator(nn.Module):
     draws: ClassVar[bool] = True  # whether it makes scans of noise; False for an autoencoder, never sampled
     told: ClassVar[bool] = False  # whether it takes a condition of `r2flow.generators.condition_of`
     learns_directions: ClassVar[bool] = False  # whether it learns a vector per direction: no rotation in training
+    usual: ClassVar[Sampler] = FixedSteps()  # default sampler of a new generator
     goes_on_as: ClassVar[str | None] = None  # class used when fine-tuned with a velocity loss; None: the same
 
     def __init__(self, space: ModelSpace, noise_shape: tuple[int, ...] | None = None) -> None:
         super().__init__()
         self.space = space
         self.noise_shape = space.shape if noise_shape is None else noise_shape
-        self.run_by(FixedSteps())
+        self.run_by(self.usual)
 
     def run_by(self, sampler: Sampler, few: Sampler | None = None, fixed: bool = False) -> None:
         self.sampler, self.few, self.fixed = sampler, few, fixed

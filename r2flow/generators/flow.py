@@ -130,9 +130,7 @@ class NetworkFlow(Flow):
 class RectifiedFlow(NetworkFlow):
     """v(t, x) by a backbone. 1-RF, k-RF and k-TD differ only in training and sampler."""
 
-    def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
-        super().__init__(space, backbone)
-        self.run_by(USUAL)
+    usual: ClassVar[Sampler] = USUAL
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         assert condition is None
@@ -162,11 +160,8 @@ class FlowMap(RectifiedFlow):
     """
 
     second_time: ClassVar[bool] = True
+    usual = Jump()
     goes_on_as = "rectified_flow"  # a velocity loss would leave the jumps to those of the old flow
-
-    def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
-        super().__init__(space, backbone)
-        self.run_by(Jump())
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
         assert condition is None

@@ -96,7 +96,7 @@ class TransferFlow(Flow):
         sigma: Standard deviation of the noise in x_0, in model space.
     """
 
-    told, draws = True, False
+    told, draws, usual = True, False, Jump(steps=1)
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any], sigma: NonNegative = 0.25) -> None:
         super().__init__(space)
@@ -108,7 +108,6 @@ class TransferFlow(Flow):
         self.rows = RowFeatures(space.rays[0, :, 0])
         self.elevations, self.numbered = space.rays[0, :, 0], True
         self.foreign = False  # whether the scans are of another sensor than the training scans
-        self.run_by(Jump(steps=1))
 
     def start_from(self, parent: Generator) -> None:
         """Copy a transfer flow's weights; for a sensor with other beams, each row starts from the shared vector."""
