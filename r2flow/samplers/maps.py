@@ -97,9 +97,9 @@ class Refine(Renoise):
         first = self.steps - min(self.jumps, self.steps // 2)
         return first if first >= LEADING else 0
 
-    def times(self, *args: Any, **how: Any) -> Tensor:
+    def times(self) -> Tensor:
         if self.grid is not None or not self.leading:
-            return super().times(*args, **how)
+            return super().times()
         leading = build_grid("power:1.5", 0.0, self.until, self.leading)
         return torch.cat([leading, late(self.steps - self.leading, 1 - self.until)[1:]])
 
