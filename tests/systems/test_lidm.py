@@ -342,6 +342,12 @@ def test_a_published_config_that_contradicts_is_one_line(published: tuple[Path, 
         path.with_name("config.yaml").write_text(text.replace(what, instead))
         with pytest.raises(InputError, match=said):
             load_checkpoint(path)
+    content = torch.load(path, weights_only=True)
+    content["state_dict"]["betas"] = torch.linspace(0.0015, 0.0195, 1000)
+    path.with_name("config.yaml").unlink()
+    torch.save(content, path)
+    with pytest.raises(InputError, match="betas"):
+        load_checkpoint(path)
 
 
 @pytest.mark.parametrize("averaged", [False, True])

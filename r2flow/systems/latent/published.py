@@ -10,10 +10,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.files import telling
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
@@ -59,15 +60,18 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
     options = {**USUAL, **({"lib_name": "ldm"} if unet else {}), **params, **unet}  # ldm: without circular convolutions
     if other := {name: options[name] for name, usual in USUAL.items() if options[name] != usual}:
         raise InputError(f"{path}: its config.yaml has {other}, and only LiDM's own form is read.")
+    betas = state["betas"].double()
+    straight = torch.allclose(betas.sqrt().diff(), betas.sqrt().diff().mean(), rtol=1e-2)
+    check(straight, f"{path}: the square roots of its betas are not evenly spaced, as LiDM's are.")
     generator = {
         "name": "latent_diffusion",
         "autoencoder": _autoencoder(_within(weights, AUTOENCODER)),
         "unet": {**_unet(_within(weights, UNET)), "head_channels": int(unet.get("num_head_channels", HEAD))},
         "schedule": {
             "name": "square_root_linear",
-            "first": float(f"{state['betas'][0]:.6g}"),
-            "last": float(f"{state['betas'][-1]:.6g}"),
-            "steps": len(state["betas"]),
+            "first": float(f"{betas[0]:.6g}"),
+            "last": float(f"{betas[-1]:.6g}"),
+            "steps": len(betas),
         },
     }
     step = int(content.get("global_step", 0))
