@@ -20,17 +20,13 @@ from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
 from tests.fields import CONFIG, Field
+from tests.test_sampling import network
 
 
+@pytest.fixture(scope="module")
 def parent() -> RectifiedFlow:
     """A flow whose velocity is not zero."""
-    torch.manual_seed(1)
-    flow = build_generator(CONFIG)
-    with torch.no_grad():
-        for weight in flow.backbone.parameters():
-            if not weight.any():
-                weight.normal_(std=0.05)
-    return flow.eval()
+    return network(**CONFIG).generator
 
 
 def flow_map() -> FlowMap:
@@ -38,9 +34,9 @@ def flow_map() -> FlowMap:
 
 
 @pytest.fixture
-def grown() -> FlowMap:
+def grown(parent) -> FlowMap:
     found = flow_map()
-    found.start_from(parent())
+    found.start_from(parent)
     return found
 
 
@@ -65,23 +61,19 @@ def exact() -> Exact:
     return found  # type: ignore[return-value]
 
 
-def test_before_it_has_learned_jumps_and_chords_are_its_parent_s_euler_steps(grown):
+def test_before_it_has_learned_jumps_and_chords_are_its_parent_s_euler_steps(grown, parent):
     x_0 = Draws(0, range(2)).start(grown.noise_shape)
     for name, steps, grid in (("jump", 1, "uniform"), ("jump", 3, "uniform"), ("chord", 3, "power:2")):
         jumped = grown(x_0, sampler=build_sampler(name, steps=steps, grid=grid))
-        walked = parent()(x_0, sampler=build_sampler("euler", steps=steps, grid=grid))
+        walked = parent(x_0, sampler=build_sampler("euler", steps=steps, grid=grid))
         torch.testing.assert_close(jumped.x, walked.x, rtol=0, atol=1e-5)  # s - t is rounded otherwise
         assert jumped.evaluations.tolist() == [steps, steps]
     t = torch.tensor([0.3, 0.6])
-    assert torch.equal(grown.velocity(t, x_0), parent().velocity(t, x_0))
+    assert torch.equal(grown.velocity(t, x_0), parent.velocity(t, x_0))
 
 
 def test_a_flow_that_goes_on_from_a_map_has_its_velocity():
-    torch.manual_seed(2)
-    learned = flow_map()
-    with torch.no_grad():
-        for weight in learned.parameters():
-            weight.add_(0.05 * torch.randn_like(weight))
+    learned = network(**CONFIG, generator={"name": "flow_map"}).generator
     x, t = torch.randn(3, 2, 8, 32), torch.tensor([0.0, 0.3, 1.0])
     plain = build_generator(CONFIG).eval()
     plain.start_from(learned)
@@ -308,13 +300,13 @@ def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps
         torch.testing.assert_close(aims[0][row], slope[row])
 
 
-def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
+def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths(parent):
     scans = {"name": "simulated", "scenes": 4}
     assert stage({**DATA, "scans": scans}, objective="knots").objective is not None
     with pytest.raises(InputError, match=r"leave data\.scans out, or give stage\.objective=knots"):
         stage({**DATA, "scans": scans})
     with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
-        build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent())
+        build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent)
     with pytest.raises(InputError, match=r"data\.scans needs the name of a data set"):
         resolve({"name": "pairs", "scans": {"scenes": 4}})
 
@@ -340,7 +332,7 @@ def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path
     assert "scan" not in data._dataset(data.validation_source, "validation")[0, 0]
 
 
-def test_a_stage_of_jumps_says_what_it_lacks():
+def test_a_stage_of_jumps_says_what_it_lacks(parent):
     with pytest.raises(InputError, match=r"data\.pairs\.knots=7"):
         stage({**DATA, "pairs": {"knots": 0}}, objective="knots")
     with pytest.raises(InputError, match=r"leave stage\.time out"):
@@ -348,7 +340,7 @@ def test_a_stage_of_jumps_says_what_it_lacks():
     with pytest.raises(InputError, match="'step'"):
         stage(jumps={"step": [1]})
     with pytest.raises(InputError, match="learns a FlowMap"):
-        stage(generator=parent())
+        stage(generator=parent)
     assert stage({"name": "simulated", "batch_size": 4}).objective is not None
 
 
