@@ -92,20 +92,3 @@ def test_a_cut_or_a_longer_file_is_refused(scan: Path, label: Path):
 def test_ids_are_those_of_semantickitti():
     ids = {"unlabeled": 0, "car": 10, "other-vehicle": 20, "lane-marking": 60, "other-object": 99, "moving-truck": 258}
     assert {name: LABELS[name] for name in ids} == ids
-
-
-def test_real_labels(shared: Path):
-    real = shared / "real"
-    for scan, sensor, classes in (
-        (real / "odometry/sequences/00/velodyne/000000.bin", "hdl64e", {10, 40, 50, 70}),
-        (real / "other_sensors/rellis_os1_64/000104.bin", "hdl64e", {3, 4, 19}),
-    ):
-        image, labels = read_labelled_scan(scan, labels_beside(scan), Reading(SENSORS[sensor], reflectance=True))
-        assert classes <= set(np.unique(labels[image[0] > 0]).tolist())
-    scan = real / "odometry/sequences/08/velodyne/000000.bin"
-    image, labels = read_labelled_scan(scan, labels_beside(scan), Reading(SENSORS["hdl64e"], reflectance=True))
-    r, road, building = image[0], labels == 40, labels == 50
-    elevation = SENSORS["hdl64e"].rays()[0].numpy()
-    height = 1.73 + r * np.sin(elevation)  # of what is seen, above the ground that the car stands on
-    assert abs(np.median(height[road])) < 0.3
-    assert np.median(height[building]) > 1
