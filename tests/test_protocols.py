@@ -133,16 +133,10 @@ def test_several_sets_stand_in_one_table_with_references_and_baselines(
     assert {"mmd_lidm", "kid_handcrafted"} <= figures.keys()
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda x: x[1].fill(255.0), "scan 000004.npy of .*generated: its reflectance goes up to 255"),
-        (lambda x: x.__imul__(1000), "generated/000004.npy: .*millimetres"),
-    ],
-)
-def test_a_scan_of_another_scale_is_named_in_one_line(r2flow, measured, generated, tmp_path, change, said):
+def test_a_scan_of_another_scale_is_named_in_one_line(r2flow, measured, generated):
     scan = np.load(generated / "000004.npy")
-    change(scan)
+    scan[1] = 255
     np.save(generated / "000004.npy", scan)
     options = ("--metrics", "frechet_handcrafted", "--size", "8x64", "--workers", 0, "--no-cache")
-    assert re.search(said, r2flow("evaluate", measured[0], generated, *options).refusal)
+    said = r2flow("evaluate", measured[0], generated, *options).refusal
+    assert re.search("scan 000004.npy of .*generated: its reflectance goes up to 255", said)

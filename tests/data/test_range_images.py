@@ -31,6 +31,9 @@ def test_range_images_are_read_as_they_were(tmp_path: Path):
     np.save(tmp_path / "whole.npy", IMAGE.astype(np.int32))
     with pytest.raises(InputError, match="not points"):
         read_image(tmp_path / "whole.npy", READING)
+    np.save(tmp_path / "far.npy", 1000 * IMAGE)
+    with pytest.raises(InputError, match=r"far\.npy: .* Are these millimetres"):
+        read_range_image(tmp_path / "far.npy")
 
 
 def test_no_more_memory_is_taken_than_a_few_times_the_file(tmp_path: Path):
