@@ -33,14 +33,11 @@ VERBS = """
 nope # No such command 'nope'
 sampel -c run -o out # Did you mean 'sample'?
 sample empty -o out
-sample run -o out --sampler torchdiffeq:nope
-sample run -o out --sampler euler --tolerance 0.1 # tolerance
 sample run -o out --sampler dopri5 --steps 50 # steps
 sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
 sample '' -o out # an argument is empty
-info nowhere
 sample run -o out --steps 10000000 # 1,000,000
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
@@ -52,7 +49,6 @@ export run --to pt2 --out empty/a.pt2 # --to pt2 writes a .pt2, found --out empt
 report backbones --size ²x²
 report backbones --only hdit,adm_unet --size 31x64 --repeats 0 # height 31 cannot be used
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels
-complete scans/000000.bin -c run -o out --mask nope # no mask
 complete scans/000000.bin -c run -o out --to os1_64
 view scans -o out # ends in .html
 view scans -o file.txt/a.html
@@ -70,15 +66,12 @@ show scans -o out --projection unfolding
 show run -o out # a run without samples
 show street -o out # sample it first: r2flow sample street --out scans
 show nope:scans -o out
-show kitti_360:nowhere -o out
-sensor bad.bin
 sensor image.npy
 sensor scans -o out # a .yaml file
 sensor scans -o file.txt/out.yaml
 prepare empty -o out
 prepare simulated:3 -o out
 prepare scans/000000.bin -o out
-prepare scans -o out --split train # no split named 'train'
 prepare scans -o out --drives 77
 pairs run --num 1 --seed 99999999999999999999
 weights --add rangenet53 file.txt
@@ -148,7 +141,6 @@ name=x backbone.base_channels=7
 name=x backbone.name=null
 name=x data=folder data.root=scans data.reading.projection=flat
 name=x data=folder data.root=scans data.validation.data=3
-name=x data=mixed 'data.parts=[{name: folder, root: empty}]'
 name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
 --plugin
 name=x 'chain={a: {init: b}}'

@@ -46,7 +46,6 @@ REFUSED = {
     "trainer.use_distributed_sampler=true": "use_distributed_sampler must be False (each device",
     "stage.time={name: u_shaped, a: 800}": "a must be a finite number above 0 and at most 80",
     "sampler.name=mmps": "completes scans: give it to r2flow complete by --sampler",
-    "sampler.tolerance=0.1": "sampler 'adams3' has no option 'tolerance'",
     "trainer.overfit_batches=1": "overfit_batches must be a finite number equal to 0 (data.scenes",
     "+callbacks.half_life_ema={half_life: 4, rampup: 1}": "one average of its weights, found callbacks.ema and",
     "trainer.limit_train_batches=0": "limit_train_batches must be null",
@@ -65,7 +64,6 @@ REFUSED = {
     # What would be passed over.
     "data=folder & data.root=. & data.scenes=5": "no simulated scenes: leave data.scenes out",
     "data=mixed & data.parts=[{name: simulated}] & data.split=train": "has its own: leave data.split",
-    "data.root=typo": "simulated scans are not files (data=folder for yours): leave data.root out",
     "data.pairs.num=5": "data.pairs.num are of data=pairs, found data=simulated",
     "stage=reflow & data=pairs & stage.init=street & data.drives=[1]": "pairs are drawn, not read: leave data.drives",
     "preview=street": "preview is of a chain of runs",
