@@ -49,10 +49,9 @@ class Family:
 
 
 GAN = Family("gan", "toy_gan", ("stage=toy_gan", "stage.width=16"))
-DDPM = Family("ddpm", "toy_ddpm", ("stage=toy_ddpm", "sampler.steps=4"))
-COMPLETION = Family("completion", "toy_completion", ("stage=toy_completion", "sampler.steps=2"))
+COMPLETION = Family("completion", "toy_completion", ("stage=toy_completion", "sampler={name: sde, steps: 2}"))
 BACKBONE = Family("backbone", "toy_backbone", ("backbone=toy_backbone", "sampler.steps=2"))
-ALL = (GAN, DDPM, COMPLETION, BACKBONE)
+ALL = (GAN, COMPLETION, BACKBONE)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""A GAN, a DDPM, a conditional flow and a backbone from files outside the package: every verb."""
+"""A GAN, a conditional flow and a backbone from files outside the package: every verb."""
 
 import hashlib
 import json
@@ -18,7 +18,6 @@ from r2flow.samplers import build_sampler
 from tests.extension.conftest import (
     BACKBONE,
     COMPLETION,
-    DDPM,
     FAMILIES,
     GAN,
     TINY,
@@ -52,7 +51,7 @@ def test_info_names_the_family(trained: tuple[Family, Path]):
     family, run = trained
     about = json.loads(r2flow("info", run, "--json", family.plugin).said)
     expected = {
-        GAN: ("toy_gan", None), DDPM: ("toy_ddpm", "hdit"), COMPLETION: ("toy_completion", "hdit"),
+        GAN: ("toy_gan", None), COMPLETION: ("toy_completion", "hdit"),
         BACKBONE: ("rectified_flow", "toy_backbone"),
     }  # fmt: skip
     assert (about["generator"], about["backbone"]) == expected[family]
