@@ -147,23 +147,20 @@ def test_a_sensor_s_file_is_replaced_only_when_asked(r2flow, scans: Path, tmp_pa
     assert read_sensor(out).reflectance_scale == 255
 
 
-SCALES = {
-    "nuscenes_hdl32e": 255.0,
-    "vlp16": None,
-    "rellis_os1_64": 0.012,
-    "rellis_vlp32c": 255.0,
-}  # None: they have none
-
-
 @pytest.mark.parametrize(
-    "folder",
-    [*list(SCALES)[:2], *(pytest.param(folder, marks=pytest.mark.slow) for folder in list(SCALES)[2:])],
+    ("folder", "scale"),
+    [
+        ("nuscenes_hdl32e", 255.0),
+        ("vlp16", None),  # without reflectance
+        pytest.param("rellis_os1_64", 0.012, marks=pytest.mark.slow),
+        pytest.param("rellis_vlp32c", 255.0, marks=pytest.mark.slow),
+    ],
 )
-def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: Path, tmp_path: Path, folder):
+def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: Path, tmp_path: Path, folder, scale):
     data, prepared = shared / "real" / "other_sensors" / folder, tmp_path / "my" / "prepared"
     mine = tmp_path / "my sensor.yaml"
     assert r2flow("sensor", data, "--out", mine).quiet
-    assert read_sensor(mine).reflectance_scale == SCALES[folder]
+    assert read_sensor(mine).reflectance_scale == scale
     assert r2flow("prepare", data, "--sensor", mine, "--out", prepared, "--workers", 1).quiet
     small = [part for part in TINY if not part.startswith(("data", "sensor."))]
     for given in (["data=prepared", f"data.root={prepared}"], ["data=folder", f"data.root={data}"]):
