@@ -174,7 +174,6 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
     [
         (None, ["--mask", "points:0"], "one: the mask keeps nothing that was measured"),
         (None, ["--mask", "points:1"], "one: the mask keeps everything that was measured"),
-        (None, ["--mask", "{folder}/mask.npy"], "is of (4, 4), the scans are of (8, 64) rays"),
         (None, ["--from", "vlp16"], "of 8 rows by --from, in Python by sensor (vlp16 has 16), or --size 8x64 alone"),
         (np.full((2, 8, 64), np.nan, np.float32), [], "is NaN or infinite in places; 0 stands for a ray without"),
         (np.full((1, 8, 4), 3, np.float32), [], "must be a range image of floats (2 or 1, H, W), found float32 (1, 8"),
@@ -185,9 +184,7 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
 )
 def test_what_cannot_be_done_is_one_line(complete, tmp_path, image, options, message):
     np.save(tmp_path / "one.npy", scans()[0].numpy() if image is None else image)
-    np.save(tmp_path / "mask.npy", np.ones((4, 4), bool))
-    given = (option.format(folder=tmp_path) for option in options)
-    assert_refused(complete(tmp_path / "one.npy", *given), message, tmp_path / "out")
+    assert_refused(complete(tmp_path / "one.npy", *options), message, tmp_path / "out")
 
 
 @pytest.mark.parametrize("sensor", [[], ["--from", "vlp32c"]])
