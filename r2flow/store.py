@@ -249,8 +249,8 @@ class Store:
             result: Any = end.recv()
         except (EOFError, OSError):
             raise InputError(
-                f"a process that wrote {self.folder} was killed or could not start; is there memory for as many "
-                "processes? The same command resumes."
+                f"a process that wrote {self.folder} was killed or could not start; is there memory for as "
+                "many processes? The same command resumes."
             ) from None
         if isinstance(result, Exception):
             raise result

@@ -142,7 +142,7 @@ class Unreadable:
 @pytest.mark.parametrize(
     ("work", "message"),
     [
-        (be_killed, "killed.* memory for 2"), (refuse, "refuses"), (Unreadable(), "refuses"),
+        (be_killed, "killed.* memory for as many"), (refuse, "refuses"), (Unreadable(), "refuses"),
         (fail, "ValueError: of the work"),
     ],
 )  # fmt: skip
