@@ -27,7 +27,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "7b7a4e7e94ba60e73a7f822a3b695cd6e27326ec19341fe151fa519cf7affe09",
+        "9177ee104c65d06690c4f1719eed8bda524704e7d631c371689ef7e3cec0f9d1",
     ),
     densify=Model(
         "scans of few beams or points completed to all, in one evaluation, learned from simulated scans",
