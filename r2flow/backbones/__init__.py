@@ -31,9 +31,9 @@ def build_backbone(
 
     `in_channels` includes the channels of a condition; `out_channels` None means as many.
     """
-    ends = {"in_channels": in_channels, "out_channels": out_channels}
-    times = {"second_time": True} if second_time else {}  # a plug-in may not know it
-    built: Backbone = BACKBONES.build({**options, **ends, **times}, rays)
+    wanted = {"in_channels": in_channels, "out_channels": out_channels, "second_time": second_time or None}
+    given = {name: value for name, value in wanted.items() if value is not None}  # a plug-in may not know the others
+    built: Backbone = BACKBONES.build({**options, **given}, rays)
     check(any(True for _ in built.parameters()), f"a {type(built).__name__} has no weights to learn.")
     return built
 

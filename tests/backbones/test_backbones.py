@@ -9,7 +9,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
+from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, Plain, image, tiny, untrained
 
 from r2flow.backbones import BACKBONES, Backbone, build_backbone, configurations
 from r2flow.errors import InputError
@@ -233,6 +233,11 @@ def test_a_backbone_without_weights_is_refused(monkeypatch):
     monkeypatch.setitem(BACKBONES._entries, "bare", Backbone)
     with pytest.raises(InputError, match="a Backbone has no weights to learn"):
         build_backbone({"name": "bare"}, torch.zeros(2, ROWS, COLUMNS), 2)
+
+
+def test_a_backbone_may_know_the_channels_of_its_images_alone(monkeypatch):
+    monkeypatch.setitem(BACKBONES._entries, "narrow", lambda rays, in_channels: Plain(rays, in_channels=in_channels))
+    assert build_backbone({"name": "narrow"}, torch.zeros(2, ROWS, COLUMNS), 3).out_channels == 3
 
 
 @pytest.mark.parametrize("config", [path.stem for path in (CONF / "backbone").glob("*.yaml")])
