@@ -142,8 +142,8 @@ class SamplerOptions:
     sampler: Annotated[
         str | None,
         typer.Option(
-            help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: dopri5, "
-            "torchdiffeq; stochastic: sde; flow maps: jump, chord, renoise; completion: mmps, replace, repaint. "
+            help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: dopri5, torchdiffeq; "
+            "stochastic: sde; flow maps: jump, chord, renoise, refine; completion: mmps, replace, repaint. "
             "For other systems see docs/systems.md."
         ),
     ] = None
