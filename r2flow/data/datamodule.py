@@ -120,7 +120,7 @@ class ScanDataModule(L.LightningDataModule):
 
     def _open(self, options: SourceOptions, first_scene: int = 0, sensor: Sensor | None = None) -> ScanSource:
         images = {"reflectance": self.encoding.reflectance, "within_limits": True}
-        reading = Reading(sensor or self.sensor, **{**options.chosen, **images})
+        reading = Reading.of({**options.chosen, **images, "sensor": (sensor or self.sensor).described()})
         return open_source(options, reading, self.seed, first_scene)
 
     def _order(self, source: Mixture | PairSource) -> MixedOrder | Permutations:

@@ -195,7 +195,7 @@ def reading_for(
     stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
     options = parse(specs[0])[0] if specs else SourceOptions(FOLDER)
     reading = _reading_of(model) if model else stored or Reading(SENSORS[SOURCES[options.name].sensor])
-    given = {key: value for key, value in fields.items() if value is not None}
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if v is not None}
     reading = replace(reading, **given)
     if specs and not (model or stored or sensor):
         sensor = _detected(specs[0], reading)

@@ -142,7 +142,8 @@ def prepare(
     have changed since are refused. `checked` and `made` are called with each shard. The result is the number of scans
     left out.
     """
-    store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
+    if not store.check() or store.missing(store.shards):  # else the folder may be read-only
+        store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
 
     def look(shard: int) -> None:
         file = store.files(shard)[0]

@@ -189,6 +189,8 @@ def find_checkpoint(path: str | Path) -> Path:
         problem = f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt)."
         runs = sorted(str(folder.parent) for folder in path.glob(f"*/{FOLDER}") if checkpoints_of(folder.parent))
         hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
+    elif path.exists():  # reading a pipe would block
+        problem = f"{path} is not a regular file."
     raise InputError(f"{problem} {hint}")
 
 

@@ -83,8 +83,8 @@ class Renoise(Chord):
 class Refine(Renoise):
     """Solve the ODE by `adams3` to t = `until`, then renoise: `jumps` of the steps, at most half of them.
 
-    The ODE places objects that early jumps lose; jumps draw surfaces that the velocity blurs near t = 1. In fewer than
-    seven steps it is `renoise`. A grid gives the times of all steps, instead of `until`.
+    The ODE places objects that early jumps lose; jumps draw surfaces that the velocity blurs near t = 1. It is
+    `renoise` where this leaves fewer than four steps to the ODE. A grid gives all times, instead of `until`.
     """
 
     steps: Steps = 12
