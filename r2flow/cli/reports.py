@@ -151,7 +151,6 @@ def completion(
     out: OutOption = Path("reports"),
 ) -> None:
     """Mask scans and complete them by models and by interpolation: errors against evaluations."""
-
     from r2flow.data.opening import own_reading
     from r2flow.generators import TransferFlow
     from r2flow.inversion import real_scans

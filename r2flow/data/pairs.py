@@ -94,16 +94,17 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
     flow, sampler = as_flow(generator, "a reflow pair"), store.sampler
     sampler.check(flow)
     check(sampler.paired, f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
-    usable, evaluations, ends = list[bool](), list[int](), [time.monotonic()]
+    usable, evaluations, start, seconds = list[bool](), 0, time.monotonic(), 0.0  # without waiting for others
 
     def make_shard(shard: int) -> None:
+        nonlocal evaluations, seconds
         store.mend([shard])
         batches = []
         for batch in store.batches_of(shard):
             batches.append(solve_batch(store, flow, batch))
-            evaluations.append(int(batches[-1]["evaluations"].sum()))
+            evaluations += int(batches[-1]["evaluations"].sum())
             usable.extend(batches[-1]["usable"].tolist())
-            ends.append(time.monotonic())
+            seconds = time.monotonic() - start
             bar.set(len(usable))
             if not any(usable) and (len(usable) > 64 or batch == store.batches_of(shard)[-1]):
                 raise InputError(
@@ -123,7 +124,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         store.make(missing, make_shard, wait=wait)
     if usable:
         unusable = "" if all(usable) else f", {usable.count(False)} did not converge and are left out"
-        rate, cost = len(usable) / (ends[-1] - ends[0]), sum(evaluations) / len(usable)
+        rate, cost = len(usable) / seconds, evaluations / len(usable)
         drawn = f"{len(usable)} pairs drawn in whole batches"
         print(f"{drawn}, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
     return usable

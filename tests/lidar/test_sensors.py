@@ -150,8 +150,8 @@ def test_a_sensor_of_one_s_own_has_every_option(tmp_path):
     [
         ("", "is empty"),
         ("name: \udc80", "not a readable .yaml file"),  # not UTF-8
-        ("just text", "is no sensor"),
-        ("1: 2", "is no sensor"),
+        ("just text", "is not a sensor"),
+        ("1: 2", "is not a sensor"),
         ("name: [", "not a readable .yaml file"),
         ("name: !!python/object/apply:os.system [ls]", "not a readable .yaml file"),
         ("name: 2001-13-45", "not a readable .yaml file"),

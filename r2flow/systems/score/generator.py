@@ -133,12 +133,10 @@ class Langevin(Sampler):
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         x = torch.special.ndtr(noise)
+        image, known = (condition[name].to(x) if condition else torch.zeros_like(x) for name in (IMAGE, KNOWN))
 
         def pull(x: Tensor) -> Tensor:
             """Likelihood gradient of the known pixels (Zyrianov et al. 2022, eq. 8)."""
-            if condition is None:
-                return torch.zeros_like(x)
-            image, known = condition[IMAGE].to(x), condition[KNOWN].to(x)
             return generator.pull * known * ((image + 1) / 2 - x)
 
         assert draws is not None
