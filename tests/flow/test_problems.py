@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from r2flow.flow.problems import PROBLEMS, NarrowJet, RayDrop
+from r2flow.flow.problems import PROBLEMS, NarrowJet
 from r2flow.flow.solvers import solve
 
 X_0 = torch.randn(3, 8, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
@@ -31,14 +31,6 @@ def test_a_time_for_each_scene_is_as_one_for_all_in_any_shape(name):
         torch.testing.assert_close(
             problem.solution(X_0, t)[scene], problem.solution(X_0[scene : scene + 1], t[scene].item())[0]
         )
-
-
-def test_the_distribution_function_is_constant_along_paths_of_a_mixture():
-    # F_1(x_1) = Phi(x_0), with F_1 the distribution that x_1 is drawn from.
-    problem = RayDrop(dropped=0.3, std=1e-3)
-    x_1 = problem.solution(X_0, 1.0)
-    below = 0.3 * torch.special.ndtr((x_1 + 1) / 1e-3) + 0.7 * torch.special.ndtr((x_1 - 0.3) / 0.3)
-    torch.testing.assert_close(below, torch.special.ndtr(X_0), rtol=0, atol=1e-11)
 
 
 def test_a_wide_jet_has_its_exact_solution():
