@@ -220,7 +220,7 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
             "r2flow.reports.outputs.draw", lambda *asked, **how: drawn.extend(asked[1]) or draw(*asked, **how)
         )
         how = build_sampler("euler", steps=2)
-        write_samples(checkpoint, tmp_path, num, seed, how, ["npy"], pictures=0, batch_size=2, **options)
+        write_samples(checkpoint, tmp_path, num, seed, how, ["npy", "ply"], pictures=0, batch_size=2, **options)
         return drawn
 
     checkpoint = flow()
@@ -245,7 +245,7 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     with pytest.raises(InputError, match=r"000000.png and no manifest.json"):
         write_samples(checkpoint, tmp_path / "camera", 1, 0)
     (tmp_path / "manifest.json").unlink()
-    with pytest.raises(InputError, match=r"\.npy\) and no manifest.json"):
+    with pytest.raises(InputError, match=r"\.(npy|ply)\) and no manifest.json"):
         write(3)
 
 

@@ -37,16 +37,6 @@ def test_files_hold_what_the_simulator_draws(tmp_path):
     np.testing.assert_array_equal(back, scan.labels)
 
 
-def test_files_that_exist_are_kept_and_missing_ones_are_made(tmp_path):
-    folder = SimulatedFolder(tmp_path, SMALL, 0)
-    write_folder(folder, range(4), workers=1)
-    whole, kept = files(tmp_path), (tmp_path / "000001.bin").stat().st_mtime_ns
-    (tmp_path / "000002.bin").unlink()
-    assert write_folder(folder, range(4), workers=1) == 1
-    assert files(tmp_path) == whole
-    assert (tmp_path / "000001.bin").stat().st_mtime_ns == kept
-
-
 def test_a_folder_of_another_seed_or_sensor_is_refused(tmp_path):
     write_folder(SimulatedFolder(tmp_path, SMALL, 0), range(1), workers=1)
     before = files(tmp_path)
