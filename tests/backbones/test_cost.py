@@ -6,7 +6,6 @@ from tiny_backbones import Plain
 from torch import nn
 
 from r2flow.backbones import build_backbone, configurations
-from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
@@ -31,15 +30,6 @@ def test_the_papers_table(config):
     assert count_macs(model) / 1e9 == pytest.approx(gmac, rel=2e-4)
 
 
-def test_counting_leaves_the_model_as_it_was():
-    model = EfficientUNet(torch.zeros(2, 8, 16), base_channels=8, channel_multiplier=(1, 2), num_residual_blocks=1)
-    before = [parameter.clone() for parameter in model.parameters()]
-    assert count_macs(model) == count_macs(model) > 0
-    assert all(torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
-    assert not any(module._forward_hooks for module in model.modules())
-    assert {parameter.device.type for parameter in model.parameters()} == {"cpu"}
-
-
 def test_a_module_says_its_own_multiplications():
     class Twice(nn.Module):
         def forward(self, x):
@@ -54,6 +44,7 @@ def test_a_module_says_its_own_multiplications():
     model.last = nn.Sequential(model.last, nn.Sequential(twice), twice)
     assert count_macs(model) - before == 2 * 2 * 8 * 16
     assert not any(parameter.is_meta for parameter in model.parameters())
+    assert not any(module._forward_hooks or module._forward_pre_hooks for module in model.modules())
 
 
 class Other(nn.Module):
