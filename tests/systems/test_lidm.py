@@ -20,7 +20,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project, unproject
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.checkpoint import load_checkpoint
-from r2flow.model.sampling import sample
+from r2flow.noise import Draws
 from r2flow.registry import options_of
 from r2flow.runs.composing import CONF
 from r2flow.runs.lineage import Parent
@@ -396,11 +396,11 @@ def test_a_sampler_that_a_latent_diffusion_does_not_have_is_refused(changes: dic
 
 
 def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
-    generator = build_generator(DIFFUSION).eval()
-    images = next(sample(generator, 1, steps=2, precision="bf16-mixed")).images
-    assert images.dtype == torch.float32
-    returned = images[images > 0]
-    assert not torch.equal(returned, returned.bfloat16().float())
+    generator, draws = build_generator(DIFFUSION).eval(), Draws(0, [0])
+    noise, sampler = draws.start(generator.noise_shape), build_sampler("latent_ddim", steps=2)
+    x = generator(noise, sampler=sampler, draws=draws, precision="bf16-mixed").x
+    assert x.dtype == torch.float32
+    assert not torch.equal(x, x.bfloat16().float())
 
 
 @pytest.mark.parametrize(
