@@ -254,7 +254,7 @@ def test_noise_in_a_velocity_is_no_jacobian():
         lambda t, x: 0.1 * torch.randn(x.shape, generator=noise, dtype=x.dtype) - x, X, method="exprb43", tolerance=1e-4
     )
     assert not solution.converged.item()
-    assert solution.x.abs().max() < 10
+    assert solution.evaluations.item() == 2  # two answers to the start differ
 
 
 @pytest.mark.parametrize("x_0", [-12.0, -9.0, -8.2, 8.2, 9.0, 12.0])
