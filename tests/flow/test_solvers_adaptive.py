@@ -211,6 +211,7 @@ def test_the_order_is_at_least_4():
     coarse, fine = (solve(velocity, x_0, method="exprb43", tolerance=tolerance) for tolerance in (1e-4, 1e-7))
     gained = math.log(worst(coarse.x, exact) / worst(fine.x, exact))
     assert gained / math.log(fine.accepted[0] / coarse.accepted[0]) > 3.5
+    assert solve(velocity, x_0, method="exprb43", tolerance=0.1, max_step=1 / 32).accepted.item() == 32
 
 
 def test_a_scene_that_runs_away_does_not_end_its_batch():
