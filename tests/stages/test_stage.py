@@ -134,7 +134,7 @@ ADAMW = {"lr": 1e-2, "betas": (0.9, 0.99), "weight_decay": 0.1}
 
 def network() -> nn.Sequential:
     torch.manual_seed(0)
-    return nn.Sequential(nn.Conv2d(2, 16, 3), nn.Conv2d(16, 32, 3), nn.Flatten(), nn.Linear(32, 12), nn.Linear(12, 2))
+    return nn.Sequential(nn.Conv2d(2, 16, 3), nn.Conv2d(16, 32, 3), nn.Flatten(), nn.Linear(32, 48), nn.Linear(48, 2))
 
 
 def gradients(model: nn.Module, seed: int) -> None:
@@ -173,18 +173,19 @@ def test_all_other_weights_are_adamw_s():
         assert torch.equal(p, q) != is_hidden_matrix(p)
 
 
-def test_a_step_of_a_matrix_is_the_equation():
+@pytest.mark.parametrize(("layer", "factor"), [(1, 1), (3, 1.5**0.5)])  # 32 rows of 144 columns, 48 of 32
+def test_a_step_of_a_matrix_is_the_equation(layer, factor):
     model = network()
     ours = Muon(model.parameters(), RATE, MOMENTUM, **ADAMW)
-    matrix = model[1].weight
-    expected, average = matrix.detach().clone().flatten(1), torch.zeros(32, 144)
+    matrix = model[layer].weight
+    expected, average = matrix.detach().clone().flatten(1), torch.zeros_like(matrix).flatten(1)
     for seed, rate in enumerate((RATE, RATE / 2)):
         ours.param_groups[1]["lr"] = rate  # as a schedule does
         gradients(model, seed)
         g = matrix.grad.flatten(1)
         average = MOMENTUM * average + (1 - MOMENTUM) * g
         step = orthogonalised((1 - MOMENTUM) * g + MOMENTUM * average)
-        expected = expected * (1 - rate * 0.1) - rate * step  # 32 rows, 144 columns: sqrt(max(1, .)) = 1
+        expected = expected * (1 - rate * 0.1) - rate * factor * step  # sqrt(max(1, rows / columns))
         ours.step()
     assert torch.allclose(matrix.flatten(1), expected, atol=1e-5)
 
