@@ -6,7 +6,6 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.flow import times
-from r2flow.flow.path import interpolate
 from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped, build_density
 
 N = 400_000
@@ -85,13 +84,3 @@ def test_the_low_discrepancy_sequences_are_exact_and_even_however_late_they_begi
     assert (found.double() - torch.tensor(exact, dtype=torch.float64)).abs().max() < 1.6 * 2**-24
     # By the three-distance theorem 64 points lie at least phi^-9 / sqrt(5) apart.
     assert found[:, 0].sort().values.diff().min() > 0.005
-
-
-def test_the_line_ends_in_noise_and_in_data_and_u_is_its_derivative():
-    x_0, x_1 = torch.randn(3, 2, 4, 8, dtype=torch.float64), torch.randn(3, 2, 4, 8, dtype=torch.float64)
-    t = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
-    assert torch.equal(interpolate(x_0, x_1, torch.zeros(3))[0], x_0)
-    assert torch.equal(interpolate(x_0, x_1, torch.ones(3))[0], x_1)
-    h = 1e-6
-    derivative = (interpolate(x_0, x_1, t + h)[0] - interpolate(x_0, x_1, t - h)[0]) / (2 * h)
-    torch.testing.assert_close(derivative, interpolate(x_0, x_1, t)[1], rtol=0, atol=1e-8)
