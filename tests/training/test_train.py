@@ -63,6 +63,8 @@ def test_next_is_what_has_not_been_done(alone: tuple[Path, str]):
         assert words in what_next(Path("a"), Path("a/samples"), config=config).splitlines()[-1]
     spaced = what_next(Path("a b"), Path("a b/samples"), config=config).split("r2flow ")[1:]
     assert [shlex.split(line)[1] for line in spaced] == ["a b", "a b/samples/000000.ply", "REAL"]
+    plugged = {"stage": {"name": "rectify"}, "data": {"name": "folder"}, "plugins": ["mine.py"]}
+    assert what_next(Path("a"), Path("a/samples"), config=plugged).endswith("stage.init=a --plugin mine.py")
 
 
 def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
