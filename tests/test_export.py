@@ -102,6 +102,13 @@ def test_a_velocity_of_ones_own_is_not_exported_as_the_network(network, words, t
         export(checkpoint, tmp_path / "flow.pt2", SHORT, network)
 
 
+def test_a_sampler_of_more_evaluations_than_it_states_is_refused(monkeypatch, tmp_path):
+    sampler = build_sampler("midpoint", steps=2)
+    monkeypatch.setattr(type(sampler), "evaluations", lambda self, generator: 2)  # of 4
+    with pytest.raises(InputError, match="`evaluations`"):
+        export(flow("efficient_unet"), tmp_path / "flow.pt2", sampler)
+
+
 def test_an_export_leaves_the_model_as_it_was_and_takes_a_samplers_name(tmp_path):
     checkpoint = flow("hdit")
     checkpoint.generator.train()

@@ -49,6 +49,7 @@ class _Recorder(nn.Module):
 
     def forward(self, t: Tensor | float, x: Tensor, s: Tensor | float | None = None) -> Tensor:
         self.calls.append((torch.as_tensor(t), x, torch.as_tensor(t if s is None else s)))
+        check(len(self.calls) < len(self.vectors), "the sampler evaluates more often than its `evaluations` says.")
         return self.vectors[len(self.calls)].view_as(x)
 
 
