@@ -101,6 +101,7 @@ def test_a_sparser_sensor_is_found_and_its_points_come_back(complete, tmp_path):
     said = complete(tmp_path / "in", "--num", 2).said
     for words in ("vlp16 with 16 beams from +15.1 to -14.9", "6 of the 8 rows", "7 of its 16 beams look past"):
         assert words in said
+    assert "uses them with densify" in said  # the model itself has no other sensor
     answers = [read_points(tmp_path / "out" / f"room_{a}.pcd") for a in range(2)]
     for answer in answers:
         assert np.array_equal(answer.xyz[: len(xyz)], xyz.astype(np.float32))

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 FEWER = 0.9  # with less than this share of rays per column, pixels between the rays are not measured
 FEW = 4  # default number of simulated scans
-FROM, THROUGH = "--from, in Python by sensor", "in Python Checkpoint.through of such a sensor"
+FROM, THROUGH = "--from, in Python by sensor", "in Python Checkpoint.through of such a sensor, uses them with densify"
 
 Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors
 
@@ -174,7 +174,7 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
     if lost := int((rows < 0).sum()):
         lines.append(f"{spec}: {lost} of its {len(e)} beams look past the view of {target.name} and are not used")
         to = SENSORS[source.name] if source.name in SENSORS else replace(source, name="FILE (r2flow sensor)")
-        lines[-1] += f": --to {to.name} --size {max(target.shape[0], len(e))}x{to.columns}, {THROUGH}, uses them"
+        lines[-1] += f": --to {to.name} --size {max(target.shape[0], len(e))}x{to.columns}, {THROUGH}"
     return lines
 
 
