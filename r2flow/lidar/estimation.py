@@ -177,8 +177,7 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         beams.firing,
         full_reflectance(scans),
     )
-    off = float(np.median(beams.off(scans)))
-    return Estimate(sensor, beams, steps, off, ground is not None)
+    return Estimate(sensor, beams, steps, float(np.median(beams.off(scans))), ground is not None)
 
 
 def _height(xyz: np.ndarray) -> float | None:

@@ -98,7 +98,7 @@ def write_completed(
             _write(checkpoint, scan, out, files[scan.name], given, completed)
             done[scan.name] = hidden_errors(whole, given, completed) if job.mask else None
             if not completed.evaluations.any():
-                print(f"{scan.name}: everything is known, so nothing was completed; see --fill-gaps and --mask")
+                print(f"{scan.name}: everything is known, so nothing was completed; see --from, --fill-gaps and --mask")
             bar.set(len(done) * job.num)
     if blind and isinstance(checkpoint.generator, TransferFlow):
         print(f"no ray is known in up to {blind:.0f} degrees of a scan, and this model fills no whole sectors: "

@@ -235,6 +235,7 @@ def explain(error: Exception) -> str:
         group, name = choice.groups()
         names = choices(group)
         hint = f" For your own configs, also files in a sweep, give --config-dir FOLDER, with FOLDER/{group}/NAME.yaml."
+        hint = " For a sensor of your own give sensor=FILE.yaml." if group == "sensor" else hint
         return f"no {group} config named '{name}'; known: {', '.join(names)}.{did_you_mean(name, names) or hint}"
     if several := re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text):
         key, values = several.groups()

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.registry import Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid, Steps
@@ -42,13 +42,12 @@ class Posterior(OnGrid):
 
     def check(self, generator: Any) -> None:
         super().check(generator)
-        if generator.told:
-            kind = type(generator).__name__
-            raise InputError(f"sampler {self.name} needs an unconditional flow; for a {kind} give jump.")
+        kind = type(generator).__name__
+        check(not generator.told, f"sampler {self.name} needs an unconditional flow; for a {kind} give jump.")
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if condition is None:
-            raise InputError(f"{self.name} completes scans: it needs a condition.")
+            raise InputError(f"{self.name} completes scans: it needs a condition (r2flow complete).")
 
         def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
             velocity: Tensor = generator.mean_velocity(t, x, s).to(x)
