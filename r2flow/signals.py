@@ -45,9 +45,9 @@ def outlive_parent(seconds: float = 10.0) -> None:
 def hear(handler: Handler, signals: Sequence[int] = STOPPING) -> dict[int, Any]:
     """Handle signals, and return their former handlers.
 
-    Signals stay ignored if they were, as Ctrl-C in background jobs of a shell and SIGHUP under nohup.
+    Stop signals stay ignored if they were, as Ctrl-C in background jobs of a shell and SIGHUP under nohup.
     """
-    heard = [number for number in signals if signal.getsignal(number) is not signal.SIG_IGN]
+    heard = [n for n in signals if n not in STOPPING or signal.getsignal(n) is not signal.SIG_IGN]
     return {number: signal.signal(number, handler) for number in heard}
 
 

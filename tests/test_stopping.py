@@ -89,6 +89,11 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path, script: str):
     assert not list(tmp_path.glob(".*"))  # locks of a store
 
 
+def test_a_run_hears_the_signal_of_its_job_that_its_launcher_ignores():
+    with listening(signal.SIG_IGN, [signal.SIGUSR1]), listening(stop_at_once, [signal.SIGUSR1]):
+        assert signal.getsignal(signal.SIGUSR1) is stop_at_once
+
+
 def test_a_worker_does_not_hear_what_its_run_ignores():
     with listening(signal.SIG_IGN):  # as a hang-up under nohup
         outlive_the_signal()
