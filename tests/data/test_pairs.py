@@ -5,8 +5,6 @@ import math
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -26,7 +24,7 @@ from r2flow.samplers import build_sampler
 from r2flow.store import Store
 from tests.conftest import files
 from tests.fields import Field
-from tests.killing import in_child, wait_until
+from tests.killing import in_child
 
 SHAPE = (2, 4, 8)
 OPTIONS = {
@@ -132,6 +130,8 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
     assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
     assert begun.stat().st_size == 50  # batches, each by one of the two
     assert len(PairSource(store_in(tmp_path / "pairs", num=200))) == 200
+    make_pairs(store_in(tmp_path / "one", num=200), grow)
+    assert files(tmp_path / "pairs") == files(tmp_path / "one")
 
 
 def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
@@ -217,26 +217,6 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     chosen = PairOptions(**pairs_of(flow, options, weights_hash(flow)))
     assert len(PairSource(PairStore(folder, chosen, flow.encoding.shape))) == 10
     assert "pairs/s" not in r2flow("pairs", path, *QUICK).said  # nothing was left to make
-
-
-@pytest.mark.slow
-def test_three_processes_make_the_shards_of_one_even_if_one_is_killed(saved, tmp_path: Path):
-    path, _ = saved
-
-    def make(out: Path, **environment: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", "r2flow", "pairs", path, *QUICK, "--out", out, "--shard-mib", "0.01"]
-        full = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
-        return subprocess.Popen([str(one) for one in command], env=full, stdout=subprocess.PIPE, text=True)
-
-    three = [make(tmp_path / "three", WORLD_SIZE="3", LOCAL_RANK=str(i)) for i in range(3)]
-    wait_until(lambda: any((tmp_path / "three").glob(".*.lock")))
-    three[0].kill()
-    assert [job.wait(timeout=200) for job in three] == [-signal.SIGKILL, 0, 0]
-    for folder in ("one", "three"):  # what the killed process was making is left
-        assert make(tmp_path / folder).wait(timeout=200) == 0
-    found = files(tmp_path / "one")
-    assert len(found) >= 3
-    assert found == files(tmp_path / "three")
 
 
 @pytest.mark.parametrize("option", ["num", "batch_size", "shard_mib", "seed", "precision"])
