@@ -25,7 +25,7 @@ from r2flow.models import name_of
 from r2flow.processes import place
 from r2flow.progress import Bar
 from r2flow.samplers import build_sampler
-from r2flow.store import Store
+from r2flow.store import Damaged, Store
 
 
 class PairStore(Store):
@@ -69,8 +69,10 @@ class PairStore(Store):
 
     def has(self, item: int) -> bool:
         """Whether a shard exists and has all batches that the first `num` pairs need."""
-        needed = len(self.batches_of(item)) * self.options.batch_size
-        return super().has(item) and len(self.head(item)["usable"]) >= needed
+        try:
+            return len(self.head(item)["usable"]) >= len(self.batches_of(item)) * self.options.batch_size
+        except (FileNotFoundError, Damaged):
+            return False
 
     def missing_pairs(self) -> int:
         return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.options.batch_size

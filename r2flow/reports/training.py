@@ -74,8 +74,7 @@ def finish(run: Path, samples: Mapping[str, Any], seed: int, device: str, max_st
 
     `kept`: the run keeps checkpoints.
     """
-    curves = read_curves(run)
-    if curves:
+    if curves := read_curves(run):
         save_figure(curves_figure([(run.name, curves)]), run / "loss.png")
     if not checkpoints_of(run):
         configured = "no checkpoint was kept, as configured" + (f"; loss curve: {run / 'loss.png'}" if curves else "")

@@ -129,9 +129,9 @@ class Transport(Sampler):
 
 
 def late(steps: int, widest: float) -> Tensor:
-    """Time grid with 1 - t_j log-spaced between `widest` and 1 / 64, at the middles of N - 1 equal parts:
+    """Time grid, (N + 1,) float64 on the CPU, 1 - t_j log-spaced from `widest` to 1 / 64 at middles of N - 1 parts:
 
     1 - t_j = widest (1 / (64 widest))^((j - 1/2) / (N - 1)) for j = 1 to N - 1 of N steps.
     """
-    share = (torch.arange(1, steps, dtype=torch.float64) - 0.5) / max(steps - 1, 1)
-    return torch.cat([torch.zeros(1), 1 - widest * (64 * widest) ** -share, torch.ones(1)])
+    share = (torch.arange(1, steps, dtype=torch.float64, device="cpu") - 0.5) / max(steps - 1, 1)
+    return torch.cat([share.new_zeros(1), 1 - widest * (64 * widest) ** -share, share.new_ones(1)])

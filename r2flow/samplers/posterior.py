@@ -42,8 +42,7 @@ class Posterior(OnGrid):
 
     def check(self, generator: Any) -> None:
         super().check(generator)
-        kind = type(generator).__name__
-        check(not generator.told, f"sampler {self.name} needs an unconditional flow; for a {kind} give jump.")
+        check(not generator.told, f"sampler {self.name} needs an unconditional flow; for this model give jump.")
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if condition is None:
