@@ -30,8 +30,8 @@ MEASURED = {
 }  # fmt: skip
 
 # Keys that are equal for all seeds, though a run may resume with another value: they change a column.
-TELLING = {"trainer.precision", "trainer.val_check_interval", "data.root", "parent.step",
-           "callbacks.curvature.num", "callbacks.curvature.steps"}  # fmt: skip
+TELLING = {"trainer.precision", "trainer.val_check_interval", "data.root", "data.pairs.of", "data.scans.root",
+           "parent.step", "callbacks.curvature.num", "callbacks.curvature.steps"}  # fmt: skip
 
 
 class ComparedRun(NamedTuple):
