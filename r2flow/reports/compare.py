@@ -55,8 +55,7 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         inside = [run.parent for level in ("", "*/", "*/*/") for run in sorted(path.glob(f"{level}{CONFIG}"))]
         runs += [path] if path in inside else [run for run in inside if not run.name.startswith(".")]
-    others = [path for path in paths if not any(run.is_relative_to(path) for run in runs)]
-    if wrong := [path for path in others if not runs or not path.exists()]:
+    if wrong := [path for path in paths if not runs or not path.exists()]:
         raise InputError(f"{wrong[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
     return list(dict.fromkeys(runs))
 
