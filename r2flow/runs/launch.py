@@ -59,6 +59,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
             _run_hydra(arguments, functools.partial(_job, arguments, command, ended, os.getpid()))
             if ended:
                 raise JobEnded(*ended[0])
+            return 0
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except Stopped as stop:
@@ -82,8 +83,6 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         message = "a config contains itself, or is nested too deeply."
     except (InputError, OSError) as error:
         message = explain_mistake(error)
-    else:
-        return 0
     print(f"error: {message}", file=sys.stderr)
     return 2
 
