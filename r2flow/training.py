@@ -251,6 +251,8 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
             trainer = L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
         if environment := getattr(trainer.strategy, "cluster_environment", None):
             environment.validate_settings(trainer.num_devices, trainer.num_nodes)
+        if trainer.world_size > 1 and isinstance(interval, str | Mapping):  # Lightning asks each process's clock
+            raise ValueError("a val_check_interval in time comes at another step on each device; give it in steps.")
         return trainer
     except (TypeError, ValueError, RuntimeError, ImportError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None

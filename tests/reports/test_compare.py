@@ -88,8 +88,7 @@ def test_networks_of_other_generators_are_counted_apart(tmp_path, order):
 
 
 def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
-    values = [0.2, 0.4, 0.9]
-    for seed, value in enumerate(values):
+    for seed, value in enumerate([0.2, 0.4, 0.9]):
         make_run(tmp_path / f"net-seed={seed}", {"seed": seed}, val=[value], checkpoint=40)
     make_run(tmp_path / "other-seed=0", {"stage.learning_rate": 2e-3}, val=[0.1], checkpoint=40)
     make_run(tmp_path / "other-seed=1", {"stage.learning_rate": 2e-3, "seed": 1}, checkpoint=40)  # not validated yet

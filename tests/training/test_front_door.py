@@ -77,6 +77,7 @@ REFUSED = {
     "sensor.columns=100": "100 | nearest",
     "data=folder & data.root=/nowhere/at/all": "/nowhere/at/all is not a folder | data.root=FOLDER",
     "data.batch_size=3 & trainer.accumulate_grad_batches=2": "batch_size=3 | multiple of 2",
+    "trainer.strategy=ddp & trainer.devices=2 & trainer.val_check_interval=00:00:00:09": "another step on each device",
     "trainer.precision=16-mixed": "16-mixed | bf16-mixed",
     "encoding.format=log": "no range format named 'log' | Did you mean 'logscale'?",
     "sensor.rays=foo": "'centre' or 'reference' | 'foo'",
