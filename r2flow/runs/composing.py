@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import hydra
+import yaml
 from hydra import initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -28,6 +29,7 @@ from r2flow.registry import Bound, Seed, did_you_mean, options_of
 T = TypeVar("T")
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
+WRONG = (HydraException, OmegaConfBaseException, yaml.YAMLError)  # raised for a wrong config
 
 # Hydra groups: the registry of each, and the options that the run sets instead of the config.
 REGISTRIES = {
@@ -56,7 +58,7 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
             config = with_choices(partial(hydra.compose, "train", overrides, return_hydra_config=True))
             HydraConfig.instance().set_config(config)
             return plain(config)
-        except (HydraException, OmegaConfBaseException) as error:
+        except WRONG as error:
             raise InputError(explain(error)) from None
 
 
@@ -150,7 +152,7 @@ def choices(group: str) -> list[str]:
     if GlobalHydra.instance().is_initialized():  # knows `--config-dir`, too
         return [name for name in GlobalHydra.instance().config_loader().get_group_options(group) if name != "base"]
     files = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
-    return sorted(files | {name.removesuffix(".yaml") for name in ConfigStore.instance().repo.get(group, {})})
+    return sorted(files | {name.removesuffix(".yaml") for name in ConfigStore.instance()._open(group) or ()})
 
 
 OmegaConf.register_new_resolver("choices", lambda group: ", ".join(choices(group)), replace=True)  # for --help
@@ -166,10 +168,9 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     """
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
     converted: list[str] = []
-    parser = OverridesParser.create()
     for text in map(_plain, overrides):
         try:
-            parsed = parser.parse_override(text)
+            parsed = OverridesParser.create().parse_override(text)
         except HydraException:
             raise InputError(
                 f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around =, "
@@ -231,16 +232,17 @@ def explain(error: Exception) -> str:
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."
     if "'hydra/launcher/submitit" in text:
         return "this launcher needs an extra of the project: python -m pip install -e '.[slurm]'"
-    if choice := re.search(r"Could not find '([^/']+)/([^']+)'", text):
-        group, name = choice.groups()
-        names = choices(group)
+    if choice := re.search(r"Could not find '((?:hydra/)?[^/']+)/([^']+)'", text):
+        group, name, names = *choice.groups(), choices(choice[1])
         hint = f" For your own configs, also files in a sweep, give --config-dir FOLDER, with FOLDER/{group}/NAME.yaml."
         hint = " For a sensor of your own give sensor=FILE.yaml." if group == "sensor" else hint
+        hint = " Others are plug-ins of Hydra." if group.startswith("hydra/") else hint
         return f"no {group} config named '{name}'; known: {', '.join(names)}.{did_you_mean(name, names) or hint}"
     if several := re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text):
         key, values = several.groups()
         return f"{key}={values} is several values: for a sweep add -m, for a list give {key}=[{values}]."
-    return " ".join([line.strip() for line in text.splitlines() if line.strip()][:2])
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return " ".join(lines if isinstance(error, yaml.YAMLError) else lines[:2])
 
 
 def known_keys(error: Exception) -> list[str]:

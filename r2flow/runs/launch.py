@@ -17,7 +17,6 @@ from typing import Any, NoReturn
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -27,7 +26,7 @@ from r2flow.config import key_of, override
 from r2flow.errors import InputError, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.registry import check_options
-from r2flow.runs.composing import CONF, Keys, add_choices, as_hydra_takes, compose, explain, plain, with_choices
+from r2flow.runs.composing import CONF, WRONG, Keys, add_choices, as_hydra_takes, compose, explain, plain, with_choices
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, stop_at_once
 
 
@@ -77,7 +76,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
             print(f"{number} of the sweep's jobs resume with the same command: {names}")
             return LATER
         message = f"{number} of the sweep's jobs failed: {names}"
-    except (HydraException, OmegaConfBaseException) as error:
+    except WRONG as error:
         message = one_line(explain(error))
     except RecursionError:
         message = "a config contains itself, or is nested too deeply."
@@ -94,8 +93,7 @@ def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:
     for text in given:
         names += [name.strip(" '\"") for name in text.partition("=")[2].strip("[]").split(",")]
     names = list(dict.fromkeys(name for name in names if name))
-    rest = [text for text in others if text not in given]
-    return [*rest, *([override("plugins", names)] if names else [])], names
+    return [*(text for text in others if text not in given), *([override("plugins", names)] if names else [])], names
 
 
 def _checked_arguments(arguments: list[str]) -> list[str]:

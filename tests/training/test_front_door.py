@@ -72,6 +72,7 @@ REFUSED = {
     # What a name, a size or a number does not fit; several words apart.
     "bakcbone.base_channels=8": "no key 'bakcbone.base_channels' | Did you mean 'backbone.base_channels'?",
     "backbone=hditt": "no backbone config named 'hditt' | Did you mean 'hdit'?",
+    "hydra/sweeper=optuna": "no hydra/sweeper config named 'optuna'; known: basic. Others are plug-ins of Hydra",
     "sensor=mine": "no sensor config named 'mine' | sensor=FILE.yaml",
     "+backbone.widht=8": "no option 'widht'",
     "sensor.columns=100": "100 | nearest",
@@ -111,6 +112,9 @@ def test_python_refuses_a_wrong_key_and_a_chain():
 def test_a_folder_of_configs_may_have_any_name(tmp_path: Path):
     write_file(tmp_path / "é, [1]" / "experiment" / "mine.yaml", "# @package _global_\nseed: 9")
     assert compose(["experiment=mine"], [tmp_path / "é, [1]"])["seed"] == 9
+    write_file(tmp_path / "é, [1]" / "experiment" / "mine.yaml", "seed: 9\nseed: 8")
+    refusal = in_process(tmp_path, ["--config-dir", "é, [1]", "experiment=mine"], check=False).refusal
+    assert refusal.endswith('/é, [1]/experiment/mine.yaml", line 2, column 1')
 
 
 def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
@@ -123,10 +127,9 @@ def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
 
 def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(scans: Path, tmp_path: Path):
     asked = ["experiment=densify", "data=folder", f"data.root={scans}", f"run_dir={tmp_path / 'run'}"]
-    by_experiment = ["data.scenes=99"]
-    assert build(compose([*asked, *by_experiment]), asked).data.options.name == "folder"
+    assert build(compose([*asked, "data.scenes=99"]), asked).data.options.name == "folder"
     asked[1:3] = []
-    assert 99 not in {part.scenes for part in build(compose([*asked, *by_experiment]), asked).data.parts}
+    assert 99 not in {part.scenes for part in build(compose([*asked, "data.scenes=99"]), asked).data.parts}
 
 
 def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
@@ -140,10 +143,8 @@ def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
 
 
 def test_a_named_choice_has_options_of_its_own():
-    time = compose(["stage.time={name: logit_normal, mean: 2.0}"])["stage"]["time"]
-    assert time == {"name": "logit_normal", "mean": 2.0}
-    reflow = ["stage=reflow", "stage.time={name: uniform}"]  # whose default density has an option a
-    assert compose(reflow)["stage"]["time"] == {"name": "uniform"}
+    assert compose(["stage.time={name: logit_normal, mean: 2}"])["stage"]["time"] == {"name": "logit_normal", "mean": 2}
+    assert compose(["stage=reflow", "stage.time={name: uniform}"])["stage"]["time"] == {"name": "uniform"}  # without a
 
 
 def test_a_generator_without_options_is_given_by_its_name():
@@ -170,8 +171,7 @@ def test_a_plugin_that_does_not_load(tmp_path: Path, text: str, words: str):
 
 def test_a_folder_is_no_plugin(tmp_path: Path):
     (tmp_path / "no_package").mkdir()
-    done = in_process(tmp_path, ["--plugin", "no_package", "name=bad"], check=False)
-    assert "without an __init__.py" in done.refusal
+    assert "without an __init__.py" in in_process(tmp_path, ["--plugin", "no_package"], check=False).refusal
 
 
 @pytest.mark.parametrize("text", ["", "- 1", "x", "a: [", "a: \0", "data: 3", "trainer: [1]", "a: &a [*a]"])
