@@ -69,13 +69,12 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     edges = sensor.row_edges
     share = float(((elevation <= edges[0]) & (elevation >= edges[-1])).mean())
     seen = f"{share:.0%} of the returns lie in its view"
+    whole = SENSORS[sensor.name] if sensor.name in SENSORS else sensor  # noqa: SIM401
     if beams is None:
-        whole = SENSORS[sensor.name] if sensor.name in SENSORS else sensor  # noqa: SIM401
         own = np.asarray(whole.elevations)
         off = float(np.median(np.abs(elevation - own[np.searchsorted(-(own[:-1] + own[1:]) / 2, -elevation)])))
         return None if share >= IN_VIEW and off < MOST_OFF else Doubt(f"{seen}, {off:.1f} degrees off its beams", None)
-    name, near = nearest_sensor(beams)
-    distance, every = 0.0, 1
+    (name, near), distance, every = nearest_sensor(beams), 0.0, 1
     if sensor.name in SENSORS or len(beams) <= len(sensor.elevations):
         # A sensor at another size is the same sensor: `resized` makes one of every few rows a beam.
         most = 1 if sensor.name in SENSORS else len(sensor.elevations) // len(beams)
@@ -87,9 +86,10 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
             return Doubt(f"they have {len(beams)} beams, one of every {every} of its rows", None, finer=True)
         rows, count = len(sensor.elevations), np.histogram(-elevation, -edges)[0]
         filled = np.flatnonzero(count > 0.02 * np.median(count))
-        void = int((np.diff(filled) - 1).sum()) if len(beams) >= rows else 0
-        seen = f"{void} of its {rows} rows lie between their beams and stay empty"
-        return Doubt(seen, None) if void > rows * MOST_VOID else None
+        void = np.diff(filled if len(beams) >= rows else np.searchsorted(-edges, -beams)) - 1
+        less = 0 if len(beams) >= rows else void.max(initial=0)  # a crop of near points leaves a wide gap
+        seen = f"{void.clip(0).sum()} of its {rows} rows lie between their beams and stay empty"
+        return Doubt(seen, None) if void.sum() - less > rows * MOST_VOID and rows <= len(whole.elevations) else None
     seen = f"they have {len(beams)} beams from {beams[0]:+.1f} to {beams[-1]:+.1f} degrees, {seen}"
     return Doubt(seen, name, sure=near < BEATEN)
 

@@ -13,7 +13,7 @@ from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_
 from r2flow.lidar.estimation import estimate_sensor, full_reflectance, is_tilted, nearest_sensor, other_sensor
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import Points, read_points, write_points
-from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.lidar.sensors import HDL64E_RINGS, SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of
 from r2flow.simulator import simulate
 
@@ -289,8 +289,7 @@ def test_a_part_of_the_view_is_enough(shared: Path):
         elevation, azimuth = elevations_of(points.xyz), np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
         part = points.xyz[(np.abs(azimuth) < np.radians(41)) & (elevation > -15.7)]
         assert len(part) < len(points.xyz) / 4
-        assert other_sensor([Points(part)], SENSORS["hdl64e"]) is None
-        assert other_sensor([Points(part)], SENSORS["vlp16"]) is not None
+        assert [other_sensor([Points(part)], SENSORS[n]) is None for n in ("hdl64e", "vlp16")] == [True, False]
 
 
 def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
@@ -304,10 +303,11 @@ def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
 
 def test_sensors_of_one_s_own_are_judged_by_their_beams():
     mine = Sensor("mine", tuple(np.linspace(3, -25, 24).tolist()))
-    assert other_sensor([scan(mine, RING_AFTER_RING)], mine) is None
-    assert other_sensor([scan(SENSORS["vlp16"], RING_AFTER_RING)], mine) is not None
+    assert [other_sensor([scan(s, RING_AFTER_RING)], mine) is None for s in (mine, SENSORS["vlp16"])] == [True, False]
     few = scan(SENSORS["pandar64"], RING_AFTER_RING).xyz[:900]
     assert other_sensor([Points(few)], SENSORS["vlp16"]) is None  # a few returns say nothing
+    less = scan(Sensor("less", tuple(np.delete(HDL64E_RINGS, [n for n in range(32, 64) if n % 4]))), RING_AFTER_RING)
+    assert "21 of its 64 rows lie between" in other_sensor([less], SENSORS["hdl64e_rings"]).seen
 
 
 def test_rows_between_the_beams_of_ones_own_sensor_are_no_other_sensors(tmp_path: Path, caplog):
