@@ -84,7 +84,6 @@ def screen(shown) -> np.ndarray:
 
 def colour_by(shown, mode: str) -> None:
     shown.locator("#modes button", has_text=mode).click()
-    shown.locator("#tiles").focus()
     settle(shown)
 
 
@@ -109,12 +108,10 @@ def projected(point: np.ndarray, camera: dict, box: dict) -> np.ndarray:
 
 def points_of(image: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
     """The point of each of `PIXELS`, each alone through the project's own unprojection."""
-    found = {}
-    for place in PIXELS:
-        one = np.zeros_like(image)
+    alone = {place: np.zeros_like(image) for place in PIXELS}
+    for place, one in alone.items():
         one[:, *place] = image[:, *place]
-        found[place] = image_to_points(one, RAYS)[0][0]
-    return found
+    return {place: image_to_points(one, RAYS)[0][0] for place, one in alone.items()}
 
 
 def colour_of_range(r: float) -> np.ndarray:
@@ -175,18 +172,17 @@ def test_mouse_and_keys_move_the_camera(opened):
     shown.mouse.move(x + 50, y)
     shown.mouse.up(button="right")
     moved = camera_of(shown)
-    point = np.array(moved["target"])
     # What was in the middle has followed the mouse.
-    middle = projected(np.array(turned["target"]), moved, box) - [
-        box["x"] + box["width"] / 2,
-        box["y"] + box["height"] / 2,
-    ]
+    middle = projected(turned["target"], moved, box) - [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
     assert middle == pytest.approx([50, 0], abs=0.5)
-    assert np.linalg.norm(point - turned["target"]) > 0.5
+    assert math.dist(moved["target"], turned["target"]) > 0.5
     shown.mouse.wheel(0, -100)
     shown.wait_for_function("distance => window.view.camera.distance < distance", arg=moved["distance"])
     shown.keyboard.press("r")
     assert camera_of(shown) == first
+    shown.locator("#reset").click()
+    shown.keyboard.press("ArrowRight")  # of the page, not of the button that has the focus
+    assert camera_of(shown)["yaw"] == pytest.approx(first["yaw"] + 0.09)
 
 
 def test_the_cursor_finds_the_point_and_back(opened):
@@ -237,10 +233,9 @@ def test_everything_fits_and_the_rest_is_turned_to(opened, size, count):
     shown = opened(*(panel(lone(), caption=str(number)) for number in range(20)), size=size)
     boxes = [one.bounding_box() for one in shown.locator("figure, button:visible").all()]
     for box in boxes:
-        assert box["x"] >= 0
-        assert box["y"] >= 0
-        assert box["x"] + box["width"] <= size["width"]
-        assert box["y"] + box["height"] <= size["height"]
+        for start, length in (("x", "width"), ("y", "height")):
+            assert box[start] >= 0
+            assert box[start] + box[length] <= size[length]
     seen = shown.locator("figure").count()
     assert count <= seen <= 16
     shown.locator("#next").click()

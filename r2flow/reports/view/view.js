@@ -685,7 +685,7 @@ function help() {
 }
 
 addEventListener("keydown", (event) => {
-  const own = ["INPUT", "BUTTON"].includes(event.target.tagName) && /^(Arrow|Page| |Enter)/.test(event.key);
+  const own = { INPUT: /^(Arrow|Page)/, BUTTON: /^ $/ }[event.target.tagName]?.test(event.key); // its default action
   const action = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
   if (!action || own || event.ctrlKey || event.metaKey || event.altKey || element("keys").open) return;
   event.preventDefault();
