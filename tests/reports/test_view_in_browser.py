@@ -156,8 +156,9 @@ def test_the_image_below_is_the_range_image(opened):
             assert np.abs(pixels[int(y), int(x)] - expected).max() <= 4, (row, column)
 
 
-def test_mouse_and_keys_move_the_camera(opened):
-    shown = opened(panel(lone()))
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_mouse_and_keys_move_the_camera(opened, size):
+    shown = opened(panel(lone()), size=size)
     first, box = camera_of(shown), shown.locator(".points").bounding_box()
     x, y = box["x"] + 300, box["y"] + 200
     shown.mouse.move(x, y)

@@ -255,10 +255,10 @@ function orbit(yaw, pitch) {
   moved();
 }
 
-/** Move by pixels of a rectangle of this height. */
-function pan(x, y, height) {
+/** Move by pixels of a rectangle: what lies at its middle follows. */
+function pan(x, y, width = 800, height = 600) {
   const { right, up } = axes();
-  const metres = (2 * OPENING * camera.distance) / height;
+  const metres = (2 * lens(width, height).half * camera.distance) / height;
   camera.target = camera.target.map((value, i) => value - metres * (x * right[i] - y * up[i]));
   moved();
 }
@@ -601,8 +601,8 @@ function followPoints(scan) {
     if (other) {
       const distance = (point) => Math.hypot(point[0] - other[1][0], point[1] - other[1][1]);
       if (distance(now) > 8) zoom(distance(before) / distance(now));
-      pan(dx / 2, dy / 2, box.clientHeight);
-    } else if (event.shiftKey || event.buttons & 6) pan(dx, dy, box.clientHeight);
+      pan(dx / 2, dy / 2, box.clientWidth, box.clientHeight);
+    } else if (event.shiftKey || event.buttons & 6) pan(dx, dy, box.clientWidth, box.clientHeight);
     else orbit(-dx * 0.008, dy * 0.008);
     path += Math.abs(dx) + Math.abs(dy);
     held.set(event.pointerId, now);
@@ -640,10 +640,10 @@ function lookAt(scan, pixel) {
 }
 
 const KEYS = {
-  ArrowLeft: ["turn", () => orbit(-0.09, 0), () => pan(40, 0, 600)],
-  ArrowRight: ["turn", () => orbit(0.09, 0), () => pan(-40, 0, 600)],
-  ArrowUp: ["higher", () => orbit(0, 0.07), () => pan(0, 40, 600)],
-  ArrowDown: ["lower", () => orbit(0, -0.07), () => pan(0, -40, 600)],
+  ArrowLeft: ["turn", () => orbit(-0.09, 0), () => pan(40, 0)],
+  ArrowRight: ["turn", () => orbit(0.09, 0), () => pan(-40, 0)],
+  ArrowUp: ["higher", () => orbit(0, 0.07), () => pan(0, 40)],
+  ArrowDown: ["lower", () => orbit(0, -0.07), () => pan(0, -40)],
   "+": ["nearer", () => zoom(0.85)],
   "=": ["nearer", () => zoom(0.85)],
   "-": ["farther", () => zoom(1 / 0.85)],
