@@ -176,6 +176,7 @@ def test_mouse_and_keys_move_the_camera(opened, size):
     # What was in the middle has followed the mouse.
     middle = projected(turned["target"], moved, box) - [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
     assert middle == pytest.approx([50, 0], abs=0.5)
+    assert shown.locator("#tiles").evaluate("tiles => getComputedStyle(tiles).outlineStyle") == "none"
     assert math.dist(moved["target"], turned["target"]) > 0.5
     shown.mouse.wheel(0, -100)
     shown.wait_for_function("distance => window.view.camera.distance < distance", arg=moved["distance"])

@@ -590,7 +590,6 @@ function followPoints(scan) {
     box.setPointerCapture(event.pointerId);
     held.set(event.pointerId, at(event));
     path = held.size > 1 ? Infinity : 0;
-    tiles.focus({ preventScroll: true });
   });
   box.addEventListener("pointermove", (event) => {
     const before = held.get(event.pointerId);
