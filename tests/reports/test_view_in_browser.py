@@ -147,13 +147,11 @@ def test_the_image_below_is_the_range_image(opened):
     shown = opened(panel(image))
     colour_by(shown, "range")
     box, pixels = shown.locator(".image").bounding_box(), screen(shown)
-    for row in range(16):
-        for column in range(64):
-            x = box["x"] + (column + 0.5) / 64 * box["width"]
-            y = box["y"] + 1 + (row + 0.5) / 16 * (box["height"] - 1)
-            r = image[0, row, column]
-            expected = colour_of_range(r) if r else np.zeros(3)
-            assert np.abs(pixels[int(y), int(x)] - expected).max() <= 4, (row, column)
+    for (row, column), r in np.ndenumerate(image[0]):
+        x = box["x"] + (column + 0.5) / 64 * box["width"]
+        y = box["y"] + 1 + (row + 0.5) / 16 * (box["height"] - 1)
+        expected = colour_of_range(r) if r else np.zeros(3)
+        assert np.abs(pixels[int(y), int(x)] - expected).max() <= 4, (row, column)
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE])
@@ -185,6 +183,10 @@ def test_mouse_and_keys_move_the_camera(opened, size):
     shown.locator("#reset").click()
     shown.keyboard.press("ArrowRight")  # of the page, not of the button that has the focus
     assert camera_of(shown)["yaw"] == pytest.approx(first["yaw"] + 0.09)
+    for opens in (True, False):
+        shown.keyboard.press("?")
+        shown.locator(f"#help[aria-expanded={str(opens).lower()}]").wait_for()
+        assert shown.locator("#keys").is_visible() == opens
 
 
 def test_the_cursor_finds_the_point_and_back(opened):

@@ -672,6 +672,8 @@ const HELP = [
 function help() {
   const box = element("keys");
   if (box.open) return box.close();
+  element("help").setAttribute("aria-expanded", "true");
+  box.onclose = () => element("help").setAttribute("aria-expanded", "false");
   const table = document.createElement("table");
   for (const [key, meaning] of HELP) {
     const row = node("tr", table);
@@ -686,7 +688,8 @@ function help() {
 addEventListener("keydown", (event) => {
   const own = { INPUT: /^(Arrow|Page)/, BUTTON: /^ $/ }[event.target.tagName]?.test(event.key); // its default action
   const action = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-  if (!action || own || event.ctrlKey || event.metaKey || event.altKey || element("keys").open) return;
+  if (!action || own || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (element("keys").open && event.key !== "?") return;
   event.preventDefault();
   (event.shiftKey && action[2] ? action[2] : action[1])();
 });
