@@ -223,6 +223,8 @@ def test_only_what_is_there_can_be_coloured(opened):
     shown = opened(panel(lone()[:1]))
     assert shown.locator("#modes button").all_inner_texts() == ["range", "height"]
     assert shown.locator("#player").is_hidden()
+    colour_by(shown, "range")
+    assert shown.locator("#legend span").all_inner_texts() == ["range 2 m", "12.6 m", "80 m"]  # sqrt(2 x 80) between
     shown = opened(panel(lone(), labels=np.full((1, *SENSOR.shape), 40)))
     shown.get_by_role("button", name="label", exact=True).click()
     assert shown.locator("#legend").inner_text().strip() == "road"

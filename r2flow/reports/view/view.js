@@ -713,11 +713,18 @@ function setMode(mode) {
     const row = ["range", "height", "reflectance"].indexOf(mode);
     const ends = { range: page.ranges, height: page.heights, reflectance: [0, 0.81] }[mode];
     const unit = mode === "reflectance" ? "" : " m";
+    const [low, high] = ends;
+    const middle = { range: Math.sqrt(low * high), height: (low + high) / 2, reflectance: high / 4 }[mode];
     const stops = Array.from({ length: 17 }, (_, i) => 1024 * row + 4 * Math.min(16 * i, 255));
-    say(`${mode} ${ends[0]}${unit}`);
-    node("i", legend).style.background =
-      `linear-gradient(90deg, ${stops.map((i) => `rgb(${table.slice(i, i + 3).join(" ")})`)})`;
-    say(`${ends[1]}${unit}`);
+    const bar = (part) => {
+      node("i", legend).style.background =
+        `linear-gradient(90deg, ${part.map((i) => `rgb(${table.slice(i, i + 3).join(" ")})`)})`;
+    };
+    say(`${mode} ${low}${unit}`);
+    bar(stops.slice(0, 9));
+    say(`${Math.round(10 * middle) / 10}${unit}`); // range is on a logarithmic scale, reflectance on that of its root
+    bar(stops.slice(8));
+    say(`${high}${unit}`);
   }
   redraw();
 }
