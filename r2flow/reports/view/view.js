@@ -704,7 +704,7 @@ function setMode(mode) {
   legend.replaceChildren();
   const say = (text) => node("span", legend, { textContent: text });
   if (mode === "label") {
-    for (const [name, colour] of page.legend) {
+    for (const [name, colour] of [...page.legend, page.classes[0]]) {
       const entry = say("");
       node("b", entry).style.background = colour;
       entry.append(name);
