@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import logging
 import os
 import resource
 import sys
@@ -194,6 +195,7 @@ def captured(run: Callable[[], int | None]) -> Done:
             code = run() or 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
+    logging.getLogger("r2flow.flow").setLevel(logging.NOTSET)  # `report solvers` raises it for its process
     return Done(code, said.getvalue(), complained.getvalue())
 
 

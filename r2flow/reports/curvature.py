@@ -115,7 +115,7 @@ def trajectories_figure(flows: Mapping[str, Straightness]) -> Figure:
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
     for axes, flow, title in zip(panels, flows.values(), labels([Path(label) for label in flows]), strict=True):
-        axes.plot(np.append(flow.t, 1.0), flow.trajectories.T, lw=0.7, alpha=0.8, color="0.55")
+        axes.plot(np.append(flow.t, 1.0), flow.trajectories.T.numpy(), lw=0.7, alpha=0.8, color="0.55")
         axes.set(xlabel="t  (0 noise, 1 data)", xlim=(0, 1))
         axes.set_title(title, fontsize=9)
         axes.axhline(-1, color="black", lw=0.9, ls=":", zorder=4)

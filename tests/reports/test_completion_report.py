@@ -43,12 +43,12 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
     sensor, encoding, by = checkpoint.sensor, checkpoint.encoding, 0.0
     scan = iter(torch.from_numpy(np.stack([*truths, *truths])))
 
-    def answer(noise, condition, **_):
+    def answer(self, noise, condition, **_):
         truth = next(scan)[None]
         moved = torch.where(truth[:, :1] > 0, (truth[:, :1] + by).clamp(max=79.9), 0)
         return Generated.after(encoding.encode(torch.cat([moved, truth[:, 1:]], 1)), 7)
 
-    monkeypatch.setattr(checkpoint.generator, "forward", answer)
+    monkeypatch.setattr(type(checkpoint.generator), "forward", answer)
     ways = {"truth": (checkpoint, build_sampler("euler", steps=7))}
     options = {"tasks": ["rows:4"], "num": 1}
     *plain, (row, _) = completion_rows(truths, sensor, ways, **options)
