@@ -53,9 +53,10 @@ def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], confi
         ]
         if any(key_of(text) == "plugins" for text in own):
             raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")
+        begins = dict(flatten(difference)).keys() & {"experiment", "init", "stage.init"}  # a mistyped link does not
+        if parent not in (None, *(link.name for link in links)) or (links and not begins):
+            raise InputError(f"chain.{name} needs init=LINK with a link before it, or an experiment.")
         if parent is not None:
-            if parent not in [link.name for link in links]:
-                raise InputError(f"chain.{name}.init={parent}: no link of that name comes before it.")
             own.append(override("stage.init", str(Path(folder, parent))))
         # Overrides given for this link alone come last: they replace the link's own keys.
         alone = [text.lstrip("+") for text in given if text.lstrip("+").startswith(f"chain.{name}.")]
@@ -141,10 +142,8 @@ def run_process(command: Sequence[str]) -> int:
         process = subprocess.Popen(command, preexec_fn=_die_with_parent if sys.platform == "linux" else None)
         if received:
             process.send_signal(received[0])
-        code = process.wait()
-    if code < 0:
-        return code_of(-code)
-    return code or (code_of(received[0]) if received else 0)
+        code = process.wait() or -next(iter(received), 0)
+    return code_of(-code) if code < 0 else code
 
 
 def _die_with_parent() -> None:

@@ -227,7 +227,8 @@ def explain(error: Exception) -> str:
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)
         others = [other for other in known_keys(error) if not key.startswith(f"{other}.")]  # without the key's group
-        return f"the config has no key '{key}'.{did_you_mean(key, others)} See --cfg job for all of them."
+        more = "Add keys by +chain.LINK.KEY=VALUE" if key.startswith("chain.") else "See --cfg job for all of them"
+        return f"the config has no key '{key}'.{did_you_mean(key, others)} {more}."
     if missing := re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL):
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."
     if "'hydra/launcher/submitit" in text:

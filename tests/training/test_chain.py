@@ -108,8 +108,7 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(cha
     assert process.returncode == 143, said
     assert "stopped at step 6; the same command resumes from the last checkpoint" in said
     assert "the chain stopped in td2; the same command resumes there" in said
-    assert not (run / "td2" / "link.json").exists()
-    assert not (run / "report").exists()
+    assert not any(path.exists() for path in (run / "td2" / "link.json", run / "report"))
     let_go(tmp_path / HELD)
     run_train(tmp_path, scans, *CHAIN)
     assert_alike(chained[0], run)
@@ -206,8 +205,7 @@ def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path
     (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=simulated"])
     assert link.overrides[:2] == ("data.scenes=9", "data=simulated")
     more = {"more": {"init": "rf1", "data": {"scenes": 9}}, "rf2": {"experiment": "reflow", "init": "more"}}
-    (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=mixed"])  # parts have their own
-    assert link.overrides[0] == "data=mixed"
+    assert links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=mixed"])[0].overrides[0] == "data=mixed"
     links = links_of({"rf1": {"data": {"scenes": 8}}, **more}, "runs", ["data=folder"])
     assert ["data=folder" in link.overrides for link in links] == [True, True, False]  # rf2 learns from pairs
     assert not any(text.startswith("data.scenes") for link in links for text in link.overrides)
@@ -238,6 +236,8 @@ def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_optio
     [
         (["trainer.fast_dev_run=true"], "fast_dev_run leaves none"),
         (["stage.init=x"], "stage.init is each link's own"),
+        (["+chain.fr2.trainer.max_steps=9"], "chain.fr2 needs init=LINK with a link before it, or an experiment"),
+        (["chain.rf1.seed=1"], "Add keys by +chain.LINK.KEY=VALUE"),
         # What only building finds out, in links that would run last.
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
