@@ -148,5 +148,4 @@ def run_process(command: Sequence[str]) -> int:
 
 def _die_with_parent() -> None:
     """End a run with its chain or sweep: otherwise it would block the same command when given again."""
-    PR_SET_PDEATHSIG = 1
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG

@@ -63,6 +63,7 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
 
 
 IN_RUNS = Bound("that names a folder in runs", lambda text: text.strip("./") and ".." not in Path(text).parts)
+GLOBAL = Bound("of files that begin with # @package _global_", lambda name: True)  # else their keys lie in experiment
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Keys:
     run_dir: Annotated[str, Bound("that names a folder", lambda text: text.strip("/ "))]
     seed: Seed
     name: Annotated[str, IN_RUNS] | int | float = "run"
-    experiment: str | Sequence[str] | None = None
+    experiment: Annotated[str | Sequence[str] | None, GLOBAL] = None
     generator: Mapping[str, Any] | str | None = None
     sampler: Mapping[str, Any] | None = None
     few: Mapping[str, Any] | None = None
