@@ -24,7 +24,7 @@ def train(context: typer.Context) -> int:
     return main(context.args, [sys.executable, "-m", "r2flow", "train"])
 
 
-@app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow pairs runs/r2flow_1rf --num 1000000")
+@app.command(epilog="Example: torchrun --nproc-per-node 8 -m -- r2flow pairs runs/r2flow_1rf --num 1000000")
 @grouped
 def pairs(
     model: Annotated[str, typer.Argument(help="A model, a run folder or a checkpoint file.")],
