@@ -254,7 +254,7 @@ def _convolution(in_channels: int, out_channels: int, stride: int = 1) -> nn.Seq
 class MinibatchDeviation(nn.Module):
     """Append a channel with the standard deviation over a group of images, averaged over all features.
 
-    A group has G images b, b + B / G, ..., with the largest divisor G <= 4 of the batch size B (Karras et al. 2018,
+    A group has G images b, b + B / G, ..., with the largest divisor G <= 4 of a device's batch B (Karras et al. 2018,
     section 3).
     """
 
