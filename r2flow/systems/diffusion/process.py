@@ -111,12 +111,12 @@ def sigmoid_steps(steps: Steps = 1000, start: float = -3.0, end: float = 3.0) ->
     From Jabri et al. 2022, "Scalable adaptive computation for iterative generation".
     """
     t = torch.linspace(start, end, steps + 1, dtype=torch.float64)
-    return _of_signal(t[-1].sigmoid() - t.sigmoid())
+    return _of_signal(torch.tensor(end, dtype=torch.float32).sigmoid() - t.sigmoid())  # rounded as published
 
 
 def _of_signal(alpha_squared: Tensor) -> Tensor:
-    """lambda_t, (N,) float64, of steps between alpha^2 given up to a factor, (N + 1,), with beta_t <= 0.999."""
-    return of_steps((1 - alpha_squared[1:] / alpha_squared[:-1]).clamp(max=0.999))
+    """lambda_t, (N,) float64, of steps between alpha^2 given up to a factor, (N + 1,), with beta_t in [0, 0.999]."""
+    return of_steps((1 - alpha_squared[1:] / alpha_squared[:-1]).clamp(0, 0.999))
 
 
 SCHEDULES: Registry[Callable[..., LogSNR]] = Registry(
