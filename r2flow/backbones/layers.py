@@ -111,7 +111,7 @@ class RandomFourierFeatures(ExactBuffers):
 
     def forward(self, t: Tensor) -> Tensor:
         """t (B,) to (B, channels)."""
-        phase = 2 * math.pi * at_least_float32(t)[:, None] * self.freqs
+        phase = at_least_float32(t)[:, None] * (2 * math.pi * self.freqs)
         return self.linear(torch.cat([phase.cos(), phase.sin()], dim=-1))
 
 

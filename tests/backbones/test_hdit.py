@@ -6,7 +6,7 @@ from tiny_backbones import image, tiny, untrained
 
 from r2flow.backbones.hdit import Attention, BlockOptions, Neighbourhood
 from r2flow.errors import InputError
-from tests.reference import load_case
+from tests.reference import backbone_of, load_case
 
 
 @pytest.mark.parametrize("index", range(4))
@@ -22,6 +22,12 @@ def test_circular_attention_blocks_are_the_references(shared, index):
             layer.qkv_proj.weight[: 2 * case["dim"]] *= factor
             residual = layer(case["x"], case["emb"], layer.rope.table(case["coords"]))
             torch.testing.assert_close(residual, case["residual"], rtol=0, atol=1e-5)
+
+
+def test_times_are_rounded_as_the_references(shared):  # logits of up to 100 amplify what is left
+    case = load_case(shared, "hdit_16x192.pt")
+    found = backbone_of("hdit", case).timestep_pe(case["t"])
+    torch.testing.assert_close(found, case["acts"]["timestep_pe"], rtol=0, atol=5e-7)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
@@ -51,16 +57,13 @@ def test_autocast_does_not_round_the_image_at_the_ends():
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"num_heads": (1,)}, "num_heads must be 2 integers of at least 1"),
-        ({"depths": (1, 0)}, "depths must be 2 integers of at least 1"),
-        ({"num_heads": (3, 2)}, "16 channels cannot be shared by 3 heads"),
-        *(({"detail": detail}, "detail must be 2 integers") for detail in ([2], [0, 8], [2, 8, 8])),
-        ({"attention": "tile"}, "no attention backend named 'tile'.*Did you mean 'tiles'"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"num_heads": (1,)}, "num_heads must be 2 integers of at least 1"),
+    ({"depths": (1, 0)}, "depths must be 2 integers of at least 1"),
+    ({"num_heads": (3, 2)}, "16 channels cannot be shared by 3 heads"),
+    *(({"detail": detail}, "detail must be 2 integers") for detail in ([2], [0, 8], [2, 8, 8])),
+    ({"attention": "tile"}, "no attention backend named 'tile'.*Did you mean 'tiles'"),
+])  # fmt: skip
 def test_options_that_cannot_work_say_why(options, message):
     with pytest.raises(InputError, match=message):
         untrained("hdit", **options)

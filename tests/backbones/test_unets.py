@@ -29,20 +29,17 @@ def test_resampling_keeps_a_constant_ring_constant(window):
 
 
 @pytest.mark.parametrize("name", ["adm_unet", "efficient_unet"])
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"base_channels": 2}, "base_channels must be .* of at least 4 that is even, found 2"),
-        ({"base_channels": 9}, "base_channels must be .* of at least 4 that is even, found 9"),
-        ({"base_channels": 12}, "12 channels cannot be shared by 8 groups: give a multiple of 8"),
-        ({"base_channels": 8, "num_heads": 3}, "cannot be shared by 3 attention heads"),
-        ({"num_heads": 0}, "num_heads must be a whole number of at least 1, found 0"),
-        ({"name": "local", "channels": 5}, "channels must be .* of at least 4 that is even, found 5"),
-        ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
-        ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
-        ({"position": "learnable"}, "no position named 'learnable'; known: fourier_features, none"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"base_channels": 2}, "base_channels must be .* of at least 4 that is even, found 2"),
+    ({"base_channels": 9}, "base_channels must be .* of at least 4 that is even, found 9"),
+    ({"base_channels": 12}, "12 channels cannot be shared by 8 groups: give a multiple of 8"),
+    ({"base_channels": 8, "num_heads": 3}, "cannot be shared by 3 attention heads"),
+    ({"num_heads": 0}, "num_heads must be a whole number of at least 1, found 0"),
+    ({"name": "local", "channels": 5}, "channels must be .* of at least 4 that is even, found 5"),
+    ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
+    ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
+    ({"position": "learnable"}, "no position named 'learnable'; known: fourier_features, none"),
+])  # fmt: skip
 def test_options_that_cannot_work_say_why(name, options, message):
     with pytest.raises(InputError, match=message), torch.device("meta"):
         build_backbone({"name": name, **options}, torch.zeros(2, 16, 64), 2)
