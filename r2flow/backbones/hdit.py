@@ -146,15 +146,15 @@ class HDiT(Backbone):
         return v if self.detail is None else v + self.detail(x, h, condition)
 
     def follow_rays(self) -> None:
+        tokens = rays = F.avg_pool2d(self.coords, self.patch)
         for level in range(self.levels):
-            # Means in float32: harmonics amplify their rounding, and the published weights were trained with it.
-            rays = F.avg_pool2d(self.coords, (self.patch[0] << level, self.patch[1] << level))
+            # Level after level in float32: harmonics amplify the rounding that the published weights were trained with.
+            rays = F.avg_pool2d(rays, 2) if level else tokens
             table = _shared_rotation(level, self._blocks(level)).table(rays)
             self.register_buffer(f"table_{level}", table, persistent=False)
         if isinstance(self.spatial_pe, nn.Sequential):
             encoding = cast(RayFeatures, self.spatial_pe[0]).embedding
-            features = encoding(F.avg_pool2d(self.coords, self.patch)).permute(0, 2, 3, 1)
-            self.register_buffer("features", features, persistent=False)
+            self.register_buffer("features", encoding(tokens).permute(0, 2, 3, 1), persistent=False)
 
     @property
     def learns_directions(self) -> bool:  # type: ignore[override]
