@@ -18,6 +18,7 @@ from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator
 from r2flow.generators.flow import Conditioned, Flow
 from r2flow.generators.surroundings import FEATURES, ROW, STEEP, RowFeatures, Surroundings, encoded, steps_of
 from r2flow.lidar.encoding import ModelSpace
+from r2flow.processes import averaged
 from r2flow.registry import NonNegative
 from r2flow.samplers import Jump
 
@@ -227,8 +228,8 @@ class TransferFlow(Flow):
         """Losses over the hidden rays: negative log-likelihood of log r and of a return, mean |error| of reflectance.
 
         x_1, (B, C, H, W), are crops that do not span a full turn, t their times, (B,); `steps` are those of
-        `Surroundings.of`, `rows` the output of `RowFeatures`. In training each loss is the mean over the rays of the
-        batch (or of its part on a device), in eval mode the mean over the scans' own losses.
+        `Surroundings.of`, `rows` the output of `RowFeatures`. In training each loss is the mean over the rays of
+        the batch, on all devices, in eval mode the mean over the scans' own losses.
         """
         about = Surroundings.of(self.space, condition, ring=False, steps=steps)
         known = condition[KNOWN]
@@ -236,20 +237,17 @@ class TransferFlow(Flow):
         times = expand_time(t, x_1)
         answers = self.answers(t, torch.where(known > 0, x_1, (1 - times) * x_0 + times * x_1), about, rows)
         metres = self.space.decode(x_1)
-        returned, hidden = metres[:, :1] > 0, condition[KNOWN][:, :1] < 1
+        returned, hidden = metres[:, :1] > 0, known[:, :1] < 1
         log_r = torch.where(returned, metres[:, :1], 1.0).log()
         mask = (returned & hidden).float()
         dims = (0, 1, 2, 3) if self.training else (1, 2, 3)
 
         def mean(values: Tensor, weight: Tensor) -> Tensor:
-            return ((values * weight).sum(dims) / weight.sum(dims).clamp(min=1)).mean()
+            total = averaged(weight.sum(dims)) if self.training else weight.sum(dims)
+            return ((values * weight).sum(dims) / total.clamp(min=1)).mean()
 
-        losses = {
-            "range": -mean(answers.log_density(log_r), mask),
-            "return": mean(
-                F.binary_cross_entropy_with_logits(answers.returns, returned.float(), reduction="none"), hidden.float()
-            ),
-        }
+        surprise = F.binary_cross_entropy_with_logits(answers.returns, returned.float(), reduction="none")
+        losses = {"range": -mean(answers.log_density(log_r), mask), "return": mean(surprise, hidden.float())}
         if self.space.encoding.reflectance:
             errors = (answers.strengths - metres[:, 1:2]).abs()
             losses["reflectance"] = mean((answers.logits.detach().exp() * errors).sum(1, keepdim=True), mask)

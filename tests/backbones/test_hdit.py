@@ -60,18 +60,6 @@ def test_autocast_does_not_round_the_image_at_the_ends():
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"num_heads": (1,)}, "num_heads must be 2 integers of at least 1"),
-    ({"depths": (1, 0)}, "depths must be 2 integers of at least 1"),
-    ({"num_heads": (3, 2)}, "16 channels cannot be shared by 3 heads"),
-    *(({"detail": detail}, "detail must be 2 integers") for detail in ([2], [0, 8], [2, 8, 8])),
-    ({"attention": "tile"}, "no attention backend named 'tile'.*Did you mean 'tiles'"),
-])  # fmt: skip
-def test_options_that_cannot_work_say_why(options, message):
-    with pytest.raises(InputError, match=message):
-        untrained("hdit", **options)
-
-
 def test_levels_that_rotate_differently_are_refused():
     model = untrained("hdit")
     state = model.state_dict()

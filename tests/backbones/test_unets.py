@@ -1,4 +1,4 @@
-"""The two U-Nets against the published implementation."""
+"""The two U-Nets against the published implementation, and options that backbones refuse."""
 
 import pytest
 import torch
@@ -11,9 +11,8 @@ from tests.reference import load_case
 
 def test_resampling_is_the_references(shared):
     units = load_case(shared, "units_encodings.pt")
-    cases = [case for case in units["resample"] if "direction" not in case["kw"]]  # no model resamples one axis
-    for case in cases:
-        options = case["kw"]
+    cases = [(case["kw"], case) for case in units["resample"] if "direction" not in case["kw"]]  # of one axis: unused
+    for options, case in cases:
         resample = Resample(options.get("window", (1, 3, 3, 1)), "up" in options, options.get("ring", True))
         torch.testing.assert_close(resample.kernel, case["kernel"], rtol=0, atol=0)
         torch.testing.assert_close(resample(units["h"]), case["out"], rtol=0, atol=1e-5)
@@ -29,17 +28,22 @@ def test_resampling_keeps_a_constant_ring_constant(window):
 
 
 @pytest.mark.parametrize("name", ["adm_unet", "efficient_unet"])
-@pytest.mark.parametrize(("options", "message"), [
-    ({"base_channels": 2}, "base_channels must be .* of at least 4 that is even, found 2"),
-    ({"base_channels": 9}, "base_channels must be .* of at least 4 that is even, found 9"),
-    ({"base_channels": 12}, "12 channels cannot be shared by 8 groups: give a multiple of 8"),
-    ({"base_channels": 8, "num_heads": 3}, "cannot be shared by 3 attention heads"),
-    ({"num_heads": 0}, "num_heads must be a whole number of at least 1, found 0"),
-    ({"name": "local", "channels": 5}, "channels must be .* of at least 4 that is even, found 5"),
-    ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
-    ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
-    ({"position": "learnable"}, "no position named 'learnable'; known: fourier_features, none"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"base_channels": 2}, "base_channels must be .* of at least 4 that is even, found 2"),
+        ({"base_channels": 12}, "12 channels cannot be shared by 8 groups: give a multiple of 8"),
+        ({"base_channels": 8, "num_heads": 3}, "cannot be shared by 3 attention heads"),
+        ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
+        ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
+        ({"position": "learnable"}, "no position named 'learnable'; known: fourier_features, none"),
+        ({"name": "local", "channels": 5}, "channels must be .* of at least 4 that is even, found 5"),
+        ({"name": "hdit", "depths": (1, 0, 1, 1)}, "depths must be 4 integers of at least 1"),
+        ({"name": "hdit", "base_channels": 16, "num_heads": (3, 2, 2, 2)}, "16 channels cannot be shared by 3 heads"),
+        *(({"name": "hdit", "detail": detail}, "detail must be 2 integers") for detail in ([2], [0, 8], [2, 8, 8])),
+        ({"name": "hdit", "attention": "tile"}, "no attention backend named 'tile'.*Did you mean 'tiles'"),
+    ],
+)
 def test_options_that_cannot_work_say_why(name, options, message):
     with pytest.raises(InputError, match=message), torch.device("meta"):
         build_backbone({"name": name, **options}, torch.zeros(2, 16, 64), 2)

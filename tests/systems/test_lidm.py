@@ -403,17 +403,19 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
     assert not torch.equal(x, x.bfloat16().float())
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1, 2], [2, 2]]}}, "needs 1 strides"),
-    ({"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}}, "halves images 4"),
-    ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "position must be .* found 'polar'"),
-    ({"unet": {"wdith": 3}, "autoencoder": SMALL_AUTOENCODER}, "generator.unet has no option 'wdith'"),
-    ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers must be 1 integers"),
-    ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
-    ({"schedule": {"name": "cosine", "steps": 1}}, "steps must be a whole number of at least 2"),
-    ({"schedule": {"name": "square_root_linear", "last": 2.0}}, r"last must be a finite number in \(0, 1\)"),
-    ({"schedule": {"name": "sigmoid", "start": 3.0}}, "log-SNRs must lie within 80 of 0"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1, 2], [2, 2]]}}, "needs 1 strides"),
+        ({"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}}, "halves images 4"),
+        ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "position must be .* found 'polar'"),
+        ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers must be 1 integers"),
+        ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
+        ({"schedule": {"name": "cosine", "steps": 1}}, "steps must be a whole number of at least 2"),
+        ({"schedule": {"name": "square_root_linear", "last": 2.0}}, r"last must be a finite number in \(0, 1\)"),
+        ({"schedule": {"name": "sigmoid", "start": 3.0}}, "log-SNRs must lie within 80 of 0"),
+    ],
+)
 def test_sizes_that_cannot_work_are_one_line(change: dict[str, Any], said: str):
     with torch.device("meta"), pytest.raises(InputError, match=said):
         build_generator({**TINY, "generator": {"name": "latent_diffusion", **change}})

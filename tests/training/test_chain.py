@@ -237,7 +237,6 @@ def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_optio
         (["trainer.fast_dev_run=true"], "fast_dev_run leaves none"),
         (["stage.init=x"], "stage.init is each link's own"),
         (["+chain.fr2.trainer.max_steps=9"], "chain.fr2 needs init=LINK with a link before it, or an experiment"),
-        (["chain.rf1.seed=1"], "Add keys by +chain.LINK.KEY=VALUE"),
         # What only building finds out, in links that would run last.
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
