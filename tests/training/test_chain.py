@@ -236,7 +236,8 @@ def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_optio
     [
         (["trainer.fast_dev_run=true"], "fast_dev_run leaves none"),
         (["stage.init=x"], "stage.init is each link's own"),
-        (["+chain.fr2.trainer.max_steps=9"], "chain.fr2 needs init=LINK with a link before it, or an experiment"),
+        (["chain.rf2.init=rf9"], "chain.rf2 needs init=LINK of an earlier link, or an experiment; found init=rf9"),
+        (["+chain.fr2.trainer.max_steps=9"], "chain.fr2 needs init=LINK of an earlier link, or an experiment"),
         # What only building finds out, in links that would run last.
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
@@ -249,8 +250,7 @@ def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path: Path
 
 def test_a_link_that_lost_its_last_checkpoint_is_not_finished(chained: tuple[Path, str], tmp_path: Path):
     run = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "rf1"))
-    record = json.loads((run / "link.json").read_text())
-    link = Link("rf1", run, tuple(record[0]["overrides"]))
+    link = Link("rf1", run, tuple(json.loads((run / "link.json").read_text())[0]["overrides"]))
     assert is_finished(link)
     checkpoints_of(run)[0].unlink()
     assert not is_finished(link)
