@@ -223,7 +223,7 @@ def _plain(text: str) -> str:
 
 def explain(error: Exception) -> str:
     """Shorten an error of Hydra to one line, with the nearest existing key."""
-    text = str(error)
+    text = str(error) or str(error.__cause__)
     if unknown := re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text):
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)
