@@ -291,7 +291,7 @@ class Attention(nn.Module):
         qkv = self.qkv_proj(self.norm(x, condition)).unflatten(-1, (3, self.heads, -1))
         qk, v = at_least_float32(qkv[..., :2, :, :]), qkv[..., 2, :, :]  # s would amplify q's and k's rounding
         scale = at_least_float32(self.scale).clamp(max=LARGEST_LOG_SCALE).exp().sqrt()
-        qk = qk * (scale / torch.linalg.vector_norm(qk, dim=-1, keepdim=True).clamp(min=1e-6))
+        qk = qk * (scale * qk.square().sum(-1, keepdim=True).clamp(min=1e-12).rsqrt())  # q / max(|q|, 1e-6)
         return *rotate(qk, table).to(v.dtype).unbind(-3), v
 
 
