@@ -169,9 +169,10 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     """
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
     converted: list[str] = []
+    parser = OverridesParser.create()
     for text in map(_plain, overrides):
         try:
-            parsed = OverridesParser.create().parse_override(text)
+            parsed = parser.parse_override(text)
         except HydraException:
             raise InputError(
                 f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around =, "
@@ -243,8 +244,7 @@ def explain(error: Exception) -> str:
     if several := re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text):
         key, values = several.groups()
         return f"{key}={values} is several values: for a sweep add -m, for a list give {key}=[{values}]."
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return " ".join(lines if isinstance(error, yaml.YAMLError) else lines[:2])
+    return " ".join(re.split(r"\s*\n\s*", text.strip())[: None if isinstance(error, yaml.YAMLError) else 2])
 
 
 def known_keys(error: Exception) -> list[str]:
