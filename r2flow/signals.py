@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
@@ -69,15 +70,11 @@ def stop_at_once(number: int, frame: FrameType | None = None) -> None:
     """Handler without anything to save."""
     if multiprocessing.parent_process() is not None:  # a forked worker; its parent prints the message
         os._exit(code_of(number))
-    if _is_importing(frame):  # compiled modules swallow or replace exceptions
-        end_at_once(number)
-    raise Stopped(code_of(number))
-
-
-def _is_importing(frame: FrameType | None) -> bool:
     while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
         frame = frame.f_back
-    return frame is not None
+    if frame is not None:  # within an import, whose compiled modules swallow or replace exceptions
+        end_at_once(number)
+    raise Stopped(code_of(number))
 
 
 def end_at_once(number: int, frame: FrameType | None = None) -> None:
@@ -89,19 +86,13 @@ def end_at_once(number: int, frame: FrameType | None = None) -> None:
 @contextmanager
 def heard_from_the_first_import() -> Iterator[None]:
     """Answer stop signals by one line during a whole program, including slow imports and its exit."""
-    atexit.register(_end_in_peace)  # registered first, so that it is called last
+    atexit.register(partial(hear, signal.SIG_IGN))  # registered first, so that it is called last
     with listening(end_at_once):
         try:
             yield
         finally:
             atexit.unregister(hear)
             atexit.register(hear, end_at_once)  # registered last, so that it is called first
-
-
-def _end_in_peace() -> None:
-    """Ignore signals while the interpreter shuts down."""
-    for number in STOPPING:
-        signal.signal(number, signal.SIG_IGN)
 
 
 def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exit(1)) -> None:
