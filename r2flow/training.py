@@ -94,19 +94,12 @@ class TrainerRanges:
 
 @dataclass
 class Run:
-    """A run, ready to be fitted.
+    """A run, ready to be fitted."""
 
-    Attributes:
-        config: The complete config, including values from the parent and the data.
-        stage: The LightningModule, with initial weights.
-        data: The DataModule; no scans have been read yet.
-        trainer: Lightning's Trainer, with callbacks and loggers.
-    """
-
-    config: dict[str, Any]
-    stage: Stage
-    data: ScanDataModule
-    trainer: L.Trainer
+    config: dict[str, Any]  #: the complete config, including values from the parent and the data
+    stage: Stage  #: the LightningModule, with initial weights
+    data: ScanDataModule  #: the DataModule; no scans have been read yet
+    trainer: L.Trainer  #: Lightning's Trainer, with callbacks and loggers
 
     @property
     def folder(self) -> Path:
@@ -116,20 +109,13 @@ class Run:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a run.
+    """Result of a run."""
 
-    Attributes:
-        metrics: The last logged value of each metric, as `train/loss`.
-        checkpoint: The last checkpoint, or None.
-        step: Total number of optimiser steps.
-        finished: Whether `trainer.max_steps` was reached; `trainer.max_time` can stop a run earlier.
-    """
-
-    metrics: dict[str, float]
-    checkpoint: Path | None
+    metrics: dict[str, float]  #: the last logged value of each metric, as `train/loss`
+    checkpoint: Path | None  #: the last checkpoint, or None
     folder: Path
-    step: int
-    finished: bool
+    step: int  #: total number of optimiser steps
+    finished: bool  #: whether `trainer.max_steps` was reached; `trainer.max_time` can stop a run earlier
 
 
 def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:

@@ -28,22 +28,13 @@ class HasGenerator(Protocol):
 
 @dataclass(frozen=True)
 class Samples:
-    """Generated scans.
+    """Generated scans; tensors are on the CPU."""
 
-    Attributes:
-        images: Range in metres and reflectance, (B, 2 or 1, H, W), on the CPU; 0 for rays that were dropped or not
-            requested.
-        first: Number of the first scan.
-        evaluations: Network evaluations per scan, (B,), on the CPU.
-        converged: Whether the sampler converged, per scan, (B,) bool, on the CPU.
-        seconds: Generation time of the batch, without noise and decoding.
-    """
-
-    images: Tensor
-    first: int
-    evaluations: Tensor
-    converged: Tensor
-    seconds: float
+    images: Tensor  #: range in metres and reflectance, (B, 2 or 1, H, W); 0 for rays dropped or not requested
+    first: int  #: number of the first scan
+    evaluations: Tensor  #: network evaluations per scan, (B,)
+    converged: Tensor  #: whether the sampler converged, per scan, (B,) bool
+    seconds: float  #: generation time of the batch, without noise and decoding
 
 
 def sample(

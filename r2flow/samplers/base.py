@@ -27,17 +27,11 @@ Grid = str | list[float] | tuple[float, ...]
 
 @dataclass(frozen=True)
 class Generated:
-    """Scans in model space.
+    """Scans in model space."""
 
-    Attributes:
-        x: x_1, (B, C, H, W), on the generator's device, float32 or float64.
-        evaluations: Network evaluations of each scan, (B,) int64.
-        converged: Whether each scan is finite and, for an adaptive method, solved, (B,) bool.
-    """
-
-    x: Tensor
-    evaluations: Tensor
-    converged: Tensor
+    x: Tensor  #: x_1, (B, C, H, W), on the generator's device, float32 or float64
+    evaluations: Tensor  #: network evaluations of each scan, (B,) int64
+    converged: Tensor  #: whether each scan is finite and, for an adaptive method, solved, (B,) bool
 
     @classmethod
     def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:

@@ -18,47 +18,29 @@ V = TypeVar("V", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Solution:
-    """The state at t_1, its cost and its accuracy.
+    """The state at t_1, its cost and its accuracy."""
 
-    Attributes:
-        x: State at t_1, (B, ...), float32 (float64 if x_0 is); for a scene that has not converged, the last finite
-            state.
-        evaluations: Network evaluations per scene, (B,) int64, including those of the error estimate.
-        accepted: Steps taken per scene, (B,) int64.
-        rejected: Steps rejected per scene, (B,) int64; 0 for fixed steps.
-        stiff: Scenes whose steps were limited by stability, not by accuracy, (B,) bool; False if not detected.
-        converged: Scenes that reached t_1 with finite values, (B,) bool.
-        global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf without an estimate
-            for the scene; None if not requested.
-        knots: Inner states, (B, K, ...); None if not requested.
-    """
-
+    #: State at t_1, (B, ...), float32 (float64 if x_0 is); for a scene that has not converged, the last finite state.
     x: Tensor
-    evaluations: Tensor
-    accepted: Tensor
-    rejected: Tensor
-    stiff: Tensor
-    converged: Tensor
+    evaluations: Tensor  #: network evaluations per scene, (B,) int64, including those of the error estimate
+    accepted: Tensor  #: steps taken per scene, (B,) int64
+    rejected: Tensor  #: steps rejected per scene, (B,) int64; 0 for fixed steps
+    stiff: Tensor  #: scenes whose steps were limited by stability, not by accuracy, (B,) bool; False if not detected
+    converged: Tensor  #: scenes that reached t_1 with finite values, (B,) bool
+    #: Estimated root mean square error over a scene's elements, (B,) float64; inf without an estimate for the scene;
+    #: None if not requested.
     global_error: Tensor | None = None
-    knots: Tensor | None = None
+    knots: Tensor | None = None  #: inner states, (B, K, ...); None if not requested
 
 
 class Limits(NamedTuple):
-    """Options of a solver.
+    """Options of a solver."""
 
-    Attributes:
-        tolerance: Requested absolute and relative tolerance of a step's error.
-        max_evaluations: Budget per scene.
-        tighter: Divisor of the attainable tolerance.
-        max_step: Longest step as a share of the interval.
-        knots: Number of inner states to keep, in a fixed-step method.
-    """
-
-    tolerance: float
-    max_evaluations: int
-    tighter: float = 1.0
-    max_step: float = 1.0
-    knots: int = 0
+    tolerance: float  #: requested absolute and relative tolerance of a step's error
+    max_evaluations: int  #: budget per scene
+    tighter: float = 1.0  #: divisor of the attainable tolerance
+    max_step: float = 1.0  #: longest step as a share of the interval
+    knots: int = 0  #: number of inner states to keep, in a fixed-step method
 
 
 class Spent(Exception):
