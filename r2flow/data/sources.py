@@ -38,18 +38,12 @@ class ScanSource(ABC):
     """Numbered range images, (2 or 1, H, W) float32: range in metres and reflectance in [0, 1], 0 where missing.
 
     Subclasses must implement the four abstract methods; the others are optional.
-
-    Attributes:
-        slow: Whether reading an image is slow, so that images are kept in memory if they fit.
-        drawn: Whether a network draws the images on access: only in this process, and each image once if possible.
-        drives: Numbers of the scans of each recording, by its name, if known.
-        contents: Digest of what is cheaply known of the scans, equal for a copy of the data set.
     """
 
-    slow = False
-    drawn = False
-    drives: Mapping[str, Sequence[int]] = {}
-    contents = ""
+    slow = False  #: whether reading an image is slow, so that images are kept in memory if they fit
+    drawn = False  #: whether a network draws the images on access: only in this process, each image once if possible
+    drives: Mapping[str, Sequence[int]] = {}  #: numbers of the scans of each recording, by its name, if known
+    contents = ""  #: digest of what is cheaply known of the scans, equal for a copy of the data set
 
     @abstractmethod
     def __len__(self) -> int: ...

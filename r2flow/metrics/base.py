@@ -20,24 +20,15 @@ SIDES: tuple[Side, Side] = ("real", "generated")
 
 @dataclass(frozen=True)
 class Protocol:
-    """Everything a result depends on except the scans; different protocols have different names.
+    """Everything a result depends on except the scans; different protocols have different names."""
 
-    Attributes:
-        metric: Name in `r2flow.metrics.METRICS`.
-        representation: Data compared per scan: "range image", "points", "bird's-eye histogram".
-        mask: Range limits of returns, in metres.
-        extractor, weights, layer: Network name, first 12 digits of the SHA-256 of its weights, and feature layer;
-            None without a network.
-        settings: Other settings: bins, bandwidth, neighbours.
-    """
-
-    metric: str
-    representation: str
-    mask: tuple[float, float] = MASK
-    extractor: str | None = None
-    weights: str | None = None
-    layer: str | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    metric: str  #: name in `r2flow.metrics.METRICS`
+    representation: str  #: data compared per scan: "range image", "points", "bird's-eye histogram"
+    mask: tuple[float, float] = MASK  #: range limits of returns, in metres
+    extractor: str | None = None  #: name of the network; None without a network
+    weights: str | None = None  #: first 12 digits of the SHA-256 of its weights
+    layer: str | None = None  #: its feature layer
+    settings: Mapping[str, Any] = field(default_factory=dict)  #: other settings: bins, bandwidth, neighbours
 
 
 def blocks(rows: Tensor, size: int) -> Iterator[tuple[slice, Tensor]]:
@@ -56,16 +47,7 @@ class ScanMetric(Metric):
 
     A subclass computes a row of numbers per scan (`rows`), sums the rows (`accumulate`) or stores them (`keeping`), and
     computes `figures`. A row of NaN marks a scan without anything to compare: it is left out, counted and mentioned in
-    a remark.
-
-    Attributes:
-        name, representation, mask, settings: As in `Protocol`.
-        needs_reflectance, uses_reflectance: Whether scans without reflectance are refused; whether reflectance is
-            used if present.
-        keeping: Whether rows are stored in memory, float32.
-        fewest: Minimum number of scans per set for `distance`.
-        biased: Whether the first value, a distance that is 0 for equal sets, is larger for fewer scans; an evaluation
-            ranks the sets by it. None: not a distance, and without a verdict.
+    a remark. Its `name`, `representation`, `mask` and `settings` are as in `Protocol`.
 
     Args:
         sensor: Sensor of images passed to `update` as tensors.
@@ -79,10 +61,12 @@ class ScanMetric(Metric):
     representation: ClassVar[str]
     mask: ClassVar[tuple[float, float]] = MASK
     settings: ClassVar[Mapping[str, Any]] = {}
-    needs_reflectance: bool = False
-    uses_reflectance: ClassVar[bool] = False
-    keeping: ClassVar[bool] = False
-    fewest: ClassVar[int] = 2
+    needs_reflectance: bool = False  #: whether scans without reflectance are refused
+    uses_reflectance: ClassVar[bool] = False  #: whether reflectance is used if present
+    keeping: ClassVar[bool] = False  #: whether rows are stored in memory, float32
+    fewest: ClassVar[int] = 2  #: minimum number of scans per set for `distance`
+    #: Whether the first value, a distance that is 0 for equal sets, is larger for fewer scans; an evaluation ranks the
+    #: sets by it. None: not a distance, and without a verdict.
     biased: ClassVar[bool | None] = None
 
     def __init__(self, *, sensor: Sensor | str | None = None, name: str | None = None, **options: Any) -> None:

@@ -52,18 +52,12 @@ def last_of(states: Iterable[Tensor], progress: Call) -> Tensor:
 class Sampler(ABC):
     """How a generator is run. A subclass is a frozen dataclass in `SAMPLERS`; configs, checkpoints and the command line
     store its name and fields.
-
-    Attributes:
-        draws: Whether the sampler is stochastic: it draws noise after x_0.
-        paired: Whether x_1 depends on x_0 closely enough for a reflow pair (x_0, x_1).
-        completes: Whether a condition is required.
-        needs: Attribute that a generator must have.
     """
 
-    draws: ClassVar[bool] = False
-    paired: ClassVar[bool] = True
-    completes: ClassVar[bool] = False
-    needs: ClassVar[str] = "velocity"
+    draws: ClassVar[bool] = False  #: whether the sampler is stochastic: it draws noise after x_0
+    paired: ClassVar[bool] = True  #: whether x_1 depends on x_0 closely enough for a reflow pair (x_0, x_1)
+    completes: ClassVar[bool] = False  #: whether a condition is required
+    needs: ClassVar[str] = "velocity"  #: attribute that a generator must have
 
     @abstractmethod
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:

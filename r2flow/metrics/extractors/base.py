@@ -49,20 +49,13 @@ class Extractor(nn.Module, ABC):
     """A network that computes features of scans, for inference only.
 
     A subclass defines `features`, and `trained` unless its weights come from `r2flow weights --add`.
-
-    Attributes:
-        name: Name in `r2flow.metrics.extractors.EXTRACTORS`.
-        layer: Description of the features.
-        dim: Number of features, D.
-        needs_reflectance: Whether reflectance is an input.
-        weights: First 12 digits of the SHA-256 of its weights, set where they are loaded; "random" before.
     """
 
-    name: ClassVar[str]
-    layer: ClassVar[str]
-    dim: int
-    needs_reflectance: ClassVar[bool] = False
-    weights: str = "random"
+    name: ClassVar[str]  #: name in `r2flow.metrics.extractors.EXTRACTORS`
+    layer: ClassVar[str]  #: description of the features
+    dim: int  #: number of features, D
+    needs_reflectance: ClassVar[bool] = False  #: whether reflectance is an input
+    weights: str = "random"  #: first 12 digits of the SHA-256 of its weights, set where they are loaded
 
     @abstractmethod
     def features(self, scans: Scans) -> Tensor:

@@ -19,16 +19,12 @@ from r2flow.systems.gan.layers import LatentGenerator
 class Gan(Generator):
     """x = G(z) clamped to [-1, 1], with z of N(0, I).
 
-    The sampler is `Direct`.
-
-    Attributes:
-        network: G.
-        drops: Whether a ray-drop mask is sampled: logistic noise of `draws.step(shape, 1)`.
-        angle: Elevation and azimuth of every pixel, (1, 2, H, W), for networks that use them; training rotates
-            scans by random angles.
+    The sampler is `Direct`, and `network` is G.
     """
 
-    drops: ClassVar[bool] = True
+    drops: ClassVar[bool] = True  #: whether a ray-drop mask is sampled: logistic noise of `draws.step(shape, 1)`
+    #: Elevation and azimuth of every pixel, (1, 2, H, W), for networks that use them; training rotates scans by random
+    #: angles.
     angle: Tensor | None
 
     def __init__(self, space: ModelSpace, network: LatentGenerator) -> None:
