@@ -15,18 +15,14 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Key:
-    """Rule of a config key.
+    """Rule of a config key."""
 
-    Attributes:
-        resume: `free`: may differ when a run resumes, since it does not affect the result.
-        inherited: Whether a run with `stage.init` takes its parent's value: `always`, `unless_given` on the command
-            line, or `with_pairs`: always with pairs, which are images of the parent, else unless given.
-        links: Links of a chain that take the key from the chain's command line: `all`, those that read `scans` (others
-            inherit from them), those trained on `pairs`, or none, for keys of the `chain`.
-    """
-
-    resume: Literal["fixed", "free"] = "fixed"
+    resume: Literal["fixed", "free"] = "fixed"  #: `free`: may differ on resume, since it does not affect the result
+    #: Whether a run with `stage.init` takes its parent's value: `always`, `unless_given` on the command line, or
+    #: `with_pairs`: always with pairs, which are images of the parent, else unless given.
     inherited: Literal["no", "always", "unless_given", "with_pairs"] = "no"
+    #: Links of a chain that take the key from the chain's command line: `all`, those that read `scans` (others inherit
+    #: from them), those trained on `pairs`, or none, for keys of the `chain`.
     links: Literal["all", "scans", "pairs", "chain"] = "all"
 
 

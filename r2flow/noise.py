@@ -50,16 +50,11 @@ class Draws:
     """Standard normal noise of a batch of scans: a function of (seed, purpose, i, j) for scan i in step j.
 
     Noise is independent of the batch, and of skipped or reordered steps.
-
-    Attributes:
-        seed: Run seed, 0 <= seed < 2^64.
-        numbers: Number of each scan of the batch, (B,).
-        purpose: One of `PURPOSES`.
     """
 
-    seed: int
-    numbers: Sequence[int]
-    purpose: str = "evaluation"
+    seed: int  #: run seed, 0 <= seed < 2^64
+    numbers: Sequence[int]  #: number of each scan of the batch, (B,)
+    purpose: str = "evaluation"  #: one of `PURPOSES`
 
     def start(self, shape: tuple[int, ...]) -> Tensor:
         """x_0 of each scan, (B, *shape) float32 on the CPU: `standard_normal` of the scans' numbers."""

@@ -28,26 +28,20 @@ DARK = (
 
 @dataclass(frozen=True)
 class Reading:
-    """How scans become images of a sensor.
-
-    Attributes:
-        projection, convention: As in `r2flow.lidar.projection.project`.
-        reflectance_scale: The value in the files that means full reflectance; None estimates it from each file.
-        reflectance: Whether images have reflectance: True requires it of every scan; `auto`: see `lacks_reflectance`.
-        on_bad_scan: Treatment of unusable scans. `error` raises; `skip` takes the next usable scan; `empty` raises,
-            but returns an empty image for a scan without a return in the sensor's view.
-        within_limits: Whether ranges of a range image beyond the sensor's limits are dropped, as those of points are.
-        columns: As in `r2flow.lidar.scan_files.read_points`.
-    """
+    """How scans become images of a sensor."""
 
     sensor: Sensor
-    projection: Projection = "spherical"
-    convention: Convention = "centre"
-    reflectance_scale: float | None = 1.0
+    projection: Projection = "spherical"  #: as in `r2flow.lidar.projection.project`
+    convention: Convention = "centre"  #: likewise
+    reflectance_scale: float | None = 1.0  #: value in the files of full reflectance; None estimates it from each file
+    #: Whether images have reflectance: True requires it of every scan; `auto`: see `lacks_reflectance`.
     reflectance: bool | str = AUTO
+    #: Treatment of unusable scans. `error` raises; `skip` takes the next usable scan; `empty` raises, but returns an
+    #: empty image for a scan without a return in the sensor's view.
     on_bad_scan: str = "empty"
+    #: Whether ranges of a range image beyond the sensor's limits are dropped, as those of points are.
     within_limits: bool = False
-    columns: tuple[str, ...] | None = None
+    columns: tuple[str, ...] | None = None  #: as in `r2flow.lidar.scan_files.read_points`
 
     def described(self) -> dict[str, Any]:
         """All fields as plain values, for manifests."""

@@ -21,21 +21,14 @@ WORDS = {"measured": "as measured", "centre": "on rays through bin centres", "re
 
 @dataclass(frozen=True)
 class Rules:
-    """A protocol.
-
-    Attributes:
-        real, generated: A pixel's point: as measured, or on the ray through its bin's centre or corner ("reference").
-        convention: Default projection of point clouds to images; None: the model's.
-        choose: Sorted indices of at most n scans of a set.
-        chosen: Description of the choice.
-    """
+    """A protocol. A pixel's point is as measured, or on the ray through its bin's centre or corner ("reference")."""
 
     name: str
-    real: Literal["measured"] | Rays
-    generated: Rays
-    convention: Convention | None
-    choose: Callable[[ScanSet, int], Sequence[int]]
-    chosen: str
+    real: Literal["measured"] | Rays  #: a pixel's point in real scans
+    generated: Rays  #: a pixel's point in generated scans
+    convention: Convention | None  #: default projection of point clouds to images; None: the model's
+    choose: Callable[[ScanSet, int], Sequence[int]]  #: sorted indices of at most n scans of a set
+    chosen: str  #: description of the choice
 
     def check(self, real: ScanSet) -> None:
         """Refuse a real set without the measured coordinates that the protocol needs: a scan of each format."""

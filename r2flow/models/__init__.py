@@ -12,13 +12,9 @@ FOLDER = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Model:
-    """A trained generator with a name.
+    """A trained generator with a name."""
 
-    Attributes:
-        about: Generated scans and training data.
-    """
-
-    about: str
+    about: str  # generated scans and training data
     sha256: str
     licence: str = "MIT"
 
