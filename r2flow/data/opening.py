@@ -173,9 +173,6 @@ def find_drives(
     return SOURCES[name].find_drives(SourceOptions(name, str(root), split, None if drives is None else list(drives)))
 
 
-# How scans are read
-
-
 def reading_for(
     scans: Sequence[str | Path | None],
     model: Any = None,

@@ -71,9 +71,6 @@ class PreparedStore(Store):
         return self.source.subset(self.parts[shard]).contents[:16]
 
 
-# Making
-
-
 def plan_files(
     folder: str | Path,
     layout: str,
@@ -158,9 +155,6 @@ def prepare(
     left_out = sum(len(store.head(shard)["left_out"]) for shard in store.shards)
     check(left_out < len(store.names), f"all {left_out} scans were left out as unusable; remove {store.folder}.")
     return left_out
-
-
-# Reading
 
 
 def read_prepared(folder: Path) -> PreparedStore:
