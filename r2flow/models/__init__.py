@@ -26,7 +26,7 @@ MODELS: Registry[Model] = Registry(
         "9177ee104c65d06690c4f1719eed8bda524704e7d631c371689ef7e3cec0f9d1",
     ),
     densify=Model(
-        "scans of few beams or points completed to all, in one evaluation, learned from simulated scans",
+        "scans of few beams or points completed to all, learned from simulated scans",
         "3bf412e171f7e822f6411250b090af8a920d20b00c1a5f86f6d61eb62a213712",
     ),
 )

@@ -93,13 +93,16 @@ def test_the_answer_does_not_depend_on_what_is_hidden(flow, scans):
 
 
 def test_the_intensities_of_another_sensor_may_have_any_scale(flow, scans):
-    other = flow.at(flow.space.through(build_sensor("vlp16", 8, 32)))
+    other, runs = flow.at(flow.space.through(build_sensor("vlp16", 8, 32))), []
     bright = scans * torch.tensor([1.0, 0.4])[:, None, None]
     dim = scans * torch.tensor([1.0, 0.1])[:, None, None]
     state = measured(scans)
     one, quarter = (other.space.decode(answered(other, images, state).x) for images in (bright, dim))
     torch.testing.assert_close(quarter, one * torch.tensor([1.0, 0.25])[:, None, None], rtol=1e-4, atol=1e-5)
     assert one[:, 1].max() > 0.1
+    counted = other.backbone.register_forward_hook(lambda *_: runs.append(1))
+    assert answered(other, bright, state).evaluations.tolist() == [len(runs)] * len(scans)
+    counted.remove()
 
 
 def test_the_returns_of_another_sensor_are_those_of_higher_rows(flow, scans):
