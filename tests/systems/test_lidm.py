@@ -52,12 +52,11 @@ DIFFUSION = {**TINY, "generator": {"name": "latent_diffusion", "autoencoder": SM
 AUTOENCODER = {**TINY, "generator": {"name": "vq_autoencoder", "autoencoder": SMALL_AUTOENCODER}}
 
 
-def autoencoder_of(cfg: dict[str, Any], legacy: bool = True) -> Autoencoder:
+def autoencoder_of(cfg: dict[str, Any]) -> Autoencoder:
     inner = cfg["ddconfig"]
     return Autoencoder(
         inner["in_channels"], inner["ch"], inner["ch_mult"], inner["strides"], inner["num_res_blocks"],
-        inner["attn_levels"], inner["z_channels"], cfg["embed_dim"], cfg["n_embed"], legacy=legacy,
-        mask=cfg["use_mask"],
+        inner["attn_levels"], inner["z_channels"], cfg["embed_dim"], cfg["n_embed"], legacy=True, mask=cfg["use_mask"],
     )  # fmt: skip
 
 
@@ -244,7 +243,6 @@ def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
 
 @pytest.fixture
 def published(shared: Path, tmp_path: Path) -> tuple[Path, dict[str, Any]]:
-    """The published diffusion's file beside its config, as it is distributed."""
     io = load_case(shared, "lidm_published_io.pt")
     path = Path(shutil.copy(shared / "oracle_baselines" / "lidm_published.ckpt", tmp_path / "model.ckpt"))
     images = {"size": [16, 32], "fov": [3, -25], "depth_range": [1.0, 56.0], "depth_scale": 5.84, "log_scale": True}
@@ -268,13 +266,16 @@ def test_a_published_diffusion_gives_its_noise_and_images(published: tuple[Path,
         assert_near(generator.first_stage_model.decode(io["z"]), io["decoded"], 5e-5)
 
 
-def test_a_published_diffusion_without_its_config_has_the_published_size(shared: Path, caplog: Any):
-    loaded = load_checkpoint(shared / "oracle_baselines" / "lidm_published.ckpt")
+def test_a_published_diffusion_without_its_config_has_its_own_schedule(shared: Path, tmp_path: Path, caplog: Any):
+    content = load_case(shared, "lidm_published.ckpt")
+    betas = torch.linspace(0.0012345678**0.5, 0.0195**0.5, 1000, dtype=torch.float64) ** 2
+    torch.save({**content, "state_dict": {**content["state_dict"], "betas": betas.float()}}, tmp_path / "model.ckpt")
+    loaded = load_checkpoint(tmp_path / "model.ckpt")
+    assert_near(loaded.generator.log_snr, torch.logit((1 - betas).cumprod(0)), 2e-7)
     assert "64 x 1024" in caplog.text
     assert "heads of 32" in caplog.text
     assert loaded.generator.space.shape == (1, 64, 1024)
     assert loaded.config["generator"]["unet"]["head_channels"] == 32
-    assert loaded.config["generator"]["unet"]["multipliers"] == [1, 1]
     assert loaded.config["generator"]["schedule"]["last"] == 0.0195
 
 
@@ -320,7 +321,6 @@ def test_callback_states_keyed_by_their_class_are_read(shared: Path, tmp_path: P
             {"multipliers": (1, 2, 3), "blocks": 1, "attention": (2,), "width": 64},
         ),
     ],
-    ids=["published", "other"],
 )
 def test_options_are_read_off_the_names_and_shapes_of_weights(first: dict[str, Any], second: dict[str, Any]):
     with torch.device("meta"):
