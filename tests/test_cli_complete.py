@@ -346,7 +346,10 @@ def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_p
 
 def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path, caplog):
     xyz = sparse_scan(tmp_path / "room.ply")
-    r2flow.load(run).complete(np.column_stack([xyz, np.linspace(0, 0.05, len(xyz))]), sensor="vlp16")
+    cloud = np.column_stack([xyz, np.linspace(0, 0.05, len(xyz))])
+    same = cloud, cloud[::-1].astype(">f8")[::-1], torch.from_numpy(cloud).requires_grad_()
+    answers = torch.stack([r2flow.load(run).complete(points, sensor="vlp16") for points in same])
+    assert torch.equal(answers, answers[:1].expand_as(answers))
     assert "points in memory" in caplog.text
     for given, found in ((np.zeros(4), "(4,)"), (np.zeros((0, 2, 8, 64)), "(0, 2, 8, 64)"), (["a.bin"], "list")):
         with pytest.raises(InputError, match=rf"points \(N, 3 or 4\); found .*{re.escape(found)}"):

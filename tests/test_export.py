@@ -147,14 +147,11 @@ def test_points_and_notes_come_with_the_scan(tmp_path):
         scan, points = program.module()(Draws(0, [5]).start(checkpoint.generator.noise_shape))
     torch.testing.assert_close(points.norm(dim=1), scan[:, 0], rtol=1e-5, atol=1e-4)
     up = torch.asin((points[:, 2] / scan[:, 0])[scan[:, 0] > 0]).rad2deg()
-    assert up.min() > -25  # HDL-64E: 3 to -25 degrees
-    assert up.max() < 3
+    assert -25 < up.min() < up.max() < 3  # HDL-64E: 3 to -25 degrees
     notes = json.loads(found[NOTES])
     assert notes["r2flow"] == __version__
-    assert notes["sensor"]["name"] == "hdl64e"
-    assert notes["sensor"]["columns"] == 64
+    assert notes["sensor"].items() >= {"name": "hdl64e", "columns": 64}.items()
     assert notes["sampler"]["steps"] == 3
-    assert notes["evaluations"] == 3
 
 
 @pytest.mark.slow

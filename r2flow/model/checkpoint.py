@@ -107,10 +107,11 @@ class Checkpoint:
             shape = tuple(getattr(images, "shape", ()))
             right = (len(shape) == 4 and shape[0]) or (len(shape) == 2 and shape[1] in (3, 4))
             check(right, f"give a path, images (B, 2 or 1, H, W) or points (N, 3 or 4); found {shape or type(images)}.")
-            images = torch.as_tensor(images)
+            if not isinstance(images, Tensor):  # a message's points: read-only or big-endian, which torch does not take
+                images = torch.from_numpy(np.array(images, images.dtype.newbyteorder("=")))
         if isinstance(images, Tensor) and images.ndim == 2:
             with TemporaryDirectory(prefix="points in memory ") as folder:  # also named so in warnings
-                np.save(file := Path(folder, "points.npy"), images.cpu())
+                np.save(file := Path(folder, "points.npy"), images.detach().cpu())
                 try:
                     return self.complete(file, state, num, seed, sensor=sensor, **how)
                 except InputError as error:

@@ -49,7 +49,6 @@ def sampler_graph(
         "states": states.astype(np.float32),
         "numbers": np.arange(1 + count).reshape(-1, 1, 1, 1, 1),
         "evaluations": np.array(count),
-        "last": np.array(count),
         "true": np.array(True),
         "one": np.array(1),
         "flat": np.array([1 + count, -1]),
@@ -69,7 +68,7 @@ def sampler_graph(
         helper.make_node(
             "Loop", ["evaluations", "true", "known.0"], ["known.all"], body=_evaluation(network, second, known)
         ),
-        *_state("last", "known.all", "x_1"),
+        *_state("evaluations", "known.all", "x_1"),
         *decoded.graph.node,
     ]
     initializers = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
