@@ -41,7 +41,7 @@ sample '' -o out # an argument is empty
 sample run -o out --steps 10000000 # 1,000,000
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
-export run --to onx # no export format named 'onx'
+export run --to onx # no export format named 'onx'; known: onnx, pt2, safetensors.
 export run --to safetensors --what network # --what network is for
 export run --what network --steps 4 # takes no sampler: leave sampler, steps
 export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx

@@ -40,6 +40,7 @@ def export(
 
     name = checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name
     out = out or Path(f"{name}{'-network' * (what == 'network')}.{to}")
+    check(to in (*writing.FORMATS, "safetensors"), f"no export format named {to!r}; known: onnx, pt2, safetensors.")
     check(out.suffix == f".{to}" and not out.is_dir(), f"--to {to} writes a .{to}, found --out {out}.")
     check(not half or to == "safetensors", "--half is for --to safetensors.")
     check(what == "sampler" or to != "safetensors", "--what network is for --to onnx and --to pt2.")

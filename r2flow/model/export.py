@@ -204,8 +204,7 @@ def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any])
         any_batch = any_batch and any_too
         ends = to_onnx(decoded, ["x_1"], ["scan", "points"])
         network = sampler_graph(network, ends, how.times, how.second, how.states.numpy())
-    entry = network.metadata_props.add()
-    entry.key, entry.value = "r2flow", json.dumps(notes)
+    network.metadata_props.add(key="r2flow", value=json.dumps(notes))
     network.producer_name, network.producer_version = "r2flow", __version__
     return network.SerializeToString(), any_batch
 
