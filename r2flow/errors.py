@@ -14,6 +14,8 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 
+IN_MEMORY = "points in memory"  # the name of points without a file
+
 
 class InputError(ValueError):
     """Unusable input of the user.
@@ -64,11 +66,14 @@ _warned: set[tuple[Path, str]] = set()  # folders and kinds of odd values
 
 
 def warn_odd(path: Path, kind: str, points: int = 0) -> None:
-    """Warn about odd values of a file, once per folder and kind in a process."""
-    if (path.parent, kind) not in _warned:
-        _warned.add((path.parent, kind))
+    """Warn about odd values of a file, once per folder and kind in a process; points in memory count as a folder."""
+    folder, name = path.parent, path
+    if folder.name.startswith(IN_MEMORY):  # each scan has a new folder
+        folder = name = Path(IN_MEMORY)
+    if (folder, kind) not in _warned:
+        _warned.add((folder, kind))
         number = f" ({points:,} points; reported once per folder)" if points else ""
-        log.warning("%s: %s%s", path, kind, number)
+        log.warning("%s: %s%s", name, kind, number)
 
 
 def explain_mistake(error: InputError | OSError) -> str:

@@ -152,6 +152,7 @@ def test_points_and_notes_come_with_the_scan(tmp_path):
     assert notes["r2flow"] == __version__
     assert notes["sensor"].items() >= {"name": "hdl64e", "columns": 64}.items()
     assert notes["sampler"]["steps"] == 3
+    assert notes["times"] == {"t": [0, 1 / 3, 2 / 3], "s": None}
 
 
 @pytest.mark.slow

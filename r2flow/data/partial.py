@@ -19,7 +19,7 @@ from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, scale_o
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
-from r2flow.errors import InputError, check, naming
+from r2flow.errors import InputError, check, naming, warn_odd
 from r2flow.lidar.encoding import FAR, wrong_with
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
@@ -126,7 +126,7 @@ def _files(
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
         if not (scale or stored) and full != usual and (of_sensor or full not in SURE):
-            log.warning("%s: %s", spec, DIVIDED % full)
+            warn_odd(points[0], DIVIDED % full)
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from r2flow.config import check_tree, learned
 from r2flow.data.opening import own_reading, reading_for
 from r2flow.data.partial import PartialScan, open_partial
-from r2flow.errors import InputError, check, naming
+from r2flow.errors import IN_MEMORY, InputError, check, naming
 from r2flow.files import telling, write_file
 from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.hashing import state_hash
@@ -110,12 +110,12 @@ class Checkpoint:
             if not isinstance(images, Tensor):  # a message's points: read-only or big-endian, which torch does not take
                 images = torch.from_numpy(np.array(images, images.dtype.newbyteorder("=")))
         if isinstance(images, Tensor) and images.ndim == 2:
-            with TemporaryDirectory(prefix="points in memory ") as folder:  # also named so in warnings
+            with TemporaryDirectory(prefix=f"{IN_MEMORY} ") as folder:
                 np.save(file := Path(folder, "points.npy"), images.detach().cpu())
                 try:
                     return self.complete(file, state, num, seed, sensor=sensor, **how)
                 except InputError as error:
-                    raise InputError(str(error).replace(str(file), "points in memory")) from None
+                    raise InputError(str(error).replace(str(file), IN_MEMORY)) from None
         if isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")
             self, scans, remarks = self.open_partial([str(images)], sensor)

@@ -166,10 +166,12 @@ def export(
 
 def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[str, Any]:
     flow = checkpoint.generator
+    velocity = "mean velocity of x from t to s" if flow.second_time else "dx/dt at x and t"
     channels = ["range in metres", "reflectance of [0, 1]"][: 1 + flow.space.encoding.reflectance]
     scan = {
         "sampler": how.asdict(),
         "evaluations": steps and len(steps.times),
+        "times": steps and {"t": steps.times, "s": steps.second},
         "outputs": {
             "scan": f"(batch, {len(channels)}, H, W): {', '.join(channels)}; 0 without a return",
             "points": "(batch, 3, H, W): x ahead, y left, z up in metres; the origin without a return",
@@ -182,7 +184,7 @@ def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[
         "image": list(flow.space.shape),
         "sensor": flow.space.sensor.described(),
         "encoding": checkpoint.config["encoding"],
-        **(scan if steps else {"outputs": {"v": "dx/dt at x and t, in model space"}}),
+        **(scan if steps else {"outputs": {"v": f"{velocity}, in model space"}}),
     }
 
 
