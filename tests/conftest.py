@@ -15,6 +15,7 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
+from hydra._internal.hydra import Hydra
 from matplotlib.figure import Figure
 
 from r2flow import cli, errors
@@ -31,6 +32,7 @@ from r2flow.reports.pictures import save_figure
 from r2flow.stages import build_stage
 
 ROOT = Path(__file__).resolve().parent.parent
+Hydra.get_mode = lambda *_, **__: None  # it would compose each config twice, to read the null of hydra.mode
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # a worker for each core: more threads would wait for each other
     torch.set_num_threads(1)
