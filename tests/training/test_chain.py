@@ -14,16 +14,18 @@ from r2flow.reports.chain import report
 from r2flow.runs.chain import Link, is_finished, links_of
 from r2flow.runs.composing import compose
 from r2flow.training import build
-from tests.conftest import CONFIG, Done, write_checkpoint
+from tests.conftest import CONFIG, write_checkpoint
 from tests.training.conftest import TINY, hold_at, in_process, let_go, run_train, start, tiny, wait_for
 
 HELD = Path("held")  # in the folder that a chain is started from
 CHAIN = ["experiment=demo", "preview=null", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8",
-         "data.pairs.batch_size=4", *hold_at(5, HELD)]  # fmt: skip
+         "data.pairs.batch_size=4", "trainer.max_steps=8", "samples.num=0", *hold_at(5, HELD)]  # fmt: skip
 LINKS = ("rf1", "rf2", "td2")
 
 
 def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    model = write_checkpoint(tmp_path / "street.ckpt", CONFIG)
+    monkeypatch.setattr("r2flow.models.find_model", {"street": model}.__getitem__)
     picture = tmp_path / "runs" / "demo" / "preview" / "samples.png"
     drawn: list[int] = []
     monkeypatch.setattr("r2flow.runs.chain.run_process", lambda _: drawn.append(picture.stat().st_mtime_ns) or 2)
@@ -36,10 +38,6 @@ def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatc
 def of_a_child(*overrides: str) -> list[str]:
     """The tiny run's overrides without what a child takes from its parent."""
     return [one for one in TINY if not one.startswith(("data=", "sensor", "backbone", "data.root"))] + list(overrides)
-
-
-def train_child(cwd: Path, *overrides: str, check: bool = True) -> Done:
-    return in_process(cwd, of_a_child(*overrides), check)
 
 
 @pytest.fixture(scope="session")
@@ -86,11 +84,10 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
     assert (second.config["data"]["pairs"]["first"], third.config["data"]["pairs"]["first"]) == (0, 8)
 
 
-@pytest.mark.parametrize("name", ["demo", "it's"])
-def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path, name: str):
-    run = Path(shutil.copytree(chained[0], tmp_path / "runs" / name))
+def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):
+    run = Path(shutil.copytree(chained[0], tmp_path / "runs" / "it's"))
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")}
-    done = run_train(tmp_path, scans, *CHAIN, f'name="{name}"')
+    done = run_train(tmp_path, scans, *CHAIN, 'name="it\'s"')
     assert done.stdout.count(": finished before") == 4  # the report too
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")} == before
 
@@ -124,8 +121,8 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(cha
     ],
 )
 def test_a_child_that_cannot_be_is_refused_in_one_line(chained, tmp_path, overrides, message):
-    done = train_child(tmp_path, *(one.replace("RF1", str(chained[0] / "rf1")) for one in overrides), check=False)
-    assert message in done.refusal
+    options = of_a_child(*(one.replace("RF1", str(chained[0] / "rf1")) for one in overrides))
+    assert message in in_process(tmp_path, options, check=False).refusal
     assert list(tmp_path.iterdir()) == []
 
 
@@ -134,10 +131,10 @@ def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple
     shutil.rmtree(parent / "pairs")
     last, before = checkpoints_of(parent)
     last.unlink()
-    overrides = ["experiment=reflow", "data.pairs.num=4", "data.pairs.batch_size=4", "trainer.max_steps=2"]
-    done = train_child(tmp_path, *overrides, f"stage.init={parent}", check=False)
-    assert "has stopped at step 10 of 12: finish it, or name the checkpoint" in done.refusal
-    train_child(tmp_path, *overrides, f"stage.init={before}")
+    options = ["experiment=reflow", "data.pairs.num=4", "data.pairs.batch_size=4", "trainer.max_steps=2"]
+    done = in_process(tmp_path, of_a_child(*options, f"stage.init={parent}"), check=False)
+    assert "has stopped at step 6 of 8: finish it, or name the checkpoint" in done.refusal
+    in_process(tmp_path, of_a_child(*options, f"stage.init={before}"))
     assert (parent / "pairs" / "manifest.json").is_file()
 
 
