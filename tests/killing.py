@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 import torch
 
+from r2flow.errors import InputError
+
 # The n-th rename, and whether the process dies before it or after it.
 MOMENTS = [(1, True), (1, False), (2, True), (1, False), (1, True), (2, True), (1, False), (2, False)]
 
@@ -56,3 +58,22 @@ def is_gone(group: int) -> bool:
     except ProcessLookupError:
         return True
     return False
+
+
+def be_killed(item: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuse(item: int) -> None:
+    raise InputError("a worker refuses it")
+
+
+def fail(item: int) -> None:
+    error = ValueError("of the work")
+    error.of = lambda: item  # type: ignore[attr-defined]  which cannot be pickled
+    raise error
+
+
+class Unreadable:
+    def __reduce__(self):
+        return refuse, (0,)  # when it is unpickled

@@ -1,7 +1,6 @@
 """Ctrl-C and SIGTERM at moments when nothing of a run is under way yet: one line and the signal's exit code."""
 
 import logging
-import os
 import signal
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from r2flow.errors import InputError
 from r2flow.signals import STOPPING, Stopped, listening, out_of_reach, outlive_the_signal, stop_at_once
 from r2flow.store import Store
 from tests.conftest import ROOT
-from tests.killing import is_gone, wait_until
+from tests.killing import Unreadable, be_killed, fail, is_gone, refuse, wait_until
 from tests.training.conftest import start
 
 # Sends this process a signal when it begins to import a module, then does what a command does.
@@ -123,25 +122,6 @@ def test_told_to_stop_when_workers_start(tmp_path: Path, number: int):
     process = start(tmp_path, ["script.py"], [sys.executable])
     assert process.communicate(timeout=60)[0] == ""
     assert process.returncode == 128 + number
-
-
-def be_killed(item: int) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def refuse(item: int) -> None:
-    raise InputError("a worker refuses it")
-
-
-def fail(item: int) -> None:
-    error = ValueError("of the work")
-    error.of = lambda: item  # type: ignore[attr-defined]  which cannot be pickled
-    raise error
-
-
-class Unreadable:
-    def __reduce__(self):
-        return refuse, (0,)  # when it is unpickled
 
 
 @pytest.mark.parametrize(

@@ -212,5 +212,4 @@ def test_a_misspelt_config_is_answered_without_loading_torch(tmp_path: Path):
     script = f"for one in {mistakes}: print(main([one], []), 'torch' in sys.modules)"
     command = [sys.executable, "-c", f"import sys; from r2flow.runs.launch import main\n{script}"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
-    assert done.stdout == 4 * "2 False\n", done.stderr
-    assert len(done.stderr.splitlines()) == 4
+    assert (done.stdout, len(done.stderr.splitlines())) == (4 * "2 False\n", 4), done.stderr
