@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from traceback import walk_tb
 from typing import Annotated, Any, TypeVar
 
 import hydra
@@ -29,7 +30,7 @@ from r2flow.registry import Bound, Seed, did_you_mean, options_of
 T = TypeVar("T")
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-WRONG = (HydraException, OmegaConfBaseException, yaml.YAMLError)  # raised for a wrong config
+WRONG = (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError)  # raised for a wrong config
 
 # Hydra groups: the registry of each, and the options that the run sets instead of the config.
 REGISTRIES = {
@@ -225,6 +226,9 @@ def _plain(text: str) -> str:
 def explain(error: Exception) -> str:
     """Shorten an error of Hydra to one line, with the nearest existing key."""
     text = str(error) or str(error.__cause__)
+    if isinstance(error, UnicodeDecodeError):  # of a reader that does not name the file
+        local = {name: value for frame, _ in walk_tb(error.__traceback__) for name, value in frame.f_locals.items()}
+        return f"{local['full_path']} is not UTF-8 ({error.reason}): save it in UTF-8."
     if unknown := re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text):
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)
