@@ -143,14 +143,14 @@ name=x data=folder data.root=scans data.reading.projection=flat
 name=x data=folder data.root=scans data.validation.data=3
 name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
 --plugin
-name=x 'chain={a: {init: b}}'
 name=x 'chain={a/b: {seed: 3}}'
+name=x 'chain={a: {init: b}}'
 name=x experiment=demo chain.rf1=null
 name=a/../../b
 name=x 'data={' # data={ cannot be read
 name=x seed=${seed} # interpolation
 name=x --config-dir nowhere
--m seed=1,2 hydra/launcher=nope
+-m seed=1,2 hydra/job_logging=nope # known: default, disabled
 -m seed=1,2 --cfg job # one of
 name=x hydra.run.dir=file.txt
 name=x data@foo=kitti_raw

@@ -153,8 +153,8 @@ def with_choices(compose: Callable[[], T]) -> T:
 def choices(group: str) -> list[str]:
     if GlobalHydra.instance().is_initialized():  # knows `--config-dir`, too
         return [name for name in GlobalHydra.instance().config_loader().get_group_options(group) if name != "base"]
-    files = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
-    return sorted(files | {name.removesuffix(".yaml") for name in ConfigStore.instance()._open(group) or ()})
+    with _hydra():
+        return choices(group)
 
 
 OmegaConf.register_new_resolver("choices", lambda group: ", ".join(choices(group)), replace=True)  # for --help
@@ -233,7 +233,7 @@ def explain(error: Exception) -> str:
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)
         others = [other for other in known_keys(error) if not key.startswith(f"{other}.")]  # without the key's group
-        more = "Add keys by +chain.LINK.KEY=VALUE" if key.startswith("chain.") else "See --cfg job for all of them"
+        more = "Add keys by +chain.LINK.KEY=VALUE" if "override 'chain." in text else "See --cfg job for all of them"
         return f"the config has no key '{key}'.{did_you_mean(key, others)} {more}."
     if missing := re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL):
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."
