@@ -144,7 +144,7 @@ name=x data=folder data.root=scans data.validation.data=3
 name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
 --plugin
 name=x 'chain={a/b: {seed: 3}}'
-name=x 'chain={a: {init: b}}'
+name=x 'chain={1: {seed: 3}}' # ('1', not 1)
 name=x experiment=demo chain.rf1=null
 name=a/../../b
 name=x 'data={' # data={ cannot be read

@@ -42,10 +42,10 @@ def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], confi
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
     links: list[Link] = []
     for name, difference in chain.items():
-        if not isinstance(difference, Mapping) or not re.fullmatch(r"[\w-][\w.-]*", str(name)):
-            raise InputError(f"chain.{name}: a link has a folder's name and groups of keys; found {difference!r}.")
+        if not (isinstance(difference, Mapping) and isinstance(name, str) and re.fullmatch(r"[\w-][\w.-]*", name)):
+            raise InputError(f"chain.{name}: a link is a name ('1', not 1) and groups of keys; found {difference!r}.")
         settings = dict(difference)
-        parent = settings.pop("init", None)
+        parent = None if (init := settings.pop("init", None)) is None else str(init)  # a name may be a number
         own = [
             override("stage" if key == "stage.name" else key, value)  # a choice, with its own options
             for key, value in flatten(settings)
