@@ -10,7 +10,7 @@ import torch
 
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
-from r2flow.runs.folder import RESUMED, contradictions, open_run, read_config, run_lock
+from r2flow.runs.folder import RESUMED, check_run, contradictions, open_run, read_config, run_lock
 
 CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10}}
 
@@ -36,6 +36,8 @@ def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     with pytest.raises(InputError, match=r"data.batch_size=4 there, 8 here.*name=OTHER"):
         open_run(tmp_path, changed(data={"batch_size": 8}))
     assert read_config(tmp_path) == changed(trainer={"devices": 4})  # what runs now, and not what was refused
+    with pytest.raises(InputError, match=r"max_steps=10 there, 9 here\. Give the same command to resume it, or name="):
+        check_run(tmp_path, changed(trainer={"max_steps": 9}))  # of a link, which has a stage.init of its own
 
 
 def test_a_finished_run_keeps_its_sampler(tmp_path: Path):

@@ -83,13 +83,13 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     if old is None or not checkpoints_of(run):
         return
     later = ("scans.", "parent.", "encoding.reflectance.", "encoding.levels.", "data.pairs.parent.")
-    compared = ({k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config))
-    _refuse_another_config(run, *compared)
+    there, here = ({k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config))
+    _refuse_another_config(run, there, here, alone=False)
 
 
-def _refuse_another_config(run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
+def _refuse_another_config(run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any], alone: bool = True) -> None:
     if differing := contradictions(old, new):
-        length = all(text.startswith("trainer.max_steps=") for text in differing)
+        length = alone and all(text.startswith("trainer.max_steps=") for text in differing)
         last = next((path for path, _ in _readable(run)), run)  # not the folder: the run may not be finished
         more_steps = f", stage.init={last} name=OTHER to learn on from its weights" if length else ""
         raise InputError(

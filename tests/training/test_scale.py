@@ -71,8 +71,7 @@ def two(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_two_processes_have_the_losses_of_one(one: Path, two: Path):
     alone, together = losses(one / "record"), losses(two / "record")
     assert list(alone) == list(together) == list(range(1, STEPS + 1))
-    worst = max(abs(alone[step] - together[step]) for step in alone)
-    assert worst < 1e-5
+    assert max(abs(alone[step] - together[step]) for step in alone) < 1e-5
     # Both learn: otherwise equal losses would say little.
     assert np.mean([alone[s] for s in range(16, 21)]) < np.mean([alone[s] for s in range(1, 6)])
 
