@@ -64,6 +64,7 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
 
 
 IN_RUNS = Bound("that names a folder in runs", lambda text: text.strip("./") and ".." not in Path(text).parts)
+NAMED = Bound("with a name", lambda group: "name" in group)  # a user's file may lack it
 GLOBAL = Bound("of files that begin with # @package _global_", lambda name: True)  # else their keys lie in experiment
 
 
@@ -71,11 +72,11 @@ GLOBAL = Bound("of files that begin with # @package _global_", lambda name: True
 class Keys:
     """Top-level keys of a run's config."""
 
-    stage: Mapping[str, Any]
+    stage: Annotated[Mapping[str, Any], NAMED]
     backbone: Mapping[str, Any]
     sensor: Mapping[str, Any]
     encoding: Mapping[str, Any]
-    data: Mapping[str, Any]
+    data: Annotated[Mapping[str, Any], NAMED]
     trainer: Mapping[str, Any]
     callbacks: Mapping[str, Any]
     samples: Mapping[str, Any]
@@ -108,7 +109,7 @@ def _hydra() -> Iterator[None]:
 
 def plain(config: DictConfig) -> dict[str, Any]:
     """Convert a composed config to plain dicts, resolved and without Hydra's own keys."""
-    settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    settings = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])  # type: ignore[misc]
     settings._set_parent(config._get_parent())
     resolved: Any = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
     return {str(key): value for key, value in resolved.items()}

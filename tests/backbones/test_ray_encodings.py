@@ -42,8 +42,7 @@ def test_rotation_keeps_lengths_and_depends_on_angle_differences_only():
     rotary = Rotary(2, 8, (4, 8))
     q, k = torch.randn(2, 2, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     e, a = [0.1, 0.3, 0.1 + 0.4, 0.3 + 0.4], [1.0, 2.0, 1.0 - 0.7, 2.0 - 0.7]
-    rays = torch.tensor([[[e], [a]]], dtype=torch.float64)
-    table = rotary.table(rays)[:, 0, :, 0]
+    table = rotary.table(torch.tensor([[[e], [a]]], dtype=torch.float64))[:, 0, :, 0]
     turned = [rotate(x, table[:, place]) for x, place in ((q, 0), (k, 1), (q, 2), (k, 3))]
     torch.testing.assert_close(turned[0].norm(dim=-1), q.norm(dim=-1))
     here, there = (turned[0] * turned[1]).sum(-1), (turned[2] * turned[3]).sum(-1)

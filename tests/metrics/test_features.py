@@ -109,8 +109,7 @@ def test_halves_are_blocks_so_that_neighbours_do_not_help():
 def test_the_area_is_a_count_of_pairs_and_its_variance_that_of_the_scores():
     value, _ = area(torch.tensor([0.1, 0.4, 0.4]).double(), torch.tensor([0.4, 0.9]).double())
     assert value == pytest.approx((1 + 0.5 + 0.5 + 3) / 6)
-    draw = torch.Generator().manual_seed(7)
-    scores = torch.randn(2000, 70, generator=draw).double()
+    scores = torch.randn(2000, 70, generator=torch.Generator().manual_seed(7)).double()
     areas, variances = zip(*(area(x[:40], x[40:] + 1) for x in scores), strict=True)
     assert np.mean(areas) == pytest.approx((1 + math.erf(1 / 2)) / 2, abs=0.005)
     assert np.mean(variances) == pytest.approx(np.var(areas), rel=0.1)  # the variance of 2,000 has 3 % of error

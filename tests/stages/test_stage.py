@@ -42,8 +42,7 @@ class Automatic(Stage):
 
     def on_train_batch_end(self, outputs, batch, batch_idx) -> None:
         schedules = self.lr_schedulers()
-        first = schedules[0] if isinstance(schedules, list) else schedules
-        self.rates.append(first.get_last_lr()[0])
+        self.rates.append((schedules[0] if isinstance(schedules, list) else schedules).get_last_lr()[0])
 
 
 class Manual(Automatic):

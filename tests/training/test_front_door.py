@@ -113,9 +113,13 @@ def test_a_folder_of_configs_may_have_any_name(tmp_path: Path):
     write_file(tmp_path / "é, [1]" / "experiment" / "mine.yaml", "# @package _global_\nseed: 9")
     assert compose(["experiment=mine"], [tmp_path / "é, [1]"])["seed"] == 9
     damaged = (b"a: \xfc", "/experiment/mine.yaml is not UTF-8"), ("seed: 9\nseed: 8", 'mine.yaml", line 2')
-    for text, said in *damaged, ("seed: 9", "# @package _global_"), ("a: ${", "'${'"):
+    number = ("# @package _global_\n1: 2", "no option '1'")
+    for text, said in *damaged, number, ("seed: 9", "# @package _global_"), ("a: ${", "'${'"):
         write_file(tmp_path / "é, [1]" / "experiment" / "mine.yaml", text)
         assert said in in_process(tmp_path, ["--config-dir", "é, [1]", "experiment=mine"], check=False).refusal
+    write_file(tmp_path / "é, [1]" / "data" / "mine.yaml", "root: scans")
+    refusal = in_process(tmp_path, ["--config-dir", "é, [1]", "data=mine"], check=False).refusal
+    assert "data must be a group of keys with a name, found {'root': 'scans'}" in refusal
 
 
 def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
