@@ -236,8 +236,7 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
     expected = run(tmp_path / "one.json")
     shared = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks))
     assert run(tmp_path / "many.json", *shared) == pytest.approx(expected, rel=1e-10)
-    again = run(tmp_path / "many.json", *shared)  # from the cache
-    assert again == pytest.approx(expected, rel=1e-10)
+    assert run(tmp_path / "many.json", *shared) == pytest.approx(expected, rel=1e-10)  # from the cache
 
 
 def test_a_judged_set_may_have_the_name_of_a_baseline(r2flow, real, generated, tmp_path):

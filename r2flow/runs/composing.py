@@ -258,4 +258,4 @@ def known_keys(error: Exception) -> list[str]:
     with _hydra():
         keys: Any = OmegaConf.to_container(hydra.compose("train") if node is None else node._get_root(), resolve=False)
     leaves = (key.split(".") for key, _ in flatten(keys))
-    return list(dict.fromkeys(".".join(leaf[: n + 1]) for leaf in leaves for n in range(len(leaf))))
+    return [*dict.fromkeys(".".join(leaf[: n + 1]) for leaf in leaves for n in range(len(leaf))), "experiment", "size"]

@@ -72,6 +72,7 @@ REFUSED = {
     # What a name, a size or a number does not fit; several words apart.
     "bakcbone.base_channels=8": "no key 'bakcbone.base_channels' | Did you mean 'backbone.base_channels'?",
     "backbone=hditt": "no backbone config named 'hditt' | Did you mean 'hdit'?",
+    "expriment=r2dm": "no key 'expriment' | Did you mean 'experiment'?",
     "hydra/sweeper=optuna": "no hydra/sweeper config named 'optuna'; known: basic. Others are plug-ins of Hydra",
     "sensor=mine": "no sensor config named 'mine' | sensor=FILE.yaml",
     "+backbone.widht=8": "no option 'widht'",
