@@ -319,7 +319,8 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
         if run.trainer.world_size > 1 and stopping.told is None and re.search(PEER_LOST, str(error)):
             if any(map(_failed, getattr(run.trainer.strategy.launcher, "procs", ()))):
                 raise InputError("a process of this run on another device ended with an error.") from error
-            raise Stopped(LATER, "a process of this run on another device ended; the same command resumes.") from error
+            again = "resumes" if checkpoints_of(run.folder) else "starts it again: no checkpoint yet"
+            raise Stopped(LATER, f"a process of this run on another device ended; the same command {again}.") from error
         raise
     return run.trainer.global_step
 
