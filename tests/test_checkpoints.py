@@ -110,7 +110,6 @@ def test_missing_files_and_other_torch_files(tmp_path: Path):
         *({"global_step": value} for value in ("abc", None, math.inf, math.nan)),
         *({"sampler": value} for value in ([1], "x", {"steps": {}})),
     ],
-    ids=str,
 )
 def test_entries_of_another_kind_are_refused_in_one_line(saved, changed: dict):
     """As {config, state_dict} of another program has them."""

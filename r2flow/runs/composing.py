@@ -229,7 +229,7 @@ def explain(error: Exception) -> str:
     text = str(error) or str(error.__cause__)
     if isinstance(error, UnicodeDecodeError):  # of a reader that does not name the file
         local = {name: value for frame, _ in walk_tb(error.__traceback__) for name, value in frame.f_locals.items()}
-        return f"{local['full_path']} is not UTF-8 ({error.reason}): save it in UTF-8."
+        return f"{local.get('full_path', 'a config file')} is not UTF-8 ({error.reason}): save it in UTF-8."
     if unknown := re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text):
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # the key inside a group's value
         key = max(unknown[1], within[1] if within else "", key=len)

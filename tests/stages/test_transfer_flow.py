@@ -94,8 +94,7 @@ def test_the_answer_does_not_depend_on_what_is_hidden(flow, scans):
 
 def test_the_intensities_of_another_sensor_may_have_any_scale(flow, scans):
     other, runs = flow.at(flow.space.through(build_sensor("vlp16", 8, 32))), []
-    bright = scans * torch.tensor([1.0, 0.4])[:, None, None]
-    dim = scans * torch.tensor([1.0, 0.1])[:, None, None]
+    bright, dim = (scans * torch.tensor([1.0, share])[:, None, None] for share in (0.4, 0.1))
     state = measured(scans)
     one, quarter = (other.space.decode(answered(other, images, state).x) for images in (bright, dim))
     torch.testing.assert_close(quarter, one * torch.tensor([1.0, 0.25])[:, None, None], rtol=1e-4, atol=1e-5)
