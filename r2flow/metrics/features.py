@@ -215,7 +215,7 @@ class TwoSample(FeatureMetric):
 
     Each contiguous half of both sets is scored by the classifier trained on the other half, so that neighbouring scans
     of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always distinguished. `_low` and `_high` are a
-    95 % interval for other scans judged by these two classifiers, not for classifiers trained on other scans.
+    95 % interval for other scans judged by these two classifiers; errors of both halves, which are alike, are added.
     """
 
     kind = "auc"
@@ -234,7 +234,7 @@ class TwoSample(FeatureMetric):
             (learn_real, judge_real), (learn_made, judge_made) = (both[::turn] for both in halves)
             score = _classifier(learn_real, learn_made)
             judged.append(area(score(judge_real), score(judge_made)))
-        value, error = sum(a for a, _ in judged) / 2, math.sqrt(sum(v for _, v in judged)) / 2
+        value, error = (sum(parts) / 2 for parts in ((a for a, _ in judged), (math.sqrt(v) for _, v in judged)))
         ends = value, max(value - 1.96 * error, 0.0), min(value + 1.96 * error, 1.0)
         return dict(zip(names, ends, strict=True)), []
 

@@ -115,13 +115,8 @@ def test_the_area_is_a_count_of_pairs_and_its_variance_that_of_the_scores():
     assert np.mean(variances) == pytest.approx(np.var(areas), rel=0.1)  # the variance of 2,000 has 3 % of error
 
 
-def test_the_interval_is_of_both_halves():
-    draw = torch.Generator().manual_seed(8)
-    low, high = [], []
-    for _ in range(40):  # few features, learned from many scans: the classifiers are as good as the best
-        x, y = torch.randn(400, 1, generator=draw), torch.randn(400, 1, generator=draw) + 1
-        found = given(METRICS["auc"](), x, y)
-        low, high = [*low, found["auc_low"]], [*high, found["auc_high"]]
-    expected, sigma = (1 + math.erf(1 / 2)) / 2, (np.mean(high) - np.mean(low)) / (2 * 1.96)
-    assert np.mean(low) < expected < np.mean(high)
-    assert sigma == pytest.approx(np.std(np.add(low, high) / 2), rel=0.35)  # of 40 sets: 11 % of error
+def test_the_interval_of_equal_sets_covers_one_half():
+    sets = torch.randn(300, 2, 40, 60, generator=torch.Generator().manual_seed(8))
+    found = [given(METRICS["auc"](), *pair) for pair in sets]
+    covered = np.mean([one["auc_low"] <= 0.5 <= one["auc_high"] for one in found])
+    assert 0.92 < covered < 0.99  # of 300 intervals, 1.3 % of error; 0.86 if the halves' errors were independent
