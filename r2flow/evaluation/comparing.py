@@ -10,6 +10,7 @@ from typing import Literal
 
 from r2flow.data.sets import ScanSet
 from r2flow.errors import check
+from r2flow.evaluation import measuring
 from r2flow.evaluation.measuring import Cache, MetricResult, Statistics, Work, gather_real, measure, speed_result
 from r2flow.evaluation.protocols import Rules
 from r2flow.evaluation.sets import baseline_sets, reference_sets
@@ -88,7 +89,7 @@ class Comparer:
         path = results = None
         if self.folder is not None and other.source.drawn:
             recipe = {
-                "real": real.identity or [real.label, len(real)], "sampled": other.about,
+                "real": real.identity or [real.label, len(real)], "sampled": other.about, "format": measuring.FORMAT,
                 "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
                 "protocol": self.rules.name, "plugins": plugin_digests(), "device": self.device,
             }  # fmt: skip

@@ -26,7 +26,7 @@ from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)
 
-FORMAT = 8  # increment if statistics change for the same scans and protocol
+FORMAT = 9  # increment if statistics or figures change for the same scans and protocol
 # Metrics of single-scan histograms use this many real scans, by a fixed shuffle; metrics of features use all.
 REAL_SCANS = 10_000
 
