@@ -103,7 +103,7 @@ def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Cur
         "steps": step,
         "images": None if step is None else step * int(data["batch_size"]),
         "train_loss": fmean(train[-max(len(train) // 10, 1) :]) if train else None,
-        "val_best": min(validation, default=None),
+        "val_best": min(validation, key=lambda loss: (math.isnan(loss), loss), default=None),
         "val_last": validation[-1] if validation else None,
         "bend": bend[-1] if bend else None,
     }

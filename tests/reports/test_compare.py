@@ -90,7 +90,7 @@ def test_networks_of_other_generators_are_counted_apart(tmp_path, order):
 def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
     for seed, value in enumerate([0.2, 0.4, 0.9]):
         make_run(tmp_path / f"net-seed={seed}", {"seed": seed}, val=[value], checkpoint=40)
-    make_run(tmp_path / "other-seed=0", {"stage.learning_rate": 2e-3}, val=[0.1], checkpoint=40)
+    make_run(tmp_path / "other-seed=0", {"stage.learning_rate": 2e-3}, val=[math.nan, 0.1], checkpoint=40)
     make_run(tmp_path / "other-seed=1", {"stage.learning_rate": 2e-3, "seed": 1}, checkpoint=40)  # not validated yet
     groups = group_runs(read_runs([tmp_path]))
     assert {label: len(runs) for label, runs in groups.items()} == {"net": 3, "other": 2}
@@ -98,7 +98,7 @@ def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
     assert rows[0]["val_last"] == pytest.approx(0.5)
     assert rows[0]["val_last_spread"] == pytest.approx(math.sqrt((0.09 + 0.01 + 0.16) / 2))
     assert (rows[0]["n"], cell(rows[0], "val_last")) == (3, "0.5 ± 0.361")
-    assert cell(rows[1], "val_last") == "0.1 of 1"
+    assert cell(rows[1], "val_last") == cell(rows[1], "val_best") == "0.1 of 1"
     for seed, value in ((3, math.inf), (4, math.nan)):
         make_run(tmp_path / f"net-seed={seed}", {"seed": seed}, val=[value], checkpoint=40)
         assert cell(rows_of(group_runs(read_runs([tmp_path])))[0], "val_last") == str(value)
