@@ -64,10 +64,11 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
 def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     """One sentence per judged set, the nearest first: its panel next to those of real halves and the best baseline.
 
-    Without the panel the first distance is taken. A biased one is larger for fewer scans: a set is compared with real
-    halves in as many scans as they have, if measured.
+    Without the panel the first biased distance is taken: an unbiased one of equal sets is above that of the halves as
+    often as not, by any factor. As it is larger for fewer scans, a set is compared with real halves in as many scans
+    as they have, if measured.
     """
-    biased = _distances(comparisons)
+    biased = [name for name, larger in _distances(comparisons).items() if larger]
     metric = HEADLINE if HEADLINE in biased else next(iter(biased), "")
     near = sorted((pair for pair in _first(comparisons, metric) if math.isfinite(pair[0])), key=lambda pair: pair[0])
     judged, baselines = ([pair for pair in near if pair[1].kind == kind] for kind in ("judged", "baseline"))
@@ -79,10 +80,10 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     title, factor = heading(metric, metric)
     lines = []
     for value, comparison in judged:
-        as_many = references.get(f"{comparison.name}{AS_MANY}") if biased[metric] else None
+        as_many = references.get(f"{comparison.name}{AS_MANY}")
         compared, pair = as_many or (value, comparison)
         scans, of_half = (min(len(c.real), len(c.generated)) for c in (pair, halves))
-        farther = compared > MARGIN * max(reference, 0)
+        farther = compared > MARGIN * reference
         clause = "" if not baselines else ", below the baselines" if value < best else ", not below the baselines"
         if min(scans, of_half) < ENOUGH:
             judgement = (
@@ -94,7 +95,7 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
             judgement = "no lower than a baseline"
         elif reference >= best:
             judgement = "undecided, as the real halves are above a baseline"
-        elif biased[metric] and (scans < of_half if farther else scans > of_half):
+        elif scans < of_half if farther else scans > of_half:
             judgement = f"undecided, as the halves have other numbers of scans: give {of_half} generated scans"
         elif farther:
             judgement = "higher than between the real halves"
