@@ -122,6 +122,7 @@ def test_some_metrics_are_of_the_field_s_subset_and_some_of_every_scan(real, mon
     r = images(12, 1)[:, 0]
     assert gathered["jsd"].states["real_sum"].sum() == ((r > 3) & (r < 63))[chosen].sum()
     assert gathered["returns"].states["real_returns"] == ((r > 0) & (r < 63)).sum()
+    assert metrics["returns"].seen == [*chosen, *sorted({*range(12)} - {*chosen})]  # by which rows are sorted
 
 
 class CountReturns(JSD):
@@ -135,8 +136,9 @@ class CountReturns(JSD):
     def protocol(self):
         return type(super().protocol)("returns", "range image", extractor="counter")
 
-    def update(self, scans, real, first=None):
+    def update(self, scans, real, numbers=None):
         self.real_returns += scans.returned.sum()
+        self.seen = [*getattr(self, "seen", []), *numbers]
 
 
 def test_a_metric_that_edits_the_scans_of_all_is_refused(real, monkeypatch):

@@ -139,8 +139,8 @@ def gather_real(
     subset = next((chosen[name][0] for name in missing if chosen[name][0] is not None), None) or []
     whole_set = {name: metric for name, metric in missing.items() if chosen[name][0] is None}
     rest = sorted(set(range(len(real))) - set(subset)) if whole_set else []
-    first = _update(missing, real, subset, 0, True, work, protocol)
-    second = _update(whole_set, real, rest, len(subset), True, work, protocol)
+    first = _update(missing, real, subset, True, work, protocol)
+    second = _update(whole_set, real, rest, True, work, protocol)
     for name, metric in missing.items():
         counts = (len(real), first + second) if name in whole_set else (len(subset), first)
         statistics[name] = Statistics(metric.real_state(), *counts, chosen[name][1])
@@ -160,7 +160,7 @@ def measure(
     for name, metric in metrics.items():
         metric.reset()
         metric.load_real_state(real[name].states)
-    empty = _update(metrics, generated, range(len(generated)), 0, False, work, protocol)
+    empty = _update(metrics, generated, range(len(generated)), False, work, protocol)
     unsolved = int(summed(torch.tensor(getattr(generated.source, "unsolved", 0))))
     elevations = generated.sensor.elevations
     described: dict[str, Any] = {
@@ -205,7 +205,6 @@ def _update(
     metrics: Mapping[str, ScanMetric],
     scans: ScanSet,
     numbers: Sequence[int],
-    first: int,
     real: bool,
     work: Work,
     protocol: Rules,
@@ -225,12 +224,13 @@ def _update(
     with bar(f"reading {side} scans", len(shared)) as advance, torch.no_grad():
         for start, read in zip(starts, batches, strict=True):
             images, points = read if measured else (read, None)
-            labels = [f"{names[number]} of {scans.label}" for number in numbers[start : start + work.batch_size]]
+            given = numbers[start : start + work.batch_size]
+            labels = [f"{names[number]} of {scans.label}" for number in given]
             batch = Scans(images.to(device), scans.sensor, rays, points, labels)
             empty += int((~batch.returned.flatten(1).any(1)).sum())
             version = batch.images._version  # counts the edits in place
             for name, metric in metrics.items():
-                metric.update(batch, real=real, first=first + start)
+                metric.update(batch, real=real, numbers=given)
                 check(batch.images._version == version, f"metric {name} edits the scans of all metrics: edit a copy.")
             advance(len(batch))
     return int(summed(torch.tensor(empty)))

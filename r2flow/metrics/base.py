@@ -1,6 +1,6 @@
 """Base class of metrics between two sets of scans, and the protocol of their results."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Self
 
@@ -104,19 +104,19 @@ class ScanMetric(Metric):
         """The value for the stored rows of two sets, (N, D) and (M, D) float32."""
         raise NotImplementedError
 
-    def update(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> None:
+    def update(self, scans: Scans | Tensor, real: bool, numbers: Sequence[int] | None = None) -> None:
         """Add a batch of real or generated scans.
 
         Args:
             scans: `Scans`, or images (B, 2 or 1, H, W) of the metric's `sensor`: range in metres, reflectance in
                 [0, 1], 0 without a return. Metrics of the same network run it once per `Scans` object.
-            first: Number of the first scan: stored rows are sorted by number, so that values do not depend on the
-                order of batches. Default: the number of scans so far.
+            numbers: Numbers of the scans: stored rows are sorted by number, so that values do not depend on the order
+                of batches. Default: counted from the number of scans so far.
         """
         side: Side = "real" if real else "generated"
-        first = self.given(side) if first is None else first
+        numbers = range(self.given(side), self.given(side) + len(scans)) if numbers is None else numbers
         if isinstance(scans, Tensor) and self.sensor is not None:
-            scans = Scans(scans.to(self.device), self.sensor, names=range(first, first + len(scans)))
+            scans = Scans(scans.to(self.device), self.sensor, names=numbers)
         if not isinstance(scans, Scans):
             raise InputError(
                 f"'{self.name}' takes metrics.scans.Scans(images, sensor), or a tensor of images once it has their "
@@ -129,21 +129,21 @@ class ScanMetric(Metric):
             rows = self.rows(scans)
             shape = tuple(rows.shape) if isinstance(rows, Tensor) else type(rows).__name__
             check(shape[:-1] == (len(scans),), f"rows of '{self.name}' must be ({len(scans)}, D), found {shape}.")
-            self.add_rows(rows, side, first)
+            self.add_rows(rows, side, numbers)
 
-    def add_rows(self, rows: Tensor, side: Side, first: int = 0) -> None:
-        """Add the rows of scans `first`, `first + 1`, ... to the statistics of a side."""
+    def add_rows(self, rows: Tensor, side: Side, numbers: Sequence[int]) -> None:
+        """Add the rows of scans of these numbers to the statistics of a side."""
         whole = rows.isfinite().all(1)
         getattr(self, f"{side}_scans").add_(len(rows))
         getattr(self, f"{side}_left_out").add_(int((~whole).sum()))
         self.accumulate(rows[whole], side)
         if self.keeping and whole.any():
-            numbered = torch.cat([first + whole.nonzero(), rows[whole]], 1)
+            numbered = torch.cat([torch.tensor(numbers, device=rows.device)[whole, None], rows[whole]], 1)
             getattr(self, f"{side}_rows").append(numbered.flatten().float().to(self.device))
 
-    def forward(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> dict[str, float]:
+    def forward(self, scans: Scans | Tensor, real: bool, numbers: Sequence[int] | None = None) -> dict[str, float]:
         """Update; return no values, since a batch alone has no distance."""
-        self.update(scans, real, first)
+        self.update(scans, real, numbers)
         return {}
 
     def compute(self) -> dict[str, float]:

@@ -215,7 +215,8 @@ class TwoSample(FeatureMetric):
 
     Each contiguous half of both sets is scored by the classifier trained on the other half, so that neighbouring scans
     of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always distinguished. `_low` and `_high` are a
-    95 % interval for other scans judged by these two classifiers; errors of both halves, which are alike, are added.
+    95 % interval for other, independent scans judged by these two classifiers, too narrow below 50 scans or near 1;
+    it adds the errors of both halves, which are alike.
     """
 
     kind = "auc"

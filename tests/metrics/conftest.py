@@ -75,7 +75,7 @@ def measured(metric: ScanMetric, real: Scans, generated: Scans) -> ScanMetric:
 def given(metric: ScanMetric, real: ArrayLike, generated: ArrayLike) -> dict[str, float]:
     """The metric's figures of rows, (N, ...), in the place of scans."""
     for rows, side in ((real, SIDES[0]), (generated, SIDES[1])):
-        metric.add_rows(torch.as_tensor(rows).flatten(1), side)
+        metric.add_rows(torch.as_tensor(rows).flatten(1), side, range(len(rows)))
     return metric.compute()
 
 
