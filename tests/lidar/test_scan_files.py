@@ -112,15 +112,14 @@ def test_npy_of_any_float_type_and_order(tmp_path, dtype):
     expect_rows(read_points(tmp_path / "b.npy"), reflectance=None)
 
 
-def test_points_of_pcl_s_memory_are_refused_without_their_columns(tmp_path):
-    memory = np.array([[*row[:3], 1, row[3], 0, 0, 0] for row in ROWS], dtype="<f4")
-    path = saved(tmp_path, "a.bin", memory.tobytes())
-    with pytest.raises(InputError, match="--columns x,y,z,_,intensity,_,_,_"):
+@pytest.mark.parametrize("rest", [[1, "i", 3e-45, 0, 0], ["i", 3, 0.1, 2, 9], [1, "i", 3, 0, 0, 9, 0, 0, 0]])
+def test_points_of_8_or_12_floats_as_in_pcl_s_memory_are_refused_without_their_columns(tmp_path, rest):
+    columns = ",".join("intensity" if value == "i" else "_" for value in rest)
+    rows = [[*row[:3], *(row[3] if value == "i" else value for value in rest)] for row in ROWS * 30]
+    path = saved(tmp_path, "a.bin", np.array(rows, dtype="<f4").tobytes())
+    with pytest.raises(InputError, match=f"--columns x,y,z,{columns}[.]"):
         read_points(path)
-    expect_rows(read_points(path, [*"xyz_", "intensity", *"___"]))
-
-
-# --- rows that are not finite ---
+    assert_points(read_points(path, [*"xyz", *columns.split(",")]), XYZ * 30, REFLECTANCE * 30)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

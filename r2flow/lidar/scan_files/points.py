@@ -130,7 +130,7 @@ def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool
     check(
         not raw or (lost <= len(size) / 2 and negative <= (len(size) - lost) / 20),
         f"it does not look like rows of float32: of {len(size)} rows, {lost} are not finite and {negative} have a "
-        "negative reflectance. Is it big-endian, float64, text, or another row layout?",
+        "negative reflectance. Is it big-endian, float64, text, or of other columns (--columns)?",
     )
     kept = np.flatnonzero(finite & (size <= FARTHEST))
     selected = kept if len(kept) < len(size) else slice(None)

@@ -26,12 +26,14 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> list[np.ndarray]:
     check(not text, f"it is not rows of float32: it begins with {head[:16]!r}, as text or another format.")
     width = 4 if columns is None else len(columns)
     rows, rest = divmod(len(content), 4 * width)
-    known = {4: "the 4 of KITTI (.bin)", 5: "the 5 of nuScenes (.pcd.bin)"}
+    known = {4: "the 4 of KITTI (.bin)", 5: "the 5 of nuScenes: give --columns x,y,z,intensity,ring"}
     other = next((f", but of {words}" for count, words in known.items() if len(content) % (4 * count) == 0), "")
     check(rest == 0, f"it is not made of rows of {width} float32{other}: {rest} bytes are left. Is it cut short?")
     table = np.frombuffer(content, "<f4").reshape(rows, width)
-    memory = columns is None and rows > 4 and not table.view("<u4")[1::2, 1:3].any() and table[1::2, 0].any()
-    check(not memory, "every second row has y = z = 0, as 8 floats a point: give --columns x,y,z,_,intensity,_,_,_.")
+    for every in (2, 3, 4) if columns is None and rows >= 64 else ():  # 8 to 16 floats a point, as in PCL's memory
+        below = [(table[first::every, :3] < 0).any() for first in range(every)]
+        names = ",".join([*"xyz", *"_" * int(np.ptp(table[::every, 3]) == 0), "intensity", *"_" * 16][: 4 * every])
+        check(all(below[1:]) or not below[0], f"a point seems to be of {4 * every} floats: give --columns {names}.")
     return list(table.T)
 
 
