@@ -43,8 +43,9 @@ NAMES = ("time", "z", "x", "y", "ring", "intensity")
         {"delimiter": " ", "header": "a scan of mine\nof today", "comments": "# "},
         {"delimiter": " ", "header": "here are x y z in metres", "comments": "# "},
         {"delimiter": " ", "header": "500", "comments": ""},
+        {"delimiter": ",", "header": "0,1,2,3", "comments": ""},
     ],
-    ids=["spaces", "commas", "tabs", "semicolons", "units", "CloudCompare", "VeloView", "comments", "words", "count"],
+    ids=["spaces", "commas", "tabs", "semi", "units", "names", "VeloView", "comments", "words", "count", "pandas"],
 )
 def test_columns_of_text(tmp_path: Path, ending: str, options: dict):
     path = tmp_path / f"a.{ending}"
@@ -205,6 +206,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("x;y;z\n" + "1,5;2,5e0;3\n" * 3, "decimal commas"),
         ("1 2\n3 4\n", "2 columns without names"),
         ("1,2,,4\n" * 3, "NaN"),
+        ("x y z\n1 2 3 4\n", "longer than the names"),  # numbers of rows, as of R
         ("time;lat;rgb\n1;2;0,0,255\n", "no field x, y, z; it has: time, lat, rgb"),
         ("1 2 3\n4 5\n", "number of columns changed"),
         ("1 2 3\nfour 5 6\n", "four"),

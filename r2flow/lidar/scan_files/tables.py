@@ -96,7 +96,7 @@ def read_text(path: Path) -> Table:
     text = path.read_text("utf-8-sig", "replace").replace('"', "")
     lines = [line.strip(" \r") for line in text.split("\n") if line.strip()]
     rows = [line for line in lines if line[0] not in "#/"]
-    if rows[:1] == [str(len(rows) - 1)]:  # the number of points
+    if rows[:1] in ([str(len(rows) - 1)], ["0,1,2"], ["0,1,2,3"]):  # the number of points; pandas' names
         del rows[0]
     check(rows, "it holds no line of numbers.")
     apart = next((mark for mark in ";\t," if mark in rows[-1]), None)
@@ -121,6 +121,7 @@ def read_text(path: Path) -> Table:
             raise
         # Slower; empty values, as of rays without return, and words become NaN.
         table = np.genfromtxt(rows, delimiter=apart, comments=None, ndmin=2)  # type: ignore[call-overload]
+    check(not names or len(names) >= len(table.T) or np.isnan(table[:, -1]).all(), "rows are longer than the names.")
     return names, list(table.T)
 
 
