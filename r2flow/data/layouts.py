@@ -200,13 +200,9 @@ def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
 
 def _elsewhere(root: Path) -> str:
     """Advice on how to convert the files of a folder without scans, if they hold scans in another form."""
-    for place, names in _walk(root):
-        for name in sorted(names):
-            for ending, advice in ELSEWHERE.items():
-                if name.lower().endswith(ending):
-                    path = os.path.join(place, name)
-                    return f" {path} {advice.format(path=path)}."
-    return ""
+    paths = (os.path.join(place, name) for place, names in _walk(root) for name in sorted(names))
+    known = ((path, advice) for path in paths for end, advice in ELSEWHERE.items() if path.lower().endswith(end))
+    return next((f" {path} {advice.format(path=path)}." for path, advice in known), "")
 
 
 def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
