@@ -258,8 +258,7 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
         ("b", value + 1, (real, scans), "judged"), ("a", value, (real, scans), "judged"),
         ("real halves", 10.0, (half, half), "reference"), ("noise", 50.0, (real, scans), "baseline"),
     ]  # fmt: skip
-    if equal is not None:
-        cases.append(("a, as many", equal, (half, half), "reference"))
+    cases += [("a, as many", equal, (half, half), "reference")] * (equal is not None)
     comparisons = [
         Comparison(name, *map(range, sizes), [MetricResult(metric, {metric: number}, {}, True)], kind)
         for name, number, sizes, kind in cases

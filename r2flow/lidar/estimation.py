@@ -99,7 +99,7 @@ def is_tilted(scans: Sequence[Points]) -> bool:
 
     Beams are clear if few elevations have many points: by the sum of squares of their histogram.
     """
-    xyz = np.concatenate([scan.xyz[scan.xyz.any(axis=1)] for scan in scans])
+    xyz = np.concatenate([scan.xyz[np.isfinite(elevations_of(scan.xyz))] for scan in scans])
     if len(xyz) < 5 * FEWEST_RETURNS:
         return False
     xyz = xyz[np.random.default_rng(0).integers(len(xyz), size=5000)]

@@ -217,8 +217,7 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
         named = isinstance(options, dict) and all(isinstance(key, str) for key in options)
         check(named, "it is not a sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
-        size = {"rows": rows, "columns": columns}
-        options |= {key: value for key, value in size.items() if value is not None}
+        options |= {key: value for key, value in (("rows", rows), ("columns", columns)) if value is not None}
         return construct(str(path), build_sensor, options)
 
 

@@ -221,8 +221,7 @@ def _noise(flow: RectifiedFlow) -> dict[str, Tensor]:
 def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> dict[str, Tensor]:
     """Example inputs of v(t, x), t of shape () or (2,)."""
     network = flow.backbone
-    x = torch.zeros(2, network.in_channels, *network.coords.shape[2:])
-    inputs = {"t": torch.full(shape, 0.25), "x": x}
+    inputs = {"t": torch.full(shape, 0.25), "x": torch.zeros(2, network.in_channels, *network.coords.shape[2:])}
     return {**inputs, "s": torch.full(shape, 0.5)} if network.second_time else inputs  # t, s: distinct tensors
 
 

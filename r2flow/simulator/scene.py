@@ -67,8 +67,7 @@ class SceneBuilder:
 
     def build(self, rig: int | None = None) -> Scene:
         """The scene as tables."""
-        tables = tuple(_table(shape, rows) for shape, rows in self._rows.items() if rows)
-        return Scene(self.ground, tables, rig)
+        return Scene(self.ground, tuple(_table(shape, rows) for shape, rows in self._rows.items() if rows), rig)
 
 
 def _table(shape: type, rows: list[tuple[float, ...]]) -> tuple[Shape, Surface]:

@@ -48,8 +48,7 @@ def score_loss(score: Score, x: Tensor, noise: Tensor, labels: Tensor, sigmas: T
     Power 2 weights all levels equally (2019, eq. 6). Noise n is standard normal, labels i are (B,) int64.
     """
     sigma = sigmas[labels][:, None, None, None]
-    error = score(x + sigma * noise, labels) + noise / sigma
-    return error.square().flatten(1).sum(1) * sigmas[labels] ** power / 2
+    return (score(x + sigma * noise, labels) + noise / sigma).square().flatten(1).sum(1) * sigmas[labels] ** power / 2
 
 
 def annealed_langevin(
