@@ -13,6 +13,7 @@ NEIGHBOURS = 4
 FEATURES = 5 * NEIGHBOURS + 11  # of `Surroundings`
 ROW, STEEP = 8, 3.0  # size of the vector learned for each row, and gain of the elevation that follows it
 SAME = 2e-4  # radians: tolerance for rows of the same elevation
+LEARNED = math.radians(-32), math.radians(24)  # elevations of the training's simulated sensors, at any size
 
 
 class Surroundings(NamedTuple):
@@ -74,8 +75,9 @@ class Surroundings(NamedTuple):
 class RowFeatures(nn.Embedding):
     """Features of each row: a learned vector, the elevation, and the angles between rows and between columns.
 
-    There is one learned vector per row of the training sensor (`elevations` in radians, (H,)) and per pair of rows;
-    other sensors share one vector.
+    Rows beyond the elevations of training have the nearest of these: the network would extrapolate ray-drop. There
+    is one learned vector per row of the training sensor (`elevations` in radians, (H,)) and per pair of rows; other
+    sensors share one vector.
     """
 
     FEATURES = ROW + 3
@@ -85,6 +87,7 @@ class RowFeatures(nn.Embedding):
         rows = torch.cat([elevations, pairs])
         super().__init__(1 + len(rows), ROW)
         self.elevations = rows  # not a buffer: derived from the sensor
+        self.limits = min(LEARNED[0], float(rows.min())), max(LEARNED[1], float(rows.max()))
 
     def forward(self, elevations: Tensor, steps: Tensor, numbered: Tensor) -> Tensor:  # type: ignore[override]
         """Row features, (B, `FEATURES`, H, 1), from elevations in radians, (B, H), and `steps` of `Surroundings.of`.
@@ -95,7 +98,7 @@ class RowFeatures(nn.Embedding):
         numbered = numbered & (distance.amin(-1) < SAME).all(1)
         number = (distance.argmin(-1) + 1) * numbered[:, None]
         sizes = (steps / 0.007).log()[:, None].expand(*elevations.shape, 2)
-        each = torch.cat([super().forward(number), STEEP * elevations[..., None], sizes], -1)
+        each = torch.cat([super().forward(number), STEEP * elevations[..., None].clamp(*self.limits), sizes], -1)
         return each.movedim(-1, 1)[..., None]
 
 

@@ -1,8 +1,4 @@
-"""Completion of partial scans: answer a to scan i depends on (seed, i, a) alone, up to the network's rounding.
-
-for completed in complete(checkpoint, images, state, num=8):
-    completed.images, completed.spread
-"""
+"""Completion of partial scans: answer a to scan i depends on (seed, i, a) alone, up to the network's rounding."""
 
 import math
 from collections.abc import Iterator
