@@ -100,8 +100,7 @@ def test_ply_binary_in_both_byte_orders_among_other_elements(tmp_path, order, na
     )
     rows = [struct.pack(order + "BfdfHB", 9, *row[:3], row[4], int(row[3] * 2)) for row in ROWS]
     body = struct.pack(order + "hh", 1, 2) + b"".join(rows) + struct.pack(order + "B3i", 3, 0, 1, 2)
-    points = read_points(saved(tmp_path, "a.ply", header.encode() + body))
-    expect_rows(points, reflectance=[1, 0, 2], ring=RING)
+    expect_rows(read_points(saved(tmp_path, "a.ply", header.encode() + body)), reflectance=[1, 0, 2], ring=RING)
 
 
 @pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8", ">f8"])
@@ -120,6 +119,8 @@ def test_points_of_8_or_12_floats_as_in_pcl_s_memory_are_refused_without_their_c
     with pytest.raises(InputError, match=f"--columns x,y,z,{columns}[.]"):
         read_points(path)
     assert_points(read_points(path, [*"xyz", *columns.split(",")]), XYZ * 30, REFLECTANCE * 30)
+    with pytest.raises(InputError, match="integer reflectance"):
+        read_points(saved(tmp_path, "b.bin", np.array([(*xyz, 9) for xyz in XYZ], dtype="<f4,<f4,<f4,<u4").tobytes()))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

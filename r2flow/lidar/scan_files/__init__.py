@@ -30,7 +30,7 @@ ELSEWHERE = {
     **dict.fromkeys((".h5", ".hdf5", ".zarr", ".mat", ".pkl"), "holds arrays: write x, y, z, intensity by numpy.savez"),
     ".tfrecord": "is read by Waymo's own tools: write x, y, z, intensity by numpy.savez",
     **dict.fromkeys((".lvx", ".lvx2", ".lvx3"), "is of a Livox, which has no beams; r2flow needs a spinning LiDAR"),
-    ".gz": "is compressed: unpack it (gunzip)",
+    **dict.fromkeys((".gz", ".bz2", ".xz", ".zst", ".zip", ".tar"), "is compressed: unpack it"),
 }
 WRITTEN = (".bin", ".pcd", ".ply", ".npy")
 SCAN_ENDINGS = (*_ROWS, *_READERS)

@@ -124,13 +124,13 @@ def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool
         f"it does not look like a scan: of {len(returned)} points, {far} lie beyond {FARTHEST:g} m and {near} within "
         f"{NEAREST:g} m. Is it damaged, not in metres, big-endian, or of another row layout?",
     )
-    # Rows of three or five floats read as four have coordinates as reflectance, half of which are negative.
-    negative = 0 if reflectance is None else np.count_nonzero(finite & (reflectance < 0))
+    # Rows of three or five floats read as four have coordinates as reflectance, half negative; an integer is tiny.
+    negative = 0 if reflectance is None else np.count_nonzero(finite & (reflectance < 1e-30) & (reflectance != 0))
     lost = np.count_nonzero(~finite)
     check(
         not raw or (lost <= len(size) / 2 and negative <= (len(size) - lost) / 20),
         f"it does not look like rows of float32: of {len(size)} rows, {lost} are not finite and {negative} have a "
-        "negative reflectance. Is it big-endian, float64, text, or of other columns (--columns)?",
+        "negative or integer reflectance. Is it big-endian, float64, text, or of other columns (--columns)?",
     )
     kept = np.flatnonzero(finite & (size <= FARTHEST))
     selected = kept if len(kept) < len(size) else slice(None)
