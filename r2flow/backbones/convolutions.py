@@ -234,5 +234,4 @@ class UNet(Backbone, ABC):
         """The first convolution, on the image and the features of its rays."""
         if self.coords_encoding is None:
             return self.in_conv(x)
-        features = self.features.to(x.dtype).expand(x.shape[0], -1, -1, -1)
-        return self.in_conv(torch.cat([x, features], dim=1))
+        return self.in_conv(torch.cat([x, self.features.to(x.dtype).expand(x.shape[0], -1, -1, -1)], dim=1))

@@ -25,6 +25,7 @@ class Flow(Generator):
 
     # Samplers that complete scans, with their default settings; the first one is the default.
     completers: ClassVar[tuple[Sampler, ...]] = (MMPS(),)
+    singular: ClassVar[bool] = False  # whether v grows without limit towards t = 1
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,); a flow map without it is drawn by jumps alone."""

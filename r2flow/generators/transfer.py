@@ -97,7 +97,7 @@ class TransferFlow(Flow):
         sigma: Standard deviation of the noise in x_0, in model space.
     """
 
-    told, draws, usual = True, False, Jump(steps=1)
+    told, draws, singular, usual = True, False, True, Jump(steps=1)
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any], sigma: NonNegative = 0.25) -> None:
         super().__init__(space)

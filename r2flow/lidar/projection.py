@@ -165,8 +165,7 @@ def unproject(r: Tensor, rays: Tensor) -> Tensor:
     Ranges, (B, 1, H, W), are 0 for rays without return; rays are elevation e and azimuth a in radians, (2, H, W).
     """
     e, a = rays.to(r)
-    direction = torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()])
-    return r * direction
+    return r * torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()])
 
 
 def image_to_points(

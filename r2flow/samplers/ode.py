@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, named_grid, solve
 from r2flow.registry import Count, Portion, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Sampler
@@ -34,6 +34,11 @@ class FixedSteps(OnGrid, ODESampler):
     @property
     def name(self) -> str:
         return self.method
+
+    def check(self, generator: Any) -> None:
+        super().check(generator)
+        wrong = generator.singular and not self.finish and SOLVERS[self.method].at_end  # type: ignore[union-attr]
+        check(not wrong, f"{self.method} needs v at t = 1, where this model has none: give jump, euler or adams3.")
 
     def evaluations(self, generator: Any) -> int:
         final = int(bool(self.finish) and self.steps > 1)

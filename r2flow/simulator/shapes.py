@@ -53,8 +53,7 @@ class Boxes(NamedTuple):
         return _upright(self, rays, *_box_spans(self, rays))
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-        upright = [np.zeros_like(self.x)] * 3
-        return Frusta(*self, *upright).normal(k, x, y, z)
+        return Frusta(*self, *[np.zeros_like(self.x)] * 3).normal(k, x, y, z)  # upright
 
 
 class Frusta(NamedTuple):

@@ -13,9 +13,8 @@ def image(r: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "r",
-    [np.zeros_like(E), np.where((E < -0.3) & (A > 3.0), 5.0, 0.0), np.full_like(E, 79.9), np.full_like(E, 1.45)],
-)  # fmt: skip
+    "r", [np.zeros_like(E), np.where((E < -0.3) & (A > 3.0), 5.0, 0.0), np.full_like(E, 79.9), np.full_like(E, 1.45)]
+)
 def test_extreme_scans_are_drawn(tmp_path, r):
     for figure in (scan_figure(image(r), SENSOR.rays(), "scan"), contact_sheet([image(r)[:1]] * 2, SENSOR.rays())):
         assert save_figure(figure, tmp_path / "scan.png").read_bytes().startswith(b"\x89PNG")

@@ -60,6 +60,7 @@ class FixedStep:
     step: Callable[..., Any]  # function of v, t, h and x: the next state
     order: int  # of the global error
     evaluations: int  # of v per step
+    at_end: bool = False  # whether a step evaluates v at its end
     multistep: bool = False  # whether `step` makes such a function from the times of a solution, (N + 1,) float64
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:

@@ -91,8 +91,7 @@ class Extractor(nn.Module, ABC):
         try:
             self.load_state_dict({**counts, **tensors})
         except RuntimeError as error:
-            reason = str(error).splitlines()[1].strip()
-            raise InputError(f"not the weights of {self.name}: {reason[:160]}") from None
+            raise InputError(f"not the weights of {self.name}: {str(error).splitlines()[1].strip()[:160]}") from None
         if broken := [name for name, value in self.state_dict().items() if not value.isfinite().all()]:
             raise InputError(f"not the weights of {self.name}: '{broken[0]}' has values that are not finite.")
         return self.requires_grad_(False).eval()

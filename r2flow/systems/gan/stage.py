@@ -79,8 +79,7 @@ def blurred(x: Tensor, sigma: float) -> Tensor:
     reach = math.floor(3 * sigma)
     if reach == 0:
         return x
-    taps = torch.exp2(-((torch.arange(-reach, reach + 1) / sigma) ** 2))
-    return Filter(taps.tolist()).to(x.device)(x)
+    return Filter(torch.exp2(-((torch.arange(-reach, reach + 1) / sigma) ** 2)).tolist()).to(x.device)(x)
 
 
 DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
