@@ -114,11 +114,12 @@ def test_npy_of_any_float_type_and_order(tmp_path, dtype):
 @pytest.mark.parametrize("rest", [[1, "i", 3e-45, 0, 0], ["i", 3, 0.1, 2, 9], [1, "i", 3, 0, 0, 9, 0, 0, 0]])
 def test_points_of_8_or_12_floats_as_in_pcl_s_memory_are_refused_without_their_columns(tmp_path, rest):
     columns = ",".join("intensity" if value == "i" else "_" for value in rest)
-    rows = [[*row[:3], *(row[3] if value == "i" else value for value in rest)] for row in ROWS * 30]
+    rows = [[*row[:3], *(row[3] if value == "i" else value for value in rest)] for row in ROWS * 400]
     path = saved(tmp_path, "a.bin", np.array(rows, dtype="<f4").tobytes())
     with pytest.raises(InputError, match=f"--columns x,y,z,{columns}[.]"):
         read_points(path)
-    assert_points(read_points(path, [*"xyz", *columns.split(",")]), XYZ * 30, REFLECTANCE * 30)
+    assert_points(read_points(path, [*"xyz", *columns.split(",")]), XYZ * 400, REFLECTANCE * 400)
+    read_points(saved(tmp_path, "lost.bin", np.array([ROWS[0][:4], [0] * 4, ROWS[1][:4]] * 400, dtype="<f4").tobytes()))
     with pytest.raises(InputError, match="integer reflectance"):
         read_points(saved(tmp_path, "b.bin", np.array([(*xyz, 9) for xyz in XYZ], dtype="<f4,<f4,<f4,<u4").tobytes()))
 
