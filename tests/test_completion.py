@@ -119,7 +119,7 @@ def test_a_generator_that_cannot_complete_is_refused():
 
 
 def test_a_flow_without_a_condition_says_what_completes_with_it():
-    for model, name, words in ("rectified_flow", "euler", "repaint"), ("transfer_flow", "rk4", "rk4 needs v at t = 1"):
+    for model, name, words in ("rectified_flow", "euler", "repaint"), ("transfer_flow", "rk4", "rk4 needs v at"):
         with pytest.raises(InputError, match=words):
             completing(network(model).generator, name)
     assert completing(network().generator, "euler").name == "euler"

@@ -219,9 +219,8 @@ class TransferFlow(Flow):
         nothing = encoded(self.space, torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1]))
         x = generated.x.to(image)
         x = x if gain is None else scaled(x, 1 / gain)
-        x = torch.where(_within_reach(known[:, :1]), x, nothing)
-        evaluations = generated.evaluations * (2 if self.foreign else 1)  # see `answers`
-        return replace(generated, x=torch.where(known > 0, image, x), evaluations=evaluations)
+        x = torch.where(known > 0, image, torch.where(_within_reach(known[:, :1]), x, nothing))
+        return replace(generated, x=x, evaluations=generated.evaluations * (1 + self.foreign))  # see `answers`
 
     def loss(
         self, x_1: Tensor, condition: Condition, t: Tensor, noise: Tensor, steps: Tensor, rows: Tensor

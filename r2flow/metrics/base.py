@@ -65,8 +65,8 @@ class ScanMetric(Metric):
     uses_reflectance: ClassVar[bool] = False  #: whether reflectance is used if present
     keeping: ClassVar[bool] = False  #: whether rows are stored in memory, float32
     fewest: ClassVar[int] = 2  #: minimum number of scans per set for `distance`
-    #: Whether the first value, a distance that is 0 for equal sets, is larger for fewer scans; an evaluation ranks the
-    #: sets by it. None: not a distance, and without a verdict.
+    #: Whether the first value, a distance that is 0 for equal sets, is larger for fewer scans; an evaluation's verdict
+    #: is by it. False: an unbiased distance; None: not a distance; both without a verdict.
     biased: ClassVar[bool | None] = None
 
     def __init__(self, *, sensor: Sensor | str | None = None, name: str | None = None, **options: Any) -> None:

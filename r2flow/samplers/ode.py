@@ -19,6 +19,11 @@ class ODESampler(Sampler):
     def options(self) -> dict[str, Any]:
         """Options of `r2flow.flow.solvers.solve`."""
 
+    def check(self, generator: Any) -> None:
+        super().check(generator)
+        wrong = getattr(generator, "singular", False) and getattr(method_of(self.options()["method"]), "at_end", False)
+        check(not wrong, f"{self.name} needs v at t = 1, which this model lacks: give jump or euler.")
+
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         end = solve(generator.field(condition), noise, progress=progress, **self.options())
         return Generated(end.x, end.evaluations, end.converged)
@@ -34,11 +39,6 @@ class FixedSteps(OnGrid, ODESampler):
     @property
     def name(self) -> str:
         return self.method
-
-    def check(self, generator: Any) -> None:
-        super().check(generator)
-        wrong = SOLVERS[self.method].at_end and getattr(generator, "singular", False)  # type: ignore[union-attr]
-        check(not wrong or self.finish, f"{self.method} needs v at t = 1, which this model lacks: give jump or euler.")
 
     def evaluations(self, generator: Any) -> int:
         final = int(bool(self.finish) and self.steps > 1)

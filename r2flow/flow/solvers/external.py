@@ -2,7 +2,7 @@
 
 import logging
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ def torchdiffeq_methods() -> dict[str, Any]:
 @dataclass(frozen=True)
 class TorchDiffEqMethod:
     name: str
+    at_end: ClassVar[bool] = True  # whether a step evaluates v at its end: most do
 
     def __post_init__(self) -> None:
         names = torchdiffeq_methods()
