@@ -328,7 +328,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     moved = checkpoint.sensor != build_space(checkpoint.config).sensor
     check(not moved, f"{path}: a file keeps the sensor of training alone: save the model before `through`.")
     state, parameters = checkpoint.generator.state_dict(), checkpoint.generator.named_parameters()
-    weights = {n.replace(COMPILED, ""): value.detach().cpu().contiguous() for n, value in state.items()}
+    weights = {n.replace(COMPILED, ""): value.detach().cpu().contiguous().clone() for n, value in state.items()}
     if half:
         large = [n.replace(COMPILED, "") for n, value in parameters if value.ndim > 1 and value.numel() > SMALL]
         weights |= {n: weights[n].half() for n in large}
