@@ -350,7 +350,8 @@ def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path,
     same = cloud, cloud[::-1].astype(">f8")[::-1], torch.from_numpy(cloud).requires_grad_()
     answers = torch.stack([r2flow.load(run).complete(points, sensor="vlp16") for points in same])
     assert torch.equal(answers, answers[:1].expand_as(answers))
-    assert [message.partition(":")[0] for message in caplog.messages] == ["points in memory"]
+    assert torch.equal(*(r2flow.load(run).complete(cloud, sensor="hdl64e") for _ in range(2)))
+    assert [message.partition(":")[0] for message in caplog.messages] == ["points in memory"] * 2
     for given, found in ((np.zeros(4), "(4,)"), (np.zeros((0, 2, 8, 64)), "(0, 2, 8, 64)"), (["a.bin"], "list")):
         with pytest.raises(InputError, match=rf"points \(N, 3 or 4\); found .*{re.escape(found)}"):
             r2flow.load(run).complete(given)

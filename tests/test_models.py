@@ -74,7 +74,6 @@ def test_two_lines_of_python_without_a_network_and_a_light_import():
     code = """
 import socket
 import sys
-
 def refuse(*_, **__):
     raise OSError("no network")
 

@@ -5,7 +5,6 @@ scans[0].read()         image, state, xyz
 """
 
 import hashlib
-import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,8 +24,6 @@ from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, ot
 from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.transfer import Partial, image_through, points_of_same, points_through, rows_of, sensor_of
-
-log = logging.getLogger(__name__)
 
 FEWER = 0.9  # with less than this share of rays per column, pixels between the rays are not measured
 FEW = 4  # default number of simulated scans
@@ -115,7 +112,7 @@ def _files(
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by {FROM}: {error}") from None
         if not stored and not warn_of_frame(points[0], scans) and source and doubt and not doubt.finer:
             fits = f"; they fit {doubt.name}" if doubt.name else ""
-            log.warning("%s: sensor %s does not fit these scans: %s%s", spec, source.name, doubt.seen, fits)
+            warn_odd(points[0], f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}")
         of_sensor, options = known.reflectance_scale if known else None, parse(spec)[0]
         usual = scale_of(options, of_sensor) if options.name != FOLDER or of_sensor else 0.0
         full = scale or (1.0 if stored else full_reflectance(scans, usual) or usual) or 1.0
