@@ -22,6 +22,7 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import completing
 from r2flow.model.sampling import draw, evaluated_region, sample
 from r2flow.noise import Draws
+from r2flow.progress import Bar
 from r2flow.reports.outputs import write_samples
 from r2flow.runs.composing import compose
 from r2flow.samplers import build_sampler
@@ -226,7 +227,8 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     assert write(4) == [0, 1, 2, 3]
     whole = {name: (tmp_path / name).read_bytes() for name in names()}
     (tmp_path / "000001.npy").unlink()
-    assert write(5) == [0, 1, 4]
+    monkeypatch.setattr("r2flow.reports.outputs.Bar", bar := mock.Mock(wraps=Bar))
+    assert (write(5), bar.call_args.args[1]) == ([0, 1, 4], 3)
     assert {name: (tmp_path / name).read_bytes() for name in names()[:4]} == whole
     with pytest.raises(InputError, match="holds other samples: seed=0 there, 1 here"):
         write(2, seed=1)

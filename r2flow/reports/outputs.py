@@ -1,6 +1,5 @@
 """Generated scans as files and pictures."""
 
-import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -64,20 +63,21 @@ def write_samples(
     part = {k: v for k, v in (how | {"region": region and asdict(region)}).items() if v not in (None, "32-true")}
     store = FileStore(out, "samples", recipe_of(checkpoint, seed, sampler, **part), endings)
     stale = _stale(store, replace)
-    shown: list[np.ndarray] = []
-    with Bar("sampling", num, evaluations=math.ceil(num / batch_size) * (sampler.evaluations(generator) or 0)) as bar:
-        for first in range(0, num, batch_size):
-            numbers = range(first, min(first + batch_size, num))
-            if first < pictures or stale or store.missing(numbers):
-                drawn = draw(generator, numbers, seed, sampler, **how, progress=bar.evaluated)
-                warn_unsolved(drawn.converged, first)
-                while stale:  # the first scan shows that the settings are valid
-                    stale.pop().unlink()
-                store.begin()
-                for number, image in zip(numbers, drawn.images.numpy(), strict=True):
-                    write_scan(image, rays, out, f"{number:06d}", endings)
-                    shown += [image] if number < pictures else []
-            bar.set(numbers.stop)
+    shown, done = list[np.ndarray](), 0
+    batches = [range(first, min(first + batch_size, num)) for first in range(0, num, batch_size)]
+    left = [numbers for numbers in batches if numbers.start < pictures or stale or store.missing(numbers)]
+    with Bar("sampling", sum(map(len, left)), evaluations=len(left) * (sampler.evaluations(generator) or 0)) as bar:
+        for numbers in left:
+            drawn = draw(generator, numbers, seed, sampler, **how, progress=bar.evaluated)
+            warn_unsolved(drawn.converged, numbers.start)
+            while stale:  # the first scan shows that the settings are valid
+                stale.pop().unlink()
+            store.begin()
+            for number, image in zip(numbers, drawn.images.numpy(), strict=True):
+                write_scan(image, rays, out, f"{number:06d}", endings)
+                shown += [image] if number < pictures else []
+            done += len(numbers)
+            bar.set(done)
     if region is not None:
         shown, rays = [region.crop(torch.from_numpy(image)).numpy() for image in shown], region.crop(rays)
     if shown:

@@ -352,7 +352,6 @@ def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
     (out / "scans-000001.safetensors").unlink()
     assert "6 scans in 2 shards (1 there already), 0.0 MiB" in r2flow(*typed, "--workers", 1).said
     source = prepared_in(out)
-    assert len(source) == 6
     raw = read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))
     assert np.abs(source[5] - raw).max() <= 1e-3
 
