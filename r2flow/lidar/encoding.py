@@ -226,7 +226,7 @@ class ModelSpace:
         """
         images, rays = torch.as_tensor(images), self.sensor.rays()
         check(images.ndim == 4 and images.shape[1] < 3, f"images are (B, 2 or 1, H, W), found {tuple(images.shape)}.")
-        clouds = (image_to_points(image, rays) for image in images.float().cpu().numpy())
+        clouds = (image_to_points(image, rays) for image in images.detach().float().cpu().numpy())
         return [np.column_stack(cloud) for cloud in clouds]
 
 

@@ -71,7 +71,7 @@ def test_points_lie_along_the_middles_of_the_pixels(rays):
     space = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays(rays))
     images = torch.zeros(2, 2, 2, 4)
     images[0, :, 0, 1] = torch.tensor([10.0, 0.25])
-    empty, (point,) = space.points(images)[1], space.points(images)[0]
+    empty, (point,) = space.points(images.requires_grad_())[1], space.points(images)[0]
     flat = 10 * np.cos(np.pi / 6) * np.sqrt(0.5)  # x = y at 45 degrees; z = 10 sin 30
     np.testing.assert_allclose(point, [flat, flat, 5.0, 0.25], rtol=1e-6)
     np.testing.assert_allclose(space.points(images[:1, :1])[0], [[flat, flat, 5.0, 0]], rtol=1e-6)  # of range alone
