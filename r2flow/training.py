@@ -297,7 +297,7 @@ def fit(run: Run) -> Result:
 
 def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     """Fit a run in its folder; returns the step reached."""
-    last = open_run(run.folder, run.config)
+    last = open_run(run.folder, run.config, locked=run.trainer.is_global_zero)
     if last is not None and step_of(last) >= run.trainer.max_steps:
         if run.trainer.is_global_zero:
             init = as_override("stage.init", run.folder)

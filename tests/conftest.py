@@ -139,7 +139,6 @@ def shared() -> Path:
 
 @pytest.fixture(params=list(SENSORS))
 def sensor(request: pytest.FixtureRequest) -> Sensor:
-    """Every sensor of the table."""
     return SENSORS[request.param]
 
 

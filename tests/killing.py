@@ -45,7 +45,6 @@ def in_child(work: Callable[[], object]) -> int:
 
 
 def wait_until(there: Callable[[], bool], seconds: float = 60.0) -> None:
-    """Wait for another process; the test fails when it takes longer."""
     begin = time.monotonic()
     while not there():
         assert time.monotonic() - begin < seconds, f"not there after {seconds} s"

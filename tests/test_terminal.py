@@ -59,7 +59,7 @@ def test_a_lost_device_is_one_line(monkeypatch, tmp_path: Path, message: str, pe
     strategy.launcher.procs = [Mock(wait=lambda timeout: peer)]
     trainer = SimpleNamespace(world_size=2, max_steps=4, is_global_zero=False, fit=fit, strategy=strategy)
     run = SimpleNamespace(trainer=trainer, folder=tmp_path, config={"stage": {}}, data=Mock(), stage=torch.nn.ReLU())
-    monkeypatch.setattr(r2flow.training, "open_run", lambda *_: None)
+    monkeypatch.setattr(r2flow.training, "open_run", lambda *_, **__: None)
     with pytest.raises(kind, match=f"device ended.* {words}") as raised:
         r2flow.training._fit_in_folder(run, Stopping(tmp_path))
     assert getattr(raised.value, "code", 2) == (LATER if kind is Stopped else 2)

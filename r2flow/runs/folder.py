@@ -59,9 +59,9 @@ def read_config(run: str | Path) -> dict[str, Any] | None:
     return dict(config) or None
 
 
-def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
-    """Open a run folder: returns the newest readable checkpoint to resume from, or None for a new run."""
-    for leftover in Path(run, FOLDER).glob(".*.part"):  # of killed writers
+def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) -> Path | None:
+    """The newest readable checkpoint to resume a run from, or None for a new run; writes if its folder is `locked`."""
+    for leftover in Path(run, FOLDER).glob(".*.part") if locked else ():  # of killed writers
         leftover.unlink(missing_ok=True)
     old, last = read_config(run), None
     if old and (last := next((path for path, _ in _readable(run, RESUMED)), None)):
@@ -72,7 +72,7 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
                 f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the setting, and draw with "
                 f"another sampler by r2flow sample {run} --sampler NAME --steps N."
             )
-    if old != dict(config) or not Path(run, CONFIG).is_file():  # free keys may have changed
+    if locked and (old != dict(config) or not Path(run, CONFIG).is_file()):  # free keys may have changed
         write_file(Path(run, CONFIG), yaml.safe_dump(dict(config), sort_keys=False))
     return last
 

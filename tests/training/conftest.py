@@ -55,7 +55,6 @@ TINY = [
 
 @pytest.fixture(scope="session")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of 12 simulated scans."""
     folder, sensor = tmp_path_factory.mktemp("scans"), SENSORS["hdl64e"].resized(32, 256)
     for index in range(12):
         write_points(folder / f"{index:06d}.bin", *image_to_points(simulate(sensor, 0, index).image, sensor))
@@ -82,7 +81,6 @@ def quickly(run: Callable[[], int | None]) -> Done:
 
 
 def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
-    """`train.py ARGUMENTS` from a folder, in this process."""
     with contextlib.chdir(cwd):
         done = quickly(lambda: main(arguments, COMMAND))
     if check and done.returncode:
@@ -130,7 +128,6 @@ def let_go(file: Path) -> None:
 
 
 def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = 200.0) -> None:
-    """Wait until a process has written a file."""
     wait_until(lambda: path.exists() or process.poll() is not None, seconds)
     assert path.exists(), process.communicate()[0]
 
@@ -160,5 +157,4 @@ def alone(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
 
 @pytest.fixture
 def copied(alone: tuple[Path, str], tmp_path: Path) -> Path:
-    """A copy of that run, to be damaged."""
     return Path(shutil.copytree(alone[0], tmp_path / "runs" / "copied"))
