@@ -1,11 +1,9 @@
 """Training API: build and fit what a config describes.
 
-    from r2flow.training import build, compose, fit
+from r2flow.training import build, compose, fit
 
-    result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
-    result.metrics["val/loss"], result.checkpoint
-
-The same command, or the same config, resumes from the last checkpoint.
+result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
+result.metrics["val/loss"], result.checkpoint
 """
 
 import logging
@@ -306,6 +304,7 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     with _quiet():
         run.data.read()
         if last is not None:
+            run.stage.start = step_of(last)
             log.info("resuming from %s", last)
     if run.trainer.is_global_zero:
         log_config(run.trainer.loggers, run.config)

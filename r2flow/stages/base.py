@@ -43,6 +43,7 @@ class Stage(L.LightningModule):
 
     Attributes:
         config: The run's config, which its checkpoints store.
+        start: The step that it resumes from.
         gradient_clip_val: Gradient clipping of the run, for a stage with manual optimisation.
         further: Makes additional batch entries of x_1, (C, H, W), its sensor and draws of each image, in the loader.
     """
@@ -75,6 +76,7 @@ class Stage(L.LightningModule):
         self.warmup_steps = warmup_images // batch_size
         self.seed = seed
         self.config: dict[str, Any] = {}
+        self.start = 0
         self.gradient_clip_val: float | None = None
         self.further: Further | None = None
 
@@ -87,6 +89,12 @@ class Stage(L.LightningModule):
         check(self.needs_pairs or not on_pairs, f"stage={name} learns from scans, not data=pairs; give stage=reflow.")
         if not self.several_sensors and any(part.get("sensor") for part in data.get("parts") or ()):
             raise InputError(f"stage={name} learns from scans of one sensor: leave sensor out of data.parts.")
+
+    def setup(self, stage: str) -> None:
+        here = self.start, self.config.get("scans")
+        alike = self.trainer.strategy.reduce_boolean_decision(here == self.trainer.strategy.broadcast(here))
+        start = f"process {self.global_rank} starts from step {self.start}, on {self.config.get('scans')}"
+        check(alike, f"{start}, others do not: run_dir and data.root must be folders that all machines share.")
 
     def on_train_start(self) -> None:
         wrapped = any(COMPILED in name for name, _ in self.generator.named_parameters())

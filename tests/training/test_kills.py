@@ -28,7 +28,6 @@ VERBS = {
 
 
 def finish(cwd: Path, command: Sequence[object]) -> float:
-    """Run a command to its end; seconds."""
     begin = time.monotonic()
     process = start(cwd, command, command=[])
     said, _ = process.communicate(timeout=600)
@@ -63,7 +62,6 @@ def end_ten_times(cwd: Path, command: Sequence[object], seed: int, into: str = "
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """All that lies in a folder."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 

@@ -31,7 +31,6 @@ TWO = ["trainer.devices=2", "trainer.strategy=ddp"]
 def recorded(
     cwd: Path, scans: Path, record: Path, *overrides: str, code: int = 0, broken: tuple[int, ...] = ()
 ) -> subprocess.CompletedProcess[str]:
-    """train.py with `recorder.py` looking on, into the folder `record`."""
     recorder = str(Path(__file__).with_name("recorder.py"))
     command = [sys.executable, recorder, *TINY, f"data.root={scans}", *overrides, "+callbacks.recorder={}"]
     environment = {
@@ -52,7 +51,6 @@ def losses(record: Path) -> dict[int, float]:
 
 @pytest.fixture(scope="module")
 def one(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run in one process, with what was recorded in `record`."""
     cwd = tmp_path_factory.mktemp("one")
     recorded(cwd, scans, cwd / "record", "name=one", *EXACT)
     return cwd
@@ -60,7 +58,6 @@ def one(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def two(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same in two processes."""
     cwd = tmp_path_factory.mktemp("two")
     done = recorded(cwd, scans, cwd / "record", "name=two", *EXACT, *TWO)
     said = [line for line in (done.stdout + done.stderr).splitlines() if line]
@@ -123,10 +120,10 @@ def test_accumulated_batches_have_the_losses_of_the_whole(one: Path, scans: Path
 
 
 def srun(
-    cwd: Path, scans: Path, *overrides: str, tasks: int = 1, leave_after: Path | None = None
+    cwd: Path, scans: Path, *overrides: str, tasks: int = 1, leave_after: Path | None = None, apart: bool = False
 ) -> list[tuple[int, str]]:
     """(exit code, output) of every task of the tiny run as srun starts it, with a `scontrol` that notes what it gets;
-    the last task is sent SIGUSR1 when the file `leave_after` is there."""
+    the last task is sent SIGUSR1 when the file `leave_after` is there; `apart`: in folders a and b."""
     scontrol = cwd / "bin" / "scontrol"
     scontrol.parent.mkdir(exist_ok=True)
     scontrol.write_text(f'#!/bin/sh\necho "$@" >> {cwd}/scontrol.log\n')
@@ -140,8 +137,8 @@ def srun(
         "SLURM_NODELIST": "localhost", "SLURM_NTASKS": str(tasks), "SLURM_NTASKS_PER_NODE": str(tasks),
     }  # fmt: skip
     started = [
-        start(cwd, tiny(scans, *overrides), **environment, SLURM_PROCID=str(task), SLURM_LOCALID=str(task))
-        for task in range(tasks)
+        start(cwd / folder, tiny(scans, *overrides), **environment, SLURM_PROCID=str(task), SLURM_LOCALID=str(task))
+        for task, folder in zip(range(tasks), "ab" if apart else "..", strict=False)
     ]
     if leave_after:
         wait_for(leave_after, started[-1])
@@ -182,6 +179,16 @@ def test_two_tasks_leave_together_when_one_is_told_to(one: Path, scans: Path, tm
 
 
 @pytest.mark.slow
+def test_machines_whose_run_folders_differ_do_not_train(alone, scans: Path, tmp_path: Path):
+    run = Path(shutil.copytree(alone[0], tmp_path / "a" / "runs" / "alone"))
+    checkpoints_of(run)[0].unlink()
+    (tmp_path / "b").mkdir()
+    for task, (code, said) in enumerate(srun(tmp_path, scans, "name=alone", *TWO, tasks=2, apart=True)):
+        assert code == 2, said
+        assert f"process {task} starts from step {(10, 0)[task]}, on 9 of 12 scans" in said
+
+
+@pytest.mark.slow
 def test_two_processes_of_which_one_is_told_to_stop_leave_together(scans: Path, tmp_path: Path):
     held = tmp_path / "held"
     options = ["name=stopped", *EXACT, *TWO, "callbacks.requeue.every=2", *hold_at(5, held, seconds=5.0)]
@@ -213,7 +220,6 @@ def test_a_run_that_waits_for_another_machine_ends_when_told_to(scans: Path, tmp
         ({}, None),
         ({"SLURM_JOB_ID": "12"}, "12"),
         ({"SLURM_JOB_ID": "15", "SLURM_ARRAY_JOB_ID": "12", "SLURM_ARRAY_TASK_ID": "3"}, "12_3"),
-        ({"SLURM_JOB_ID": "12", "SLURM_JOB_NAME": "bash"}, None),
         ({"SLURM_JOB_ID": "12", "SLURM_JOB_NAME": "interactive"}, None),
     ],
 )
