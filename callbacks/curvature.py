@@ -15,6 +15,11 @@ class Curvature(Periodic):
 
     The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/bend`: an untrained flow
     is straight because its paths have almost no length. `r2flow report curvature` writes s(t) itself.
+
+    Args:
+        every: Steps between two measurements; 0 for none.
+        num: Scans per measurement.
+        steps: Euler steps per scan.
     """
 
     def __init__(self, seed: int, every: Natural = 500, num: Count = 2, steps: Count = 16) -> None:

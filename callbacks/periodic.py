@@ -51,6 +51,8 @@ class SamplePictures(Periodic):
 
     Args:
         folder: Folder of `step-XXXXXXXX.png`.
+        every: Steps between two pictures; 0 for none.
+        num: Scans per picture.
         steps: Steps per scan; None: the generator's default sampler.
     """
 

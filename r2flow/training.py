@@ -1,9 +1,11 @@
 """Training API: build and fit what a config describes.
 
-from r2flow.training import build, compose, fit
+    from r2flow.training import build, compose, fit
 
-result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
-result.metrics["val/loss"], result.checkpoint
+    result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
+    result.metrics["val/loss"], result.checkpoint
+
+The same command, or the same config, resumes from the last checkpoint.
 """
 
 import logging
