@@ -17,7 +17,7 @@ from r2flow.simulator.raycast import cast
 from r2flow.simulator.returns import report
 from r2flow.simulator.scene import Scene, SceneBuilder
 
-REVISION = 3  # of the scans: incremented with every change of the scans of a seed
+REVISION = 4  # of the scans: incremented with every change of the scans of a seed
 
 
 @dataclass(frozen=True)

@@ -161,34 +161,30 @@ class Ground:
         """
         s = np.geomspace(NEAREST, REACH, SAMPLES).astype(np.float32)[:, None]
         z = self.height(s * rays.cos, s * rays.sin)
-        distance = np.full(rays.shape, np.inf, np.float32)
-        steepness = np.zeros(rays.shape, np.float32)
-        for block in np.unique(rays.lasers.block):
-            rows = np.flatnonzero(rays.lasers.block == block)
-            distance[rows], steepness[rows] = _meet_profile(s, z, rays.slope[rows], rays.height[rows])
-        approach = steepness - rays.slope[:, None]  # approach of ray and ground per metre of s
-        cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + steepness**2))
+        distance, approach = _meet_profiles(s, z, rays)
+        cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + (approach + rays.slope[:, None]) ** 2))
+        if self.kerb > 0:
+            high, _ = _meet_profiles(s, z + np.float32(self.kerb), rays)
+            distance, cosine = self._step_up(distance, high, rays, cosine)
         met = np.isfinite(distance)
         cos, sin, approach = (np.broadcast_to(q, met.shape)[met] for q in (rays.cos, rays.sin, approach))
-        if self.kerb > 0:
-            distance[met], cosine[met] = self._step_up(distance[met], cos, sin, approach, cosine[met])
         if self.tufts > 0:
             distance[met] = self._overgrown(distance[met], cos, sin, approach)
         return distance, cosine
 
     def _step_up(
-        self, low: np.ndarray, c: np.ndarray, s: np.ndarray, approach: np.ndarray, cosine: np.ndarray
+        self, low: np.ndarray, high: np.ndarray, rays: Rays, cosine: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Raise everything except carriageways by the kerb.
 
-        A ray reaches the raised level first, kerb / approach before the low level. Off the street it ends there; over
-        the street it continues to the low level, or to the kerb's face if that is nearer.
+        A ray reaches the raised level first. Off the street it ends there; over the street it continues to the low
+        level, or to the kerb's face if that is nearer.
         """
-        high = np.maximum(low - np.float32(self.kerb) / approach, 0)
-        d_high, d_low = self.off_street(high * c, high * s), self.off_street(low * c, low * s)
+        far, near = np.minimum(low, np.float32(REACH)), np.clip(high, 0, REACH)
+        d_high, d_low = (self.off_street(s * rays.cos, s * rays.sin) for s in (near, far))
         face = (d_high <= 0) & (d_low > 0)
         share = d_high / np.where(face, d_high - d_low, 1)
-        distance = np.where(d_high > 0, high, np.where(face, high + share * (low - high), low))
+        distance = np.where(d_high > 0, high, np.where(face, near + share * (far - near), low))
         return distance, np.where(face, np.maximum(cosine, 0.6), cosine)
 
     def _overgrown(self, distance: np.ndarray, c: np.ndarray, s: np.ndarray, approach: np.ndarray) -> np.ndarray:
@@ -197,6 +193,16 @@ class Ground:
         share = np.clip((self.off_street(x, y) - self.pavement) * 2, 0, 1)  # grows over half a metre
         h = 0.25 * (2 + sine(2.3 * x + 1.1 * y) * sine(0.7 * x - 2.9 * y) + sine(4.1 * x - 3.3 * y)) * self.tufts
         return np.maximum(distance - share * h / np.maximum(approach, np.float32(0.02)), np.float32(0.5) * distance)
+
+
+def _meet_profiles(s: np.ndarray, z: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of `_meet_profile` for all blocks of lasers, and approach of ray and ground per metre of s."""
+    distance, approach = (np.empty(rays.shape, np.float32) for _ in range(2))
+    for block in np.unique(rays.lasers.block):
+        rows = np.flatnonzero(rays.lasers.block == block)
+        distance[rows], steepness = _meet_profile(s, z, rays.slope[rows], rays.height[rows])
+        approach[rows] = steepness - rays.slope[rows, None]
+    return distance, approach
 
 
 def _meet_profile(s: np.ndarray, z: np.ndarray, slope: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

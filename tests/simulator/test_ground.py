@@ -33,14 +33,15 @@ def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
     np.testing.assert_allclose(cosine[met, column], np.sin(np.arctan(0.1) - e[met]), atol=1e-4)
 
 
-def test_on_waves_a_ray_ends_where_it_first_meets_the_surface():
-    ground = Ground(OPEN, waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)))
+@pytest.mark.parametrize("kerb", [0.0, 0.12])  # all is off the street, and higher by the kerb
+def test_on_waves_a_ray_ends_where_it_first_meets_the_surface(kerb):
+    ground = Ground(OPEN, waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)), kerb=kerb)
     distance, _ = ground.meet(RAYS)
     met = np.isfinite(distance)
     s, a = np.where(met, distance, 1.0), np.broadcast_to(RAYS.azimuth, RAYS.shape)
     slope = np.broadcast_to(np.tan(RAYS.lasers.elevation)[:, None], RAYS.shape)
     for share, least, most in ((1.0, -0.03, 0.03), *((share, -0.02, np.inf) for share in (0.9, 0.6, 0.3))):
-        above = HEIGHT + share * s * slope - ground.height(share * s * np.cos(a), share * s * np.sin(a))
+        above = HEIGHT - kerb + share * s * slope - ground.height(share * s * np.cos(a), share * s * np.sin(a))
         assert ((above[met] > least) & (above[met] < most)).all()  # the profile's chords against the waves
 
 
