@@ -111,9 +111,11 @@ def _crossed(draws: ScalarDraws, main: Street) -> tuple[Street, ...]:
         half_width=half, pavement=draws.uniform(1.2, 2.5),
     )  # fmt: skip
     form = draws.pick(("cross", "left", "right", "end"), (0.4, 0.2, 0.2, 0.2))
+    for _ in range(20):  # to where the centre lines cross, `at` along the first and `middle` along the other
+        middle, _ = across.locate(*main.place(at, 0.0)[:2])
+        at, _ = main.locate(*across.place(middle, 0.0)[:2])
     if form == "end" and abs(at) > 12:
         return (main._replace(stop=at) if at > 0 else main._replace(start=at)), across
-    middle = main.offset + main.curvature * at * at / 2
     if form == "left":
         across = across._replace(start=middle)
     elif form == "right":

@@ -34,6 +34,16 @@ def test_no_hedge_stands_on_a_carriageway(seed, index):
             assert scene.ground.off_street(float(solid.x[k]), float(solid.y[k])) > 0
 
 
+def test_a_side_street_ends_on_the_street_that_it_joins():
+    ends = 0
+    for index in range(100):
+        main, *others = draw_scene(generator(5, "simulator", index)).ground.streets
+        for u in (u for other in others for u in (other.start, other.stop) if abs(u) < 1e5):
+            ends += 1
+            assert abs(main.locate(*others[0].place(u, 0.0)[:2])[1]) < main.half_width
+    assert ends > 20
+
+
 def digests() -> list[str]:
     """Of scans of three sensors."""
     views = [(HDL64E.resized(32, 512), 4), (SENSORS["os1_64"].resized(32, 256), 3), (SENSORS["vlp16"], 3)]
