@@ -162,7 +162,7 @@ class Blobs(NamedTuple):
         root = np.sqrt(np.maximum(d, 0))
         distance = (h - root) / a
         path = self.path[k]
-        distance += path * _depths(k, b, w, rng)
+        distance += path * _depths(k, b, w, rng) / np.sqrt(1 + slope**2)
         hit = (d > 0) & ((path == 0) | (distance < (h + root) / a))
         return Fragments((b * rays.columns + w)[hit], distance[hit], k[hit])
 
