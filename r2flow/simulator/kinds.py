@@ -34,20 +34,20 @@ class Kind(NamedTuple):
 KINDS = {
     "residential": Kind(
         share=0.45, half_width=(2.3, 3.5), pavement=(1.0, 2.0), setback=(0.5, 4.5), gap=6.0, storeys=(2, 3),
-        built=0.64, parked=0.48, plants=7.0, hedges=0.60, fences=0.30, people=1.5, traffic=1.3,
+        built=0.70, parked=0.43, plants=8.75, hedges=0.60, fences=0.30, people=1.5, traffic=1.3,
         paved=0.4, crossing=0.75,
     ),
     "urban": Kind(
         share=0.22, half_width=(3.2, 5.5), pavement=(1.8, 4.0), setback=(0.0, 3.0), gap=5.0, storeys=(3, 5),
-        built=0.74, parked=0.52, plants=4.0, hedges=0.08, fences=0.10, people=5.0, traffic=2.7, paved=1.0, crossing=0.8,
+        built=0.81, parked=0.47, plants=5.0, hedges=0.08, fences=0.10, people=5.0, traffic=2.7, paved=1.0, crossing=0.8,
     ),
     "suburb": Kind(
         share=0.25, half_width=(2.3, 3.4), pavement=(0.0, 2.0), setback=(2.0, 7.0), gap=12.0, storeys=(1, 2),
-        built=0.55, parked=0.30, plants=8.0, hedges=0.60, fences=0.22, people=0.6, traffic=1.0, paved=0.2, crossing=0.6,
+        built=0.61, parked=0.27, plants=10, hedges=0.60, fences=0.22, people=0.6, traffic=1.0, paved=0.2, crossing=0.6,
     ),
     "highway": Kind(
         share=0.08, half_width=(6.0, 9.0), pavement=(0.0, 0.0), setback=(14.0, 30.0), gap=30.0, storeys=(1, 4),
-        built=0.40, parked=0.0, plants=5.0, hedges=0.0, fences=0.0, people=0.0, traffic=5.0, paved=0.0, crossing=0.0,
+        built=0.44, parked=0.0, plants=6.25, hedges=0.0, fences=0.0, people=0.0, traffic=5.0, paved=0.0, crossing=0.0,
     ),
 }  # fmt: skip
 

@@ -42,6 +42,8 @@ def car(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -
     draws = b.draws
     form = draws.pick(_CARS, [form.share for form in _CARS])
     length, width = form.length * draws.uniform(0.94, 1.05), form.width * draws.uniform(0.97, 1.03)
+    if not b.take(x, y, yaw, length, width):
+        return
     ground, label = b.level(x, y), "moving-car" if moving else "car"
     dark = draws.chance(0.45)
     paint, albedo = ("dark paint", b.albedo("dark paint")) if dark else ("paint", draws.uniform(0.12, 0.62))
@@ -64,6 +66,8 @@ def car(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -
 def truck(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -> None:
     """A delivery van or lorry: cab in front of a box on wheels."""
     length, width, height = b.draws.uniform(5.5, 9.5), b.draws.uniform(2.0, 2.5), b.draws.uniform(2.4, 3.6)
+    if not b.take(x, y, yaw, length, width):
+        return
     ground, label = b.level(x, y), "moving-truck" if moving else "truck"
     cab = 1.9
     front, rear = _beside(x, y, yaw, (length - cab) / 2), _beside(x, y, yaw, -cab / 2)
@@ -76,7 +80,12 @@ def truck(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False)
             b.add(Boxes(*_beside(x, y, yaw, u, v), yaw, 0.9, 0.3, ground, ground + 0.9), label, "rubber")
 
 
-def bicycle(b: SceneBuilder, x: float, y: float, yaw: float, label: str = "bicycle") -> None:
+def bicycle(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
+    if b.take(x, y, yaw, 1.7, 0.5):
+        _cycle(b, x, y, yaw, "bicycle")
+
+
+def _cycle(b: SceneBuilder, x: float, y: float, yaw: float, label: str) -> None:
     """Two spoked wheels and a frame."""
     ground = b.level(x, y)
     for u in (-0.52, 0.52):
@@ -84,8 +93,10 @@ def bicycle(b: SceneBuilder, x: float, y: float, yaw: float, label: str = "bicyc
     b.add(Boxes(x, y, yaw, 0.9, 0.06, ground + 0.35, ground + 0.95), label, "metal", closed=0.5)
 
 
-def house(b: SceneBuilder, x: float, y: float, yaw: float, length: float, width: float, height: float) -> None:
-    """A block with rows of windows under a gable roof, sometimes with a bay or a porch."""
+def house(b: SceneBuilder, x: float, y: float, yaw: float, length: float, width: float, height: float) -> bool:
+    """A block with rows of windows under a gable roof, sometimes with a bay or a porch; False if there is no room."""
+    if not b.take(x, y, yaw, length, width):
+        return False
     ground = b.level(x, y)
     wall = "plaster" if b.draws.chance(0.75) else "brick"
     albedo = b.albedo(wall)
@@ -105,6 +116,7 @@ def house(b: SceneBuilder, x: float, y: float, yaw: float, length: float, width:
                 ground - 1, ground + b.draws.uniform(2.4, height),
             )  # fmt: skip
             b.add(bay, "building", wall, albedo, pattern=FACADE, base=ground)
+    return True
 
 
 def _clumps(
@@ -125,6 +137,8 @@ def _clumps(
 
 
 def tree(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
+    if not b.post(x, y):
+        return
     draws, ground = b.draws, b.level(x, y)
     trunk, clear = draws.uniform(0.07, 0.20) * size, draws.uniform(1.5, 2.8)
     crown, tall = draws.uniform(1.2, 2.6) * size, draws.uniform(1.2, 2.2) * size
@@ -194,6 +208,8 @@ def fence(b: SceneBuilder, x: float, y: float, yaw: float, length: float) -> Non
 
 def pole(b: SceneBuilder, x: float, y: float) -> None:
     """A lamp post."""
+    if not b.post(x, y):
+        return
     ground = b.level(x, y)
     tall = b.draws.uniform(4.5, 8.5)
     b.add(Cylinders(x, y, b.draws.uniform(0.05, 0.11), ground - 0.3, ground + tall), "pole", "metal")
@@ -203,6 +219,8 @@ def pole(b: SceneBuilder, x: float, y: float) -> None:
 
 def sign(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
     """A retro-reflecting plate on a post, facing along yaw."""
+    if not b.post(x, y):
+        return
     ground, low = b.level(x, y), b.draws.uniform(1.7, 2.4)
     size = b.draws.uniform(0.45, 0.8)
     b.add(Cylinders(x, y, 0.04, ground - 0.3, ground + low + size), "pole", "metal")
@@ -212,6 +230,8 @@ def sign(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
 
 def bollard(b: SceneBuilder, x: float, y: float) -> None:
     """A waist-high post with a reflecting band."""
+    if not b.post(x, y):
+        return
     ground, radius = b.level(x, y), b.draws.uniform(0.06, 0.12)
     tall = b.draws.uniform(0.8, 1.1)
     b.add(Cylinders(x, y, radius, ground, ground + tall), "pole", "metal")
@@ -219,11 +239,15 @@ def bollard(b: SceneBuilder, x: float, y: float) -> None:
 
 
 def bin_(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
+    if not b.post(x, y):
+        return
     ground, size = b.level(x, y), b.draws.uniform(0.45, 0.7)
     b.add(Boxes(x, y, yaw, size, size, ground, ground + 1.05), "other-object", "plastic")
 
 
 def cabinet(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
+    if not b.post(x, y):
+        return
     ground = b.level(x, y)
     box = Boxes(x, y, yaw, b.draws.uniform(0.6, 1.4), 0.4, ground, ground + b.draws.uniform(0.9, 1.4))
     b.add(box, "other-structure", "concrete")
@@ -231,6 +255,8 @@ def cabinet(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
 
 def person(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = True) -> None:
     """Two legs, a trunk, arms and a head."""
+    if not b.take(x, y, 0.0, 0.5, 0.5):
+        return
     ground, tall = b.level(x, y), b.draws.uniform(1.55, 1.9)
     label = "moving-person" if moving else "person"
     albedo, stride = b.albedo("cloth"), b.draws.uniform(0.05, 0.25)
@@ -244,7 +270,9 @@ def person(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = True)
 
 def cyclist(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
     """A rider on a bicycle."""
-    bicycle(b, x, y, yaw, "moving-bicyclist")
+    if not b.take(x, y, yaw, 1.7, 0.5):
+        return
+    _cycle(b, x, y, yaw, "moving-bicyclist")
     ground, albedo = b.level(x, y), b.albedo("cloth")
     b.add(Blobs(x, y, ground + 1.25, 0.22, 0.34, 0), "moving-bicyclist", "cloth", albedo)
     b.add(Blobs(*_beside(x, y, yaw, 0.1), ground + 1.68, 0.11, 0.13, 0), "moving-bicyclist", "skin")

@@ -49,7 +49,8 @@ def _house(b: SceneBuilder, kind: Kind, street: Street, side: int, u: float, len
     if not all(free(b, px, py, 0.3) for px, py, _ in (*corners, (x, y, 0))):
         return False
     height = 2.9 * draws.whole(*kind.storeys) + 0.3
-    objects.house(b, x, y, heading + draws.normal(0, 0.03), length, width, height)
+    if not objects.house(b, x, y, heading + draws.normal(0, 0.03), length, width, height):
+        return False
     if draws.chance(0.75):
         beyond(b, street, side, middle, edge + width)
     return True
@@ -190,7 +191,7 @@ def furnish(b: SceneBuilder, street: Street, side: int) -> None:
     """Lamp posts, signs, rows of trees, bollards, bins and bicycles along the kerb."""
     draws = b.draws
     edge = street.half_width + min(0.5, street.pavement / 2 + 0.2)
-    u, spacing, alley = max(-END, street.start) + draws.uniform(0, 25), draws.uniform(14, 32), draws.chance(0.3)
+    u, spacing, alley = max(-END, street.start) + draws.uniform(0, 25), draws.uniform(16, 37), draws.chance(0.3)
     while u < min(END, street.stop):
         x, y, heading = street.place(u, side * edge)
         if _clear(b, street, x, y, 0.6):

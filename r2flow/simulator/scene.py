@@ -1,5 +1,6 @@
 """Scenes: the ground and tables of solids with their surfaces."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, get_args
 
@@ -34,6 +35,26 @@ class Scene:
     rig: int | None = None  # index in `lasers.RIGS` of the ego vehicle, or None
 
 
+class Footprint(NamedTuple):
+    """The ground below an object: a rectangle with its length along (c, s)."""
+
+    x: float
+    y: float
+    c: float
+    s: float
+    length: float
+    width: float
+
+    def separated(self, other: "Footprint") -> bool:
+        """Whether a side of this rectangle separates it from another."""
+        dx, dy = self.x - other.x, self.y - other.y
+        cos, sin = abs(self.c * other.c + self.s * other.s), abs(self.c * other.s - self.s * other.c)
+        return (
+            2 * abs(dx * self.c + dy * self.s) >= self.length + other.length * cos + other.width * sin
+            or 2 * abs(dy * self.c - dx * self.s) >= self.width + other.length * sin + other.width * cos
+        )
+
+
 class SceneBuilder:
     """Collects the solids of a scene."""
 
@@ -41,10 +62,26 @@ class SceneBuilder:
         self.ground = ground
         self.draws = draws
         self._rows: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in get_args(Shape)}
+        self._taken: list[Footprint] = []
 
     def level(self, x: float, y: float) -> float:
         """Height of the ground at a position in metres, including the kerb."""
         return float(self.ground.height(x, y)) + self.ground.kerb * (self.ground.off_street(x, y) > 0)
+
+    def take(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
+        """Take a rectangle of ground for an object, unless another object has part of it."""
+        place = Footprint(x, y, math.cos(yaw), math.sin(yaw), length, width)
+        reach = length + width
+        for other in self._taken:
+            near = abs(x - other[0]) + abs(y - other[1]) < reach + other[4] + other[5]
+            if near and not (place.separated(other) or other.separated(place)):
+                return False
+        self._taken.append(place)
+        return True
+
+    def post(self, x: float, y: float) -> bool:
+        """Take the ground of something thin, unless it is another's or a carriageway."""
+        return bool(self.ground.off_street(x, y) > 0) and self.take(x, y, 0.0, 0.4, 0.4)
 
     def albedo(self, material: str) -> float:
         """Draw the reflectance of an object of a material."""

@@ -12,7 +12,8 @@ from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
-from r2flow.simulator.shapes import Boxes
+from r2flow.simulator.scene import BODY, FACADE
+from r2flow.simulator.shapes import Boxes, Cylinders, Frusta
 from tests.conftest import ROOT
 
 HDL64E = SENSORS["hdl64e"]
@@ -26,12 +27,28 @@ def scans():
 
 
 @pytest.mark.parametrize(("seed", "index"), [(77, 291), *((0, index) for index in range(24))])
-def test_no_hedge_stands_on_a_carriageway(seed, index):
-    # One across a junction once held the sensor: a scan without a return.
+def test_objects_stand_apart_and_off_the_carriageways(seed, index):
     scene = draw_scene(generator(seed, "simulator", index))
+    inside, blocks, posts = np.mgrid[-0.45:0.45:19j, -0.45:0.45:19j].reshape(2, -1), [], []
     for solid, surface in scene.tables:
-        for k in np.flatnonzero(surface.label == LABELS["vegetation"]) if isinstance(solid, Boxes) else ():
-            assert scene.ground.off_street(float(solid.x[k]), float(solid.y[k])) > 0
+        named = {name: surface.label == LABELS[name] for name in ("vegetation", "pole", "trunk")}
+        if isinstance(solid, Boxes):  # a hedge across a junction once held the sensor: a scan without a return
+            posts += [*np.stack(solid[:2], 1)[named["vegetation"]]]
+            blocks += [*np.stack(solid[:5], 1)[(surface.pattern == FACADE) & (solid.length * solid.width > 20)]]
+        elif isinstance(solid, Frusta):
+            blocks += [*np.stack(solid[:5], 1)[(surface.pattern == BODY) & (np.abs(solid.front - 0.12) < 1e-3)]]
+        elif isinstance(solid, Cylinders):
+            thin = np.stack(solid[:2], 1)[named["pole"] | named["trunk"]]
+            posts += [*thin]
+            blocks += [*np.pad(thin, ((0, 0), (0, 3)))]
+    assert all(scene.ground.off_street(float(x), float(y)) > -1e-3 for x, y in posts)
+    x, y, yaw, length, width = np.stack(blocks, 1)[..., None]
+    u, v = inside[0] * length, inside[1] * width
+    u, v = x + u * np.cos(yaw) - v * np.sin(yaw), y + u * np.sin(yaw) + v * np.cos(yaw)
+    for k, (x, y, yaw, length, width) in enumerate(blocks):
+        c, s, others = np.cos(yaw), np.sin(yaw), np.arange(len(blocks)) != k
+        along, across = ((u - x) * c + (v - y) * s)[others], ((v - y) * c - (u - x) * s)[others]
+        assert not ((abs(along) < 0.49 * length) & (abs(across) < 0.49 * width)).any()
 
 
 def test_a_side_street_ends_on_the_street_that_it_joins():
