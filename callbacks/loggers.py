@@ -19,7 +19,6 @@ from r2flow.errors import InputError, require
 from r2flow.registry import Registry
 
 PROJECT = "r2flow"
-Picture = Callable[[Any, str, np.ndarray, int], None]
 
 
 def _wandb(run_dir: Path) -> Logger:
@@ -58,7 +57,7 @@ LOGGERS: Registry[Callable[[Path], Logger]] = Registry(
 )
 
 # Functions that log a picture, (H, W, 3) uint8, by class of logger; other loggers do not take pictures.
-PICTURES: dict[type, Picture] = {
+PICTURES: dict[type, Callable[[Any, str, np.ndarray, int], None]] = {
     TensorBoardLogger: lambda log, name, pixels, step: log.experiment.add_image(name, pixels, step, dataformats="HWC"),
     WandbLogger: lambda log, name, pixels, step: log.log_image(name, [pixels], step),
     MLFlowLogger: lambda log, name, pixels, step: log.experiment.log_image(log.run_id, pixels, key=name, step=step),

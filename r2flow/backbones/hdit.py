@@ -245,9 +245,6 @@ class Block(nn.Module):
         return x
 
 
-LARGEST_LOG_SCALE = math.log(100.0)
-
-
 class Attention(nn.Module):
     """Cosine attention: logits s (q / |q|) . (k / |k|), rotated, with a learned scale s <= 100 per head."""
 
@@ -290,7 +287,7 @@ class Attention(nn.Module):
         """q, k and v, each (B, H, W, N, D), q and k of length sqrt(s) and rotated."""
         qkv = self.qkv_proj(self.norm(x, condition)).unflatten(-1, (3, self.heads, -1))
         qk, v = at_least_float32(qkv[..., :2, :, :]), qkv[..., 2, :, :]  # s would amplify q's and k's rounding
-        scale = at_least_float32(self.scale).clamp(max=LARGEST_LOG_SCALE).exp().sqrt()
+        scale = at_least_float32(self.scale).clamp(max=math.log(100.0)).exp().sqrt()
         qk = qk * (scale * qk.square().sum(-1, keepdim=True).clamp(min=1e-12).rsqrt())  # q / max(|q|, 1e-6)
         return *rotate(qk, table).to(v.dtype).unbind(-3), v
 

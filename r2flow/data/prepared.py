@@ -33,7 +33,6 @@ from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, read_manif
 log = logging.getLogger(__name__)
 
 KIND = "scans"
-SHARD_SCANS = 64  # 13 MB at 64 x 1024, held in memory until written
 PROBED = 8  # number of scans read to determine the levels of reflectance
 PROJECTION = 4  # revision; increase it when the same files give different images or codes
 
@@ -77,7 +76,7 @@ def plan_files(
     root: str | Path,
     drives: Sequence[Drive],
     reading: Reading,
-    shard_scans: int = SHARD_SCANS,
+    shard_scans: int = 64,  # 13 MB at 64 x 1024, held in memory until written
 ) -> PreparedStore:
     """The store in `folder` of scan files in drives below a root; reads some scans for the levels of reflectance."""
     root = Path(root).expanduser()

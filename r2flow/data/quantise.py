@@ -9,9 +9,7 @@ CODES = 2**16  # code 0: no return; codes 1 to 65535 increase from min_range to 
 STEP = 1.9e-3  # metres: half a step plus float32's rounding is below a millimetre
 KNEE = 65.0  # metres: limit of the fine step, if the sensor's range is too long for a single step
 
-# Reflectance levels of data sets: KITTI-360 n / 256, KITTI n / 100, others a byte n / 255.
-KNOWN_LEVELS = (256, 100)
-OTHER_LEVELS = 255
+OTHER_LEVELS = 255  # of reflectance: a byte n / 255
 ROUNDING = 1e-6  # some KITTI files store n * 0.01 in float32 instead of n / 100: 0.20000002
 
 
@@ -50,7 +48,7 @@ def reflectance_codes(levels: int) -> Codes:
 
 def find_levels(reflectance: np.ndarray) -> int:
     """The number of levels n for which all values are multiples of 1 / n, up to rounding; 255 if no known n fits."""
-    for levels in KNOWN_LEVELS:
+    for levels in (256, 100):  # KITTI-360, KITTI
         codes = reflectance_codes(levels)
         if np.abs(codes.values[codes.encode(reflectance)] - reflectance).max(initial=0) <= ROUNDING:
             return levels

@@ -20,7 +20,6 @@ from r2flow.model.sampling import draw
 from r2flow.models import MODELS
 from r2flow.noise import generator, standard_normal
 
-CHECKPOINTS = (".ckpt", ".pth", ".safetensors")
 LEARNED_FROM = 200  # number of evenly spaced real scans behind the mean and shuffled pixels
 AGAIN = 100  # largest half of the real scans for which a model is sampled again
 HALVES, AS_MANY = "real halves", ", as many"  # names, of a judged set as suffix
@@ -31,7 +30,7 @@ def is_checkpoint(text: str) -> bool:
     path = Path(text).expanduser()
     if path.is_dir():
         return bool(checkpoints_of(path)) or any(path.glob("step-*.ckpt"))
-    return path.suffix in CHECKPOINTS or (not path.exists() and text in MODELS)
+    return path.suffix in (".ckpt", ".pth", ".safetensors") or (not path.exists() and text in MODELS)
 
 
 def sampled_set(

@@ -24,7 +24,6 @@ from r2flow.samplers import Jump
 
 LAST = 1e-5  # smallest 1 - t that the velocity is divided by
 CANDIDATES = 7  # six of `Surroundings` and one predicted freely by the network
-BISECTIONS = 28
 FINEST = 1e-3  # smallest Laplace scale on log r
 FREE, SHIFT = 0.3, 0.02  # log r per unit of network output: of the free candidate, of a neighbour
 NEVER = -1e4  # logit of a missing candidate
@@ -54,7 +53,7 @@ class Answers:
         """Quantile of log r given a return, at u in (0, 1), (B, 1, H, W), by bisection."""
         p = self.logits.exp()
         low, high = (self.ranges - 20 * self.scales).amin(1, True), (self.ranges + 20 * self.scales).amax(1, True)
-        for _ in range(BISECTIONS):
+        for _ in range(28):
             middle = (low + high) / 2
             z = (middle - self.ranges) / self.scales
             below = (p * torch.where(z < 0, z.exp() / 2, 1 - (-z).exp() / 2)).sum(1, keepdim=True) < u

@@ -17,7 +17,6 @@ BLOCK = 2000  # scans per block: a kernel or matrix of distances takes 32 MB
 NEIGHBOURS = 5  # k of `Manifold`
 TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
 NAMES = ("precision", "recall", "density", "coverage")
-RIDGE = 1.0  # L2 penalty of `TwoSample` on the weights of standardised features
 STEPS = 25  # iterations of Newton's method
 SAME = 1e-5  # relative tolerance of equal scores
 FEW = (
@@ -255,7 +254,7 @@ def _classifier(real: Tensor, generated: Tensor) -> Callable[[Tensor], Tensor]:
     x = torch.cat([(x - centre) / spread, x.new_ones(len(x), 1)], 1)
     y = torch.cat([x.new_zeros(len(real)), x.new_ones(len(generated))])
     each = torch.cat([x.new_full((len(part),), len(y) / 2 / len(part)) for part in (real, generated)])
-    ridge = torch.eye(x.shape[1], dtype=x.dtype) * RIDGE
+    ridge = torch.eye(x.shape[1], dtype=x.dtype)  # an L2 penalty of 1 on the weights of standardised features
     ridge[-1, -1] = 1e-9
     w = x.new_zeros(x.shape[1])
     for _ in range(STEPS):

@@ -32,8 +32,6 @@ from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import Panel, write_page
 from r2flow.store import Store, read_manifest
 
-SHOWN = 4  # answers on a page
-
 
 @dataclass(frozen=True)
 class Job:
@@ -195,10 +193,10 @@ def _write(
 def _draw(
     checkpoint: Checkpoint, scan: PartialScan, out: Path, given: Partial, completed: Completed, truth: Partial | None
 ) -> None:
-    """Write `NAME.png` with two answers, `NAME.html` with more."""
+    """Write `NAME.png` with two answers, `NAME.html` with four."""
     rays = checkpoint.sensor.rays()
     whole = [("the whole scan", truth.image)] if truth else []
-    shown = completed.images.numpy()[:SHOWN]
+    shown = completed.images.numpy()[:4]
     answers = [(f"answer {number}" if len(shown) > 1 else "answer", image) for number, image in enumerate(shown)]
     first, *_ = named = [("what is known", given.image), *answers, *whole]
     write_page(out / f"{scan.name}.html", [Panel(name, image[None], rays) for name, image in named], scan.name)

@@ -22,8 +22,6 @@ from r2flow.reports.tables import table
 
 log = logging.getLogger(__name__)
 
-MOST_CURVED = 200  # paths drawn, as in the paper's figure 8 (b)
-
 
 def measure_paths(
     checkpoint: Checkpoint,
@@ -32,7 +30,7 @@ def measure_paths(
     steps: int = 256,
     seed: int = 0,
     batch_size: int = 1,
-    most_curved: int = MOST_CURVED,
+    most_curved: int = 200,  # as in the paper's figure 8 (b)
     progress: Progress = None,
 ) -> Straightness:
     """s(t) over `steps` Euler steps of scans 0 to num - 1 of a seed, and the most curved paths.

@@ -27,7 +27,6 @@ from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
 from r2flow.reports.tables import Row, shown, table
 
-FRAMES = 6  # frames of figure 3, as in the paper: round trips of both ends, and four in between
 PROTOCOL = "paper, 10000 scans of 64x1024 against"  # of the printed rows, all scans of KITTI-360
 MANY = 16  # minimum evaluations of a row to compare with the paper's 256
 
@@ -178,7 +177,7 @@ def same_architecture(parameters: int) -> Architecture | None:
 def between_figure(checkpoint: Checkpoint, real: ScanSet) -> Figure:
     """Figure 3: interpolation between two distant scans of the set."""
     ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])
-    result = interpolate_scans(checkpoint, torch.from_numpy(ends), FRAMES)
+    result = interpolate_scans(checkpoint, torch.from_numpy(ends), 6)  # as in the paper, with round trips of both ends
     frames = result.images.nan_to_num(0.0).numpy()
     return interpolation_figure(ends, frames, result.weights.tolist(), checkpoint.sensor.rays(), ("first", "last"))
 

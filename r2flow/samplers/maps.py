@@ -15,7 +15,6 @@ from r2flow.registry import Bound, Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Sampler, Steps
 
 Until = Annotated[float, Bound("above 0 and at most 0.98", lambda t: 0 < t <= 0.98)]
-LEADING = 4  # fewest steps of the ODE
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class Refine(Renoise):
     def leading(self) -> int:
         """Number of steps of the ODE."""
         first = self.steps - min(self.jumps, self.steps // 2)
-        return first if first >= LEADING else 0
+        return first if first >= 4 else 0
 
     def times(self) -> Tensor:
         if self.grid is not None or not self.leading:

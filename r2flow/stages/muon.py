@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-NEWTON_SCHULZ = 3.4445, -4.7750, 2.0315
 LEAST_CHANNELS = 8  # fewer: input or output layer of an image
 
 
@@ -71,7 +70,7 @@ def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
 
     Newton-Schulz iteration: each step is the polynomial a X + (b A + c A A) X with A = X X^T, in bfloat16.
     """
-    a, b, c = NEWTON_SCHULZ
+    a, b, c = 3.4445, -4.7750, 2.0315
     x = matrix.T if matrix.shape[0] > matrix.shape[1] else matrix
     x = (x / (torch.linalg.matrix_norm(x) + 1e-7)).bfloat16()
     for _ in range(steps):

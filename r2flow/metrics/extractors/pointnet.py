@@ -6,7 +6,6 @@ from torch import Tensor, nn
 from r2flow.metrics.extractors.base import Extractor, nan_where_empty
 from r2flow.metrics.scans import Scans
 
-SCALE = 80.0  # metres: divisor of points, for every sensor
 CHUNK = 16384  # points per pass: 1024 channels of them take 64 MiB
 
 
@@ -89,4 +88,4 @@ class PointNet(Extractor):
 
         Features are maxima over points, so the number of points at the origin does not matter.
         """
-        return nan_where_empty(self(scans.xyz.flatten(2).to(self.device) / SCALE), scans)
+        return nan_where_empty(self(scans.xyz.flatten(2).to(self.device) / 80.0), scans)  # for every sensor

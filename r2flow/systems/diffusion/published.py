@@ -11,7 +11,6 @@ from r2flow.model.published import published_config as flow_config
 RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
 PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}
 NETWORK = "model."  # prefix of the network's weights in the file; other entries are empty
-MIN_RANGE, MAX_RANGE = 1.45, 80.0  # metres; class attributes in the published code, not saved
 
 
 def holds(content: Any) -> bool:
@@ -34,7 +33,7 @@ def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
     data, diffusion = cfg["data"], cfg["diffusion"]
     if diffusion["timestep_type"] != "continuous" or not data["train_depth"]:
         raise InputError("only diffusions of range in continuous time are read, which its config does not describe.")
-    limits = {"min_depth": MIN_RANGE, "max_depth": MAX_RANGE}
+    limits = {"min_depth": 1.45, "max_depth": 80.0}  # class attributes in the published code, not saved
     config = flow_config({**cfg, "data": {**limits, **data, "data_format": RANGES[data["depth_format"]]}})
     config["encoding"]["limits"] = "open"
     config["generator"] = {
