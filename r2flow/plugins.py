@@ -62,7 +62,6 @@ def plugin_digests() -> list[str]:
 
 
 def _identity(name: str) -> str:
-    """The module name, or the absolute path of a file."""
     return str(Path(name).expanduser().resolve()) if name.endswith(".py") else name
 
 

@@ -166,7 +166,6 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
 
 
 def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
-    """Check a config and complete it with values of its parent."""
     check_trainer(config["trainer"])
     check_options("samples", SampleOptions, config["samples"])
     with made_with(parent.config if parent else {}, "the run that it starts from"):
@@ -296,7 +295,6 @@ def fit(run: Run) -> Result:
 
 
 def _fit_in_folder(run: Run, stopping: Stopping) -> int:
-    """Fit a run in its folder; returns the step reached."""
     last = open_run(run.folder, run.config, locked=run.trainer.is_global_zero)
     if last is not None and step_of(last) >= run.trainer.max_steps:
         if run.trainer.is_global_zero:

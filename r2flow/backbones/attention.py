@@ -114,8 +114,7 @@ def _tile_mask(seen_h: Tensor, seen_w: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def _tile_sees(axis: _Axis, tile: int, keys: Tensor) -> Tensor:
-    """Whether each key of a tile is in each query's window, (tiles, tile, keys), by position: on a narrow ring a token
-    has several. On a ring all tiles are equal."""
+    """Whether each key of a tile is in each query's window, (tiles or 1, tile, keys), by position on the ring."""
     if axis.wrap:
         keys = keys[:1]
     queries = torch.arange(len(keys) * tile, device=keys.device)

@@ -124,7 +124,6 @@ class ScanDataModule(L.LightningDataModule):
         return open_source(options, reading, self.seed, first_scene)
 
     def _order(self, source: Mixture | PairSource) -> MixedOrder | Permutations:
-        """Order of the scans: maps image k of the run to a scan."""
         weights = [part.weight for part in self.parts if part.weight is not None]
         if isinstance(source, Mixture) and len(weights) > 1:
             return MixedOrder([len(part) for part in source.parts], weights, self.seed)

@@ -95,7 +95,6 @@ def plan_files(
 
 
 def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
-    """Levels of reflectance; None if the scans lack reflectance."""
     if lacks_reflectance(paths, "skip", reading.columns) is not None:
         return None
     samples = []

@@ -95,7 +95,6 @@ def _is_scattered(scan: Points) -> bool:
 
 
 def _by_laser(elevations: list[np.ndarray], lasers: list[np.ndarray], order: str) -> Beams:
-    """Beams from the laser of each point."""
     together, laser = np.concatenate(elevations), np.concatenate(lasers)
     seen = np.flatnonzero(np.isfinite(together) & (laser >= 0))
     seen = seen[np.argsort(laser[seen], kind="stable")]

@@ -133,11 +133,9 @@ def _family(name: str) -> str:
 
 
 def _distance(beams: np.ndarray, table: np.ndarray) -> float:
-    """Distance between beams and a table in degrees: the 80th percentile over beams, paired in order.
+    """Distance in degrees: the 80th percentile over beams, paired in order at the best offset, as scans may be cropped.
 
-    The offset of the pairing minimises the distance, since a scan may be cropped and rings above the horizon may see
-    only sky. If beams are missing in between, later pairs are wrong: for tables with widely spaced beams, the median
-    distance to the nearest beam is used instead.
+    With beams missing in between, later pairs are wrong: then the median distance to the nearest of well spaced beams.
     """
     longer, shorter = (table, beams) if len(table) >= len(beams) else (beams, table)
     if len(longer) > 1.05 * len(table) + 1:
@@ -181,8 +179,7 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
 
 
 def _height(xyz: np.ndarray) -> float | None:
-    """Height above the ground: the lowest frequent height of returns 3 to 20 m away, or None. The most frequent one
-    may be that of hedges and cars."""
+    """The lowest frequent height of returns 3 to 20 m away, or None; the most frequent may be of hedges and cars."""
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
     z = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2), 2]
     counts, edges = np.histogram(z, np.arange(-6, -0.1, 0.1))

@@ -40,8 +40,7 @@ INTERPOLATIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 
 
 def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate between the known positions of each line, (C, lines, positions), with `extend` also beyond them;
-    returns values and known mask."""
+    """Values and known mask of lines, (C, lines, positions), between their known positions, `extend`: also beyond."""
     count = known.shape[1]
     at, lines = np.arange(count), np.arange(len(known))[:, None]
     left, right = nearest_known(known)

@@ -128,11 +128,7 @@ def image_of_same(image: np.ndarray, target: Sensor) -> Partial:
 def _cast(
     target: Sensor, xyz: np.ndarray, pixel: np.ndarray, empty: np.ndarray, reflectance: np.ndarray | None
 ) -> Partial:
-    """The image of returns at their pixels, and of pixels of rays without a return.
-
-    A return nearer than the target's minimum range is the vehicle itself, and the space behind it was not measured; a
-    return beyond the maximum range is not a return for the target.
-    """
+    """The image of returns at their pixels; one too near is the vehicle and hides its pixel, one too far is empty."""
     r = np.linalg.norm(xyz, axis=1).astype(np.float32)
     near, far = r < target.min_range, r > target.max_range
     pixels = math.prod(target.shape)

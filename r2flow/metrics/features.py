@@ -139,8 +139,7 @@ class KernelDistance(FeatureMetric):
 
 
 def _mean(x: Tensor, y: Tensor) -> Tensor:
-    """Mean of k - 1 over all pairs of two sets, which cancels the 1 in MMD^2; if x is y, without pairs of a scan with
-    itself."""
+    """Mean of k - 1 over the pairs of two sets (the 1 cancels in MMD^2), without pairs of a scan with itself."""
     total = x.new_zeros((), dtype=torch.float64)
     for i, a in blocks(x, BLOCK):
         for j, b in blocks(y, BLOCK):

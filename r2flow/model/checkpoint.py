@@ -259,7 +259,6 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
 
 
 def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
-    """Build the generator of a file's content, on the CPU; see `load_checkpoint`."""
     published = next((known for known in FORMATS.values() if known.holds(content)), None)
     if published is not None:
         converted = published.read(content, path, averaged)

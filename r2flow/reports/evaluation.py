@@ -191,7 +191,6 @@ def _first(comparisons: Sequence[Comparison], metric: str) -> list[tuple[float, 
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
-    """Distinct remarks, with their metrics and comparisons."""
     lines = []
     distances = _distances(comparisons)
     if any(distances.values()) and len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:

@@ -183,7 +183,6 @@ def between_figure(checkpoint: Checkpoint, real: ScanSet) -> Figure:
 
 
 def _birds_eye(images: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
-    """Bird's-eye histogram of scans, (100, 100)."""
     rays = checkpoint.sensor.rays()
     return np.sum([birds_eye_histogram(image_to_points(image, rays)[0]) for image in images], axis=0)
 

@@ -250,7 +250,6 @@ def _strip(axes: Any, title: str, background: str = "black") -> None:
 
 
 def _bar(axes: Any, drawn: Any, ticks: Mapping[float, float]) -> None:
-    """Colour bar at the right edge of the axes."""
     bar = axes.figure.colorbar(drawn, cax=axes.inset_axes((1.012, 0, 0.014, 1)))
     bar.set_ticks([*ticks.values()], labels=[f"{tick:g}" for tick in ticks])
     bar.outline.set_linewidth(0.5)

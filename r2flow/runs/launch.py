@@ -148,8 +148,7 @@ def job_folder(arguments: Sequence[str], overrides: str) -> str:
 def _job(
     arguments: Sequence[str], command: Sequence[str], ended: list[tuple[int, str]], launcher: int, config: DictConfig
 ) -> None:
-    """The task that Hydra runs; SystemExit carries the exit code, since Hydra catches only `Exception`. `ended`
-    collects the unfinished jobs of a sweep for the process `launcher`."""
+    """The task that Hydra runs; SystemExit carries the exit code, since Hydra catches only `Exception`."""
     try:
         given = list(HydraConfig.get().overrides.task)
         # Check the command line, not the overrides: a config file can make a sweeper add overrides.
@@ -199,7 +198,6 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
 
 
 def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str]) -> int:
-    """Run the links of a config's `chain`, then the report on them."""
     from r2flow.runs.chain import is_finished, is_noted, links_of, note, run_chain
 
     if settings["trainer"]["fast_dev_run"]:

@@ -89,8 +89,7 @@ ABSENT = object()
 
 
 def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapping[str, Any], parent: Parent) -> Any:
-    """The parent's value of a key, or ours if the command line gives it and it may differ; refuses values that do not
-    fit the parent's weights."""
+    """The parent's value of a key, or ours if given and it may differ; refuses values that its weights do not fit."""
     group, may_differ = key.partition(".")[0], inherited(key, config) == "unless_given"
     if key == group and (ours is None or not isinstance(theirs, Mapping) or (may_differ and key in asked)):
         return ours if isinstance(theirs, Mapping) and may_differ and key in asked else theirs

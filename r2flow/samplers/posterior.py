@@ -163,11 +163,10 @@ class MMPS(Posterior):
 
 
 def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, steps: int) -> Tensor:
-    """B S^-1 r for a positive S, per scan, with `multiply(p)` = (B p, S p).
+    """B S^-1 r for a positive S, per scan, with `multiply(p)` = (B p, S p), by conjugate gradients.
 
-    The result is that of conjugate gradients or, if their squared residual exceeds `GROWN` r r, of the combination of
-    the same directions with the smallest residual: a network's J is not exactly symmetric, so that the residual of
-    conjugate gradients can grow. A scan stops at a residual of 0 (to rounding) or if S is not positive along p.
+    Where their squared residual exceeds `GROWN` r r, as a network's J is not exactly symmetric, it is the combination
+    of the same directions with the smallest residual. A scan stops at a residual of 0 or if S is not positive along p.
     """
     p, rr, solution = r, _dot(r, r), torch.zeros(())
     active = torch.ones_like(rr, dtype=torch.bool)

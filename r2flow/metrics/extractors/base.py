@@ -174,7 +174,6 @@ def _unpacked(path: Path) -> dict[str, bytes]:
 
 
 def _joined(path: Path, members: Mapping[str, bytes]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors of all parts, by name, and the config."""
     parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}") for part in PARTS if part in members]
     check(parts, f"{path} holds none of {', '.join(PARTS)}; give the published archive.")
     with telling(path / CONFIG):
@@ -193,7 +192,6 @@ def _read_torch(file: IO[bytes], name: str) -> dict[str, Tensor]:
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors of a safetensors file, and the notes of `add`."""
     with telling(path):
         tensors, metadata = read_tensors(path)
         return tensors, {"config": {}, "weights": "", "source": path.name, **json.loads(metadata.get(NOTES, "{}"))}

@@ -231,8 +231,7 @@ class HandcraftedRange(Handcrafted):
 
 
 def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> tuple[Tensor, Tensor]:
-    """Means over equal parts of n rows or columns, (B, cells), from their sums `total` and numbers of summands `count`,
-    (B, n) each; and the share of counted rays, with `rays` the maximum count of a row or column."""
+    """Means over equal parts of rows or columns, (B, cells), from sums and counts, (B, n), and the shares counted."""
     n = F.adaptive_avg_pool1d(count, cells)
     return F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays
 

@@ -158,7 +158,6 @@ class RangeNet21(RangeNet):
 
 
 def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Mean and standard deviation of each channel from the release's arch_cfg.yaml."""
     try:
         sensor = config["dataset"]["sensor"]
         mean, std = (tuple(float(value) for value in sensor[key])[:channels] for key in ("img_means", "img_stds"))

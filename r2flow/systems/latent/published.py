@@ -141,7 +141,6 @@ def _notes(path: Path) -> Mapping[str, Any]:
 
 
 def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> dict[str, Any]:
-    """Build the config of a file, with the data settings of its `config.yaml`."""
     if not notes:
         heads = f", attention heads of {HEAD} channels" if generator["name"] == "latent_diffusion" else ""
         log.warning(
