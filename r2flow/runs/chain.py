@@ -139,13 +139,10 @@ def run_process(command: Sequence[str]) -> int:
 
     process: subprocess.Popen[bytes] | None = None
     with listening(pass_on):
-        process = subprocess.Popen(command, preexec_fn=_die_with_parent if sys.platform == "linux" else None)
+        # PR_SET_PDEATHSIG: a run that outlived its chain or sweep would block the same command when given again.
+        end = (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL)) if sys.platform == "linux" else None
+        process = subprocess.Popen(command, preexec_fn=end)
         if received:
             process.send_signal(received[0])
         code = process.wait() or -next(iter(received), 0)
     return code_of(-code) if code < 0 else code
-
-
-def _die_with_parent() -> None:
-    """End a run with its chain or sweep: otherwise it would block the same command when given again."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
