@@ -36,7 +36,11 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, target)
-        _sync_folder(target.parent)
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
     except OSError as error:
         if error.errno is None:  # numpy's error of an incomplete write
             error = OSError(errno.ENOSPC, f"cannot be written whole, is there room? ({error})")
@@ -105,14 +109,6 @@ def telling(path: Path) -> Iterator[None]:
             raise
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160].rstrip('.')}"
         raise InputError(f"{path} is not a readable {path.suffix} file ({reason}). Is it damaged?") from error
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def cache_folder(variable: str, name: str = "") -> Path:
