@@ -33,7 +33,6 @@ from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, read_manif
 log = logging.getLogger(__name__)
 
 KIND = "scans"
-PROBED = 8  # number of scans read to determine the levels of reflectance
 PROJECTION = 4  # revision; increase it when the same files give different images or codes
 
 
@@ -98,7 +97,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
     if lacks_reflectance(paths, "skip", reading.columns) is not None:
         return None
     samples = []
-    for index in spread(len(paths), PROBED):
+    for index in spread(len(paths), 8):
         with suppress(InputError):  # reported when the scan is prepared
             samples.append(read_image(Path(paths[index]), replace(reading, reflectance=True))[1])
     values = np.concatenate(samples) if samples else np.zeros(0)

@@ -21,8 +21,6 @@ from r2flow.plugins import plugin_digests
 from r2flow.processes import place
 from r2flow.store import checksum
 
-MOST_BASELINES = 1000  # largest number of scans of a baseline
-
 Kind = Literal["judged", "reference", "baseline"]
 Pair = tuple[Kind, str, ScanSet, ScanSet]  # kind, name, real scans, scans compared with them
 
@@ -50,7 +48,7 @@ def pairs_of(
     if reference or (judged and reference is None and len(real) > 1):
         pairs += [("reference", name, *sets) for name, sets in reference_sets(real, judged).items()]
     if baselines or (judged and baselines is None):
-        num = min(max((len(scans) for scans in judged.values()), default=len(real)), MOST_BASELINES)
+        num = min(max((len(scans) for scans in judged.values()), default=len(real)), 1000)
         pairs += [("baseline", name, real, scans) for name, scans in baseline_sets(real, num).items()]
     return pairs
 

@@ -20,7 +20,6 @@ from r2flow.model.sampling import draw
 from r2flow.models import MODELS
 from r2flow.noise import generator, standard_normal
 
-LEARNED_FROM = 200  # number of evenly spaced real scans behind the mean and shuffled pixels
 AGAIN = 100  # largest half of the real scans for which a model is sampled again
 HALVES, AS_MANY = "real halves", ", as many"  # names, of a judged set as suffix
 
@@ -156,7 +155,7 @@ BASELINES = {
 
 
 def baseline_sets(real: ScanSet, num: int) -> dict[str, ScanSet]:
-    """Each baseline as a set of `num` scans, computed from a subset of the real scans."""
-    subset = real.spread(LEARNED_FROM)
+    """Each baseline as a set of `num` scans, computed from 200 evenly spaced real scans."""
+    subset = real.spread(200)
     training = np.concatenate([batch.numpy() for batch in subset.batches(range(len(subset)), 8)])
     return {name: ScanSet(name, Baseline(name, training, real.sensor, range(num)), real.sensor) for name in BASELINES}

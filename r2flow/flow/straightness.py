@@ -17,8 +17,6 @@ from torch import Tensor
 
 from r2flow.flow.solvers import Velocity, solve
 
-Progress = Callable[[], None] | None
-
 
 class Straightness(NamedTuple):
     """s(t) per scan, and the paths of the most curved elements of all scans."""
@@ -37,7 +35,7 @@ class Straightness(NamedTuple):
 
 @torch.no_grad()
 def straightness(
-    velocity: Velocity, x_0: Tensor, steps: int = 256, most_curved: int = 0, progress: Progress = None
+    velocity: Velocity, x_0: Tensor, steps: int = 256, most_curved: int = 0, progress: Callable[[], None] | None = None
 ) -> Straightness:
     """s(t) per scan at the times of `steps` Euler steps from noise, (N, ...), and the `most_curved` elements.
 
