@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.registry import Positive
 
 
@@ -123,8 +123,7 @@ class Backbone(ExactBuffers):
         Rows and columns are neighbours, ascending; columns may wrap around the ring. The part ignores the rest of the
         image and does not wrap a cropped turn, so that its field differs, mostly near the edges of the crop.
         """
-        if not self.croppable:
-            raise InputError(f"a {type(self).__name__} cannot be evaluated on a part of its image: ask for all of it.")
+        check(self.croppable, f"a {type(self).__name__} cannot be evaluated on a part of its image: ask for all of it.")
         for what, numbers, unit in zip(("rows", "columns"), (rows, columns), self.unit, strict=True):
             assert len(numbers) % unit == int(numbers[0]) % unit == 0, f"{what} must be whole units of {unit}"
         part = copy.deepcopy(self, {id(parameter): parameter for parameter in self.parameters()})

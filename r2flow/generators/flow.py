@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones import build_backbone
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.solvers import Solution, Velocity, solve
 from r2flow.generators.base import Condition, Generator
@@ -87,9 +87,8 @@ class NetworkFlow(Flow):
 
         Only the velocity u(x, t, t) of a flow map is copied. Ray coordinates are not copied if the rays differ.
         """
-        parent_answer = getattr(parent, "answer", self.answer)
-        if parent_answer != self.answer:
-            raise InputError(f"the parent's network tells {parent_answer}, and this one learns {self.answer}.")
+        theirs = getattr(parent, "answer", self.answer)
+        check(theirs == self.answer, f"the parent's network tells {theirs}, and this one learns {self.answer}.")
         state = self.state_dict()
         added = parent.backbone.second_time_names() if isinstance(parent, NetworkFlow) else frozenset[str]()
         inherited = {
