@@ -82,7 +82,14 @@ def page(panels: Sequence[Panel], title: str = "r2flow") -> str:
         "legend": list(dict(classes.values()).items()),
         "shown": {"reflectance": any(s["reflectance"] for s in scans), "label": any(s["labels"] for s in scans)},
     }
-    return _filled(contents, title)
+    # The content security policy allows only this script and this style, by hash.
+    part = {name: files(__package__).joinpath(f"view.{name}").read_text("utf-8") for name in ("html", "css", "js")}
+    # Only "<" could end the script element.
+    data = json.dumps(contents, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return Template(part["html"]).substitute(
+        title=html.escape(printable(title)), data=data, style=part["css"], script=part["js"],
+        style_hash=_hash(part["css"]), script_hash=_hash(part["js"]),
+    )  # fmt: skip
 
 
 def write_page(path: str | Path, panels: Sequence[Panel], title: str = "r2flow") -> Path:
@@ -128,17 +135,6 @@ def _numbered(ids: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarra
     table = np.zeros(int(max(ids.max(initial=0), *classes, 0)) + 1, np.uint8)
     table[list(classes)] = np.arange(1, len(classes) + 1)
     return table[ids]
-
-
-def _filled(contents: dict[str, Any], title: str) -> str:
-    # The content security policy allows only this script and this style, by hash.
-    part = {name: files(__package__).joinpath(f"view.{name}").read_text("utf-8") for name in ("html", "css", "js")}
-    # Only "<" could end the script element.
-    data = json.dumps(contents, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    return Template(part["html"]).substitute(
-        title=html.escape(printable(title)), data=data, style=part["css"], script=part["js"],
-        style_hash=_hash(part["css"]), script_hash=_hash(part["js"]),
-    )  # fmt: skip
 
 
 def _hash(text: str) -> str:
