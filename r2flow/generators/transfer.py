@@ -24,7 +24,6 @@ from r2flow.samplers import Jump
 
 LAST = 1e-5  # smallest 1 - t that the velocity is divided by
 CANDIDATES = 7  # six of `Surroundings` and one predicted freely by the network
-FINEST = 1e-3  # smallest Laplace scale on log r
 FREE, SHIFT = 0.3, 0.02  # log r per unit of network output: of the free candidate, of a neighbour
 NEVER = -1e4  # logit of a missing candidate
 REFLECTANCE = 0.265  # mean reflectance of returns to which scans of other sensors are scaled: of simulated scans
@@ -140,7 +139,7 @@ class TransferFlow(Flow):
         present = torch.cat([about.there, torch.ones_like(about.there[:, :1])], 1)
         logits = (logits + bias).masked_fill(~present, NEVER).log_softmax(1)
         ranges = torch.cat([about.ranges + SHIFT * shifts[:, :6], about.guess + FREE * shifts[:, 6:]], 1)
-        scales = (scales - 4).clamp(max=2).exp() + FINEST
+        scales = (scales - 4).clamp(max=2).exp() + 1e-3  # of Laplace densities on log r
         nearest = about.strengths.gather(1, about.there.int().argmax(1, keepdim=True))
         strengths = torch.cat([about.strengths, nearest], 1) + strength * (FOREIGN if self.foreign else 1.0)
         returns = torch.where(about.sure != 0, -NEVER * about.sure, returns + 1)

@@ -5,7 +5,6 @@ import numpy as np
 from r2flow.errors import InputError, check
 from r2flow.lidar.sensors import Convention, Sensor
 
-SAMPLE = 256  # number of firings from which their order is estimated
 SURE = 0.9  # minimum share of neighbouring lasers whose elevations decrease in that order
 
 
@@ -110,7 +109,7 @@ def rows_from_firings(xyz: np.ndarray, sensor: Sensor) -> np.ndarray | None:
     firings = len(xyz) // rows
     if len(xyz) % rows or firings < 8:
         return None
-    sample = np.linspace(0, firings - 1, min(firings, SAMPLE)).astype(np.int64)
+    sample = np.linspace(0, firings - 1, min(firings, 256)).astype(np.int64)
     elevation = elevations_of(xyz.reshape(firings, rows, 3)[sample].reshape(-1, 3)).reshape(-1, rows)
     middle, scatter = scatter_of(elevation)
     if not scatter < 0.25:

@@ -16,8 +16,6 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, Samples, draw, warn_unsolved
 from r2flow.samplers import Transport, build_sampler, parse_sampler
 
-ANSWER = 2**32  # offset of the noise number between answers: answer 0 to scan i has the noise of sample i
-
 
 class Completed(Samples):
     """The answers to scan number `first`, with reflectance if the model has it."""
@@ -114,7 +112,7 @@ def complete(
         evaluations, converged, seconds = torch.zeros(num, dtype=torch.int64), torch.ones(num, dtype=torch.bool), 0.0
         for start in range(0, 0 if bool(known.all()) else num, batch_size):
             at = slice(start, min(start + batch_size, num))
-            numbers = [first + i + answer * ANSWER for answer in range(at.start, at.stop)]
+            numbers = [first + i + answer * 2**32 for answer in range(at.start, at.stop)]  # of noise: 0 is sample i's
             given = {name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()}
             drawn = draw(
                 generator, numbers, seed, how if any_known else plain, given if any_known else None,

@@ -20,7 +20,6 @@ from r2flow.reports.tables import table
 from r2flow.reports.view import Panel, most_images, write_page
 
 MOST = 8  # maximum number of frames in the figure, evenly spaced
-BETWEEN = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
 ENDS = {
     "scan": "scan", "rms": "RMS, model space", "median_m": "median, m", "dropped": "rays lost or gained",
     "noise_std": "std of x_0", "converged": "converged",
@@ -50,7 +49,7 @@ def interpolation(
         "frames from spherical interpolations (slerp) of it. The first and last frames are round trips of the scans; "
         "their evaluations include both directions.",
         table(ends_rows, ENDS),
-        table(rows, BETWEEN),
+        table(rows, {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}),
     )
     first, last = (Panel(f"real: {name}", image[None], rays) for name, image in zip(names, pair.numpy(), strict=True))
     chosen = spread(len(images), most_images(images.shape) - 2)

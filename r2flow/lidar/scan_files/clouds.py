@@ -14,7 +14,6 @@ import numpy as np
 from r2flow.errors import check
 from r2flow.lidar.scan_files.points import NoPointsError
 
-HEADER_LIMIT = 1 << 16  # bytes; a header has a few hundred
 PCD_KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 PCD_TYPES = {f"{kind}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {"F4", "F8"}
 PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -194,7 +193,7 @@ def _split_header(data: bytes, last: str) -> tuple[list[list[str]], int]:
     """The words of each line of a text header up to the line that begins with `last`, and the offset after it."""
     lines: list[list[str]] = []
     start = 0
-    while (end := data.find(b"\n", start, HEADER_LIMIT)) >= 0:
+    while (end := data.find(b"\n", start, 1 << 16)) >= 0:  # a header has a few hundred bytes
         words = data[start:end].decode("ascii", "replace").split()
         start = end + 1
         if words:

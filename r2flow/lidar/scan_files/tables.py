@@ -14,7 +14,6 @@ from r2flow.errors import check, require
 from r2flow.lidar.scan_files.clouds import Table
 from r2flow.lidar.scan_files.points import MOST_COLUMNS, ROLES, find_roles
 
-MOST_UNPACKED = 100  # maximum expansion of a compressed file, plus 1 MiB
 TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar", "scan", "data", "arr_0")
 
 
@@ -183,7 +182,7 @@ READERS = {
 
 def check_unpacked(path: Path, size: int) -> None:
     """Refuse a compressed file that declares far more bytes than its size allows."""
-    most = MOST_UNPACKED * path.stat().st_size + (1 << 20)
+    most = 100 * path.stat().st_size + (1 << 20)
     check(0 <= size <= most, f"it unpacks to {size:,} bytes, far more than its own size. Is it damaged?")
 
 

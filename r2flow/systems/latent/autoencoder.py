@@ -18,8 +18,6 @@ from r2flow.backbones.layers import wrapped
 from r2flow.errors import InputError
 from r2flow.registry import Count, NonNegative
 
-AT_ONCE = 4096  # vectors per block of distances to all codes
-
 
 class Quantiser(nn.Module):
     """q(z), the code e_k nearest to each vector z, and the mean over all elements of the loss
@@ -53,7 +51,7 @@ class Quantiser(nn.Module):
         with torch.autocast(vectors.device.type, enabled=False):  # full precision, for differences of large numbers
             parts = [
                 (part.square().sum(1, keepdim=True) + lengths - 2 * part @ codes.T).argmin(1)
-                for part in vectors.flatten(0, -2).float().split(AT_ONCE)
+                for part in vectors.flatten(0, -2).float().split(4096)
             ]
         return torch.cat(parts).view(vectors.shape[:-1])
 
