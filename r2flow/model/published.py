@@ -38,8 +38,9 @@ class Format(NamedTuple):
     read: Callable[[Any, Path, bool], Published]  # convert the content, with averaged or raw weights
 
 
-def holds(content: Any) -> bool:
-    return isinstance(content, Mapping) and {"cfg", "weights"} <= content.keys() and "ema_weights" not in content
+def has_keys(*keys: str, but: str | None = None) -> Callable[[Any], bool]:
+    """Whether the content of a file is a dict with these keys, without another."""
+    return lambda content: isinstance(content, Mapping) and {*keys} <= content.keys() and but not in content
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
@@ -142,7 +143,7 @@ def plain(value: Any) -> Any:
 
 FORMATS: Registry[Format] = Registry(
     "published format",
-    r2flow=Format("R2Flow", holds, read),
+    r2flow=Format("R2Flow", has_keys("cfg", "weights", but="ema_weights"), read),
     r2dm=lazy("r2flow.systems.diffusion.published:FORMAT"),
     dusty=lazy("r2flow.systems.gan.published:FORMAT"),
     lidargen=lazy("r2flow.systems.score.published:FORMAT"),

@@ -5,16 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.errors import InputError
-from r2flow.model.published import BACKBONE, Format, Published, rings_of
+from r2flow.model.published import BACKBONE, Format, Published, has_keys, rings_of
 from r2flow.model.published import published_config as flow_config
 
 RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
 PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}
 NETWORK = "model."  # prefix of the network's weights in the file; other entries are empty
-
-
-def holds(content: Any) -> bool:
-    return isinstance(content, Mapping) and {"cfg", "weights", "ema_weights"} <= content.keys()
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
@@ -44,4 +40,4 @@ def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
     return {**config, "published": dict(cfg)}
 
 
-FORMAT = Format("R2DM", holds, read)
+FORMAT = Format("R2DM", has_keys("cfg", "weights", "ema_weights"), read)

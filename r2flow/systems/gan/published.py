@@ -4,15 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from r2flow.model.published import Format, Published, sensor_of
+from r2flow.model.published import Format, Published, has_keys, sensor_of
 from r2flow.systems.gan.layers import DROPPED
 
 GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
 NETWORK = "network."  # prefix of the network's parameters
-
-
-def holds(content: Any) -> bool:
-    return isinstance(content, Mapping) and {"cfg", "angle", "G", "G_ema", "D"} <= content.keys()
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
@@ -68,4 +64,4 @@ def _generator(model: Mapping[str, Any], out: Mapping[str, Mapping[str, Any]]) -
     return {**options, **deeper}
 
 
-FORMAT = Format("DUSty", holds, read)
+FORMAT = Format("DUSty", has_keys("cfg", "angle", "G", "G_ema", "D"), read)
