@@ -118,11 +118,10 @@ ENCODINGS: Registry[type[RayEncoding]] = Registry(
     "position", fourier_features=FourierFeatures, polar=Polar, spherical_harmonics=SphericalHarmonics
 )
 
-PUBLISHED_NAMES = {"learnable_embedding": "learnable", "polar_coordinates": "polar"}
-
 
 def position_name(position: str | None, *special: str) -> str:
     """The name of a position option; accepts the names of published configs, too."""
-    name = PUBLISHED_NAMES.get(str(position), str(position).lower())
+    published = {"learnable_embedding": "learnable", "polar_coordinates": "polar"}
+    name = published.get(str(position), str(position).lower())
     Registry("position", **dict.fromkeys(special), **ENCODINGS)[name]
     return name

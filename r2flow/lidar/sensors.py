@@ -21,7 +21,6 @@ Convention = Literal[Rays, "lidargen", "lidm"]
 
 MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, but within memory
 ENDINGS = (".yaml", ".yml")
-LARGEST_FILE = 1 << 20  # bytes; a sensor is a dozen lines
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,7 @@ def build_sensor(
 def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
     """Read a sensor from a YAML file with the options of `build_sensor`, in another size if given."""
     path = Path(path)
-    with reading(path, LARGEST_FILE, "sensor's YAML"):
+    with reading(path, 1 << 20, "sensor's YAML"):  # of a dozen lines
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
         named = isinstance(options, dict) and all(isinstance(key, str) for key in options)
         check(named, "it is not a sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")

@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor
 
-VOXEL = 0.1  # metres
 UNITS: Mapping[str, str] = {
     "mae_all_m": "MAE, all pixels, missing = 0 (m)",
     "mae_m": "MAE where both return (m)",
@@ -36,7 +35,7 @@ def errors(truth: np.ndarray, answer: np.ndarray, hidden: np.ndarray, sensor: Se
     both = hidden & (r > 0) & (s > 0)
     a, b = (image_to_points(image, sensor.rays())[0] for image in (truth, answer))
     a_to_b, b_to_a = _distances(a, b)
-    cells, others = ({*map(tuple, np.floor(points / VOXEL).astype(np.int64))} for points in (a, b))
+    cells, others = ({*map(tuple, np.floor(points / 0.1).astype(np.int64))} for points in (a, b))
     return {
         "mae_all_m": float(np.abs(r - s).mean()),
         "mae_m": _mean(np.abs(r - s)[both]),

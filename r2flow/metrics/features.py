@@ -17,7 +17,6 @@ BLOCK = 2000  # scans per block: a kernel or matrix of distances takes 32 MB
 NEIGHBOURS = 5  # k of `Manifold`
 TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
 NAMES = ("precision", "recall", "density", "coverage")
-STEPS = 25  # iterations of Newton's method
 SAME = 1e-5  # relative tolerance of equal scores
 FEW = (
     "fewer scans than features on a side: its covariance has no full rank, and the distance is too large; compare it "
@@ -256,7 +255,7 @@ def _classifier(real: Tensor, generated: Tensor) -> Callable[[Tensor], Tensor]:
     ridge = torch.eye(x.shape[1], dtype=x.dtype)  # an L2 penalty of 1 on the weights of standardised features
     ridge[-1, -1] = 1e-9
     w = x.new_zeros(x.shape[1])
-    for _ in range(STEPS):
+    for _ in range(25):  # Newton's method
         p = (x @ w).sigmoid()
         curvature = (x * (each * p * (1 - p))[:, None]).mT @ x + ridge
         w = w - torch.linalg.solve(curvature, x.mT @ (each * (p - y)) + ridge @ w)

@@ -19,7 +19,6 @@ from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import table
 from r2flow.reports.view import Panel, most_images, write_page
 
-MOST = 8  # maximum number of frames in the figure, evenly spaced
 ENDS = {
     "scan": "scan", "rms": "RMS, model space", "median_m": "median, m", "dropped": "rays lost or gained",
     "noise_std": "std of x_0", "converged": "converged",
@@ -65,7 +64,7 @@ def interpolation_figure(
 ) -> Figure:
     """Contact sheet of the real scans and the frames between them; the first and last frame are round trips."""
     last = len(frames) - 1
-    chosen = sorted({round(i) for i in np.linspace(0, last, MOST)})
+    chosen = sorted({round(i) for i in np.linspace(0, last, 8)})
     between = {i: "round trip" if i in (0, last) else f"w = {weights[i]:.2f}" for i in chosen}
     titles = [f"real: {names[0]}", *between.values(), f"real: {names[1]}"]
     return contact_sheet([real[0], *frames[chosen], real[1]], rays, titles)

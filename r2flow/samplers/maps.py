@@ -14,8 +14,6 @@ from r2flow.flow.solvers.solution import finite, stepped
 from r2flow.registry import Bound, Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Sampler, Steps
 
-Until = Annotated[float, Bound("above 0 and at most 0.98", lambda t: 0 < t <= 0.98)]
-
 
 @dataclass(frozen=True)
 class Jump(OnGrid):
@@ -88,7 +86,7 @@ class Refine(Renoise):
 
     steps: Steps = 12
     jumps: Count = 5
-    until: Until = 0.9
+    until: Annotated[float, Bound("above 0 and at most 0.98", lambda t: 0 < t <= 0.98)] = 0.9
 
     @property
     def leading(self) -> int:

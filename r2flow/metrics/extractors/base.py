@@ -25,16 +25,14 @@ from r2flow.metrics.scans import Scans
 from r2flow.model.checkpoint import NOTES, is_dense, read_tensors, read_torch
 from r2flow.registry import Registry
 
-BONN = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/"
 R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights/"
-SPARENET = "https://github.com/microsoft/SpareNet/raw/main/Frechet/"
 
 # Published files.
 SOURCES: Registry[str] = Registry(
     "network with published weights",
-    rangenet53=f"{BONN}darknet53-1024.tar.gz",
+    rangenet53="http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/darknet53-1024.tar.gz",
     rangenet21=f"{R2FLOW}rangenet21_lidm.tar.gz",
-    pointnet=f"{SPARENET}cls_model_39.pth",
+    pointnet="https://github.com/microsoft/SpareNet/raw/main/Frechet/cls_model_39.pth",
     minkowskinet=f"{R2FLOW}minkowskinet_lidm.tar.gz",
     spvcnn=f"{R2FLOW}spvcnn_lidm.tar.gz",
 )

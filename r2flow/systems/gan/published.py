@@ -8,7 +8,6 @@ from r2flow.model.published import Format, Published, has_keys, sensor_of
 from r2flow.systems.gan.layers import DROPPED
 
 GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
-NETWORK = "network."  # prefix of the network's parameters
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
@@ -29,7 +28,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
         "published": cfg,
     }
     step = int(content["step"]) // max(int(cfg["training"]["batch_size"]), 1)
-    weights = {NETWORK + key: value for key, value in content["G_ema" if averaged else "G"].items()}
+    weights = {f"network.{key}": value for key, value in content["G_ema" if averaged else "G"].items()}
     if generator["name"] == "dusty2":
         weights["angle"] = angle
 

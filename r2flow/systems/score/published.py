@@ -11,7 +11,6 @@ from torch import Tensor
 
 from r2flow.model.published import Format, Published
 
-NETWORK = "network."  # prefix in the generator
 WRAPPED = "module."  # prefix of torch's DataParallel
 FIRST, LAST = "begin_conv.weight", "end_conv.weight"
 
@@ -45,7 +44,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     }
     if averaged:
         weights |= {name.removeprefix(WRAPPED): value for name, value in dict(*content[4:]).items()}
-    named = {NETWORK + name: value for name, value in weights.items()}
+    named = {f"network.{name}": value for name, value in weights.items()}
     return Published(config, named, int(content[3]), {"name": "langevin", "steps": 5})
 
 
