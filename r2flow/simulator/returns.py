@@ -25,6 +25,7 @@ _WIDTHS = (
 CALIBRATED = 16.0  # metres up to which the sensor compensates for distance
 FADE = 0.0068  # loss of reflectance per metre beyond
 DARK = 0.13  # reflectance below a random threshold of at most this is reported as 0
+ALONE = 0.0014  # share of returns lost one by one: gaps of one column and lengths of runs in three drives
 PATCH = 3  # columns lost together: dark and slanted surfaces are wider than a bin
 FAINT = -0.10  # far returns with a reflectance below this are mostly lost
 SOFT = 0.02  # width of the transition, in units of reflectance
@@ -50,11 +51,12 @@ def report(
     r += (NOISE + NOISE_FAR * r) * noise[0] + rays.lasers.bias.astype(np.float32)[:, None]
     r = np.round(r / RANGE_STEP) * np.float32(RANGE_STEP)
     reading = _reading(hits, r, noise[1], rays)
-    seen = (hits.label > 0) & (uniforms > _lost(hits, r, reading))
+    single = rng.random(rays.shape, dtype=np.float32)
+    seen = (hits.label > 0) & (uniforms > _lost(hits, r, reading)) & (single > ALONE)
     seen &= (r >= sensor.min_range) & (r <= sensor.max_range)
     if rig is not None:
         seen &= ~hidden(rays.lasers, rays.columns, rig)
-    reading[reading < DARK * rng.random(rays.shape, dtype=np.float32)] = 0
+    reading[reading < DARK * single] = 0
     reading = _levels()[np.rint(np.clip(reading, 0, 1) * 2000).astype(np.int32)]
     along = np.broadcast_to(np.arange(len(slope))[:, None], rays.shape)
     row = along if rays.lasers.straight else rows_of(sensor, slope + rise / np.maximum(s, np.float32(0.1)))
