@@ -63,7 +63,7 @@ def relief(surface: Surface, k: np.ndarray, normal: Normal, z: np.ndarray) -> np
     rise = z - surface.base[k]
     piece, storey = np.floor(normal.along / BAY).astype(np.int64), np.floor(rise / STOREY).astype(np.int64)
     share = _hash(piece, storey, _key(surface.albedo[k]))
-    back = np.where(share < 0.10, 0.18, 0.04 * share) - 0.06 * (rise < 0.5)
+    back = np.where(share < 0.25, 0.30, 0.04 * share) - 0.06 * (rise < 0.5)
     return np.where(wall, back, 0).astype(np.float32)
 
 
