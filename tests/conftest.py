@@ -305,6 +305,5 @@ def generated(tmp_path: Path) -> Path:
 
 
 def prepare_folder(root: Path, out: Path, sensor: Sensor, layout: str = "folder") -> Path:
-    """The scans of a data set, prepared."""
     prepare(plan_files(out, layout, root, find_drives(layout, root), Reading(sensor)))
     return out

@@ -33,7 +33,6 @@ def write_scans(folder: Path, sensor: Sensor, count: int, most: int) -> Path:
 
 @pytest.fixture
 def scans(tmp_path: Path) -> Path:
-    """Three scans of a sensor of one's own."""
     return write_scans(tmp_path / "scans", MINE, 3, 255)
 
 

@@ -54,7 +54,6 @@ def write_scans(folder: Path) -> None:
 
 
 def keep(folder: Path, kind: str, *files: Path) -> None:
-    """Originals to be damaged."""
     for file in files:
         target = folder / kind / file.name
         target.parent.mkdir(exist_ok=True)
@@ -106,7 +105,6 @@ def write_weights(folder: Path, beside: Path, run: Path) -> None:
 
 @pytest.mark.parametrize("each", [4, pytest.param(350, marks=pytest.mark.slow)])  # of each original
 def test_damaged_files_are_one_line_or_what_was_written(tmp_path: Path, saved, each: int):
-    """Damaged and read in a process of its own."""
     folder = tmp_path / "fuzz"
     write_scans(folder / "points")
     write_stores(folder, folder / "beside")

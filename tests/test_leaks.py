@@ -34,7 +34,6 @@ class Held:
         self.noted.append((pages * os.sysconf("SC_PAGE_SIZE"), len(os.listdir("/proc/self/fd"))))
 
     def check(self) -> None:
-        """From the first note to the last."""
         (memory, files), *_, (memory_now, files_now) = self.noted
         assert files_now <= files, self.noted
         assert memory_now - memory < ALLOWED, self.noted

@@ -195,12 +195,10 @@ def test_values_out_of_the_sensor_s_limits_are_dropped_for_a_model_alone(tmp_pat
 
 @pytest.fixture
 def own_table(monkeypatch) -> None:
-    """What is added to the table is gone after the test."""
     monkeypatch.setattr(SOURCES, "_entries", dict(SOURCES._entries))
 
 
 def find_weeks(root: Path) -> list[Drive]:
-    """`week-N/*.bin`."""
     return [Drive(week.name, tuple(map(str, sorted(week.glob("*.bin"))))) for week in sorted(root.glob("week-*"))]
 
 

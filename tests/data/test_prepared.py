@@ -45,7 +45,6 @@ def write_cloud(path: Path, seed: int, levels: int | None = 256) -> None:
 
 @pytest.fixture(scope="module")
 def clouds(tmp_path_factory) -> Path:
-    """Ten scans in two folders."""
     root = tmp_path_factory.mktemp("clouds")
     for number in range(10):
         write_cloud(root / f"drive{number // 6}" / f"{number:06d}.bin", number)

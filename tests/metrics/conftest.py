@@ -38,14 +38,12 @@ class Summary(Extractor):
 
 
 def untrained(network: type[Extractor], seed: int = 0) -> Extractor:
-    """A network with random weights of a seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return network().requires_grad_(False).eval()
 
 
 def put_in_place_of_networks(patch: pytest.MonkeyPatch) -> None:
-    """The stand-in, under every name of a network."""
     stand_ins = {name: SimpleNamespace(trained=partial(Summary, name)) for name in EXTRACTORS}
     patch.setattr(EXTRACTORS, "_entries", stand_ins)
 
@@ -66,7 +64,6 @@ def scans_of(n: int, seed: int = 0, scale: float = 40.0, sensor: Sensor = SMALL)
 
 
 def measured(metric: ScanMetric, real: Scans, generated: Scans) -> ScanMetric:
-    """The metric, of both sets."""
     metric.update(real, real=True)
     metric.update(generated, real=False)
     return metric
