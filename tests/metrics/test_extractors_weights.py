@@ -182,9 +182,8 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path):
         signal.alarm(0)
 
 
-def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):
+def test_the_table_says_which_weights_are_here(r2flow, pointnet, folder):
     def here() -> set[str]:
-        """Which networks have their weights, by the table."""
         said = r2flow("weights").said
         for words in ("FRD", "FRID", "FPD", "FSVD", "FPVD", "darknet53-1024.tar.gz", f"Looked for in {folder}"):
             assert words in said
@@ -193,13 +192,11 @@ def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):
         return {row[0] for row in rows if row[2] != "no"}
 
     assert here() == set()
-    path = tmp_path / "mine.pth"
-    torch.save(untrained(PointNet).state_dict(), path)
-    said = r2flow("weights", "--add", "pointnet", path).said
+    said = r2flow("weights", "--add", "pointnet", pointnet[1]).said
     assert said.startswith(f"{folder / 'pointnet.safetensors'}: weights ")
-    assert said.endswith("of mine.pth\n")
+    assert said.endswith("of cls_model_39.pth\n")
     assert here() == {"pointnet"}
-    assert f"{said.split(': weights ')[1].split()[0]} of mine.pth" in r2flow("weights")[1]
+    assert f"{said.split(': weights ')[1].split()[0]} of cls_model_39.pth" in r2flow("weights")[1]
 
 
 def test_the_table_of_networks_is_light():
