@@ -56,7 +56,6 @@ def test_the_network_and_the_sampler_are_not_written_to_one_file(r2flow, tmp_pat
 
 
 def verbs() -> list[str]:
-    """Every verb of the command, and of `report`."""
     import typer.main
 
     from r2flow.cli.verbs import app

@@ -188,8 +188,6 @@ def listing(folder: Path) -> dict[Path, tuple[int, int]]:
 
 @pytest.fixture
 def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
-    """Runs a command in that place, and sees to it that it is refused."""
-
     def ready(run: r2flow.training.Run) -> None:
         """In place of `fit`: what it reads before the first step."""
         if run.config["data"]["name"] != "simulated":

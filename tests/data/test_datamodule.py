@@ -191,7 +191,6 @@ class TestReflectance:
 
 @pytest.fixture
 def prepared_360(kitti_360: Path, tmp_path: Path) -> Path:
-    """Drives 0, 2, 3, 4 and 10 of three scans each, prepared."""
     return prepare_folder(kitti_360, tmp_path / "prepared", SENSOR, "kitti_360")
 
 

@@ -31,7 +31,6 @@ def estimate(t: Tensor, x: Tensor) -> Tensor:
 
 
 def variance(t: float) -> float:
-    """Var x_t = t^2 STD^2 + (1 - t)^2."""
     return t**2 * STD**2 + (1 - t) ** 2
 
 

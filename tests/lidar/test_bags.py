@@ -24,7 +24,6 @@ CODES = {"f4": 7, "u2": 4}
 
 
 def fields(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Intensity and ring of each point of a cloud."""
     return np.arange(count) % 256, np.arange(count) % 32
 
 

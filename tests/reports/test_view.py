@@ -154,7 +154,6 @@ def test_what_does_not_fit_is_refused():
 class TestTheVerb:
     @pytest.fixture
     def scan(self, tmp_path: Path) -> Path:
-        """A scan of the ground 1.73 m below, as a KITTI .bin."""
         sensor = SENSORS["hdl64e"]
         write_points(tmp_path / "ground.bin", *image_to_points(ground(sensor), sensor.rays()))
         return tmp_path / "ground.bin"
