@@ -97,8 +97,7 @@ def test_ring_numbers_by_laser_give_the_firing_order(first):
 @pytest.mark.parametrize(
     ("values", "scale"),
     [
-        (np.arange(100) / 100, 1),  # KITTI
-        (np.arange(256) / 256, 1),  # KITTI-360
+        (np.arange(100) / 100, 1),  # KITTI, and so KITTI-360
         (np.arange(101), 100),
         (np.arange(236), 255),
         (np.arange(257), 256),

@@ -114,7 +114,6 @@ def test_every_sensor_has_a_config_and_every_config_builds():
         ({"elevations": [1, 0], "columns": 10**13}, "pixels"),
         ({"name": "hdl64e", "rows": 10**13}, "pixels"),
         ({"name": "hdl64"}, "Did you mean 'hdl64e'"),
-        ({}, "no sensor named 'mine'"),
     ],
 )
 def test_an_impossible_sensor_of_a_user_is_refused(options, words):
