@@ -343,19 +343,6 @@ def test_a_diffusion_walks_noise_of_half_precision_in_float32(method):
 TINY = ["backbone=hdit_tiny", "backbone.base_channels=16", "backbone.num_heads=[1,2,4]"]
 
 
-def endless(network: nn.Module, count: int) -> None:
-    """Let the first `count` answers of each batch be infinite."""
-
-    def at_the_end(_: nn.Module, __: Any, found: Any) -> Any:
-        if isinstance(found, dict):
-            return {name: at_the_end(_, __, value) for name, value in found.items()}
-        found = found.clone()
-        found[:count] = math.inf
-        return found
-
-    network.register_forward_hook(at_the_end)
-
-
 @pytest.mark.parametrize(
     ("words", "sampler"),
     [
@@ -371,8 +358,15 @@ def endless(network: nn.Module, count: int) -> None:
     ],
 )
 def test_a_scan_that_leaves_the_numbers_is_flagged_whatever_is_clamped(words: list[str], sampler: Sampler):
+    def without_end(_: nn.Module, __: Any, found: Any) -> Any:
+        if isinstance(found, dict):
+            return {name: without_end(_, __, value) for name, value in found.items()}
+        found = found.clone()
+        found[:1] = math.inf
+        return found
+
     generator: Generator = build_generator(compose([*words, *SIZE])).eval()
-    endless(getattr(generator, "backbone", None) or generator.network, 1)
+    (getattr(generator, "backbone", None) or generator.network).register_forward_hook(without_end)
     draws = Draws(0, range(3))
     made = generator(draws.start(generator.noise_shape), sampler=sampler, draws=draws)
     assert made.converged.tolist() == [False, True, True]
