@@ -19,7 +19,6 @@ CONFIG = {**BOTH, "encoding": {"format": "logscale", "reflectance": False}}
 
 @pytest.fixture
 def parent(tmp_path: Path) -> Path:
-    """A checkpoint of range alone."""
     return write_checkpoint(tmp_path / "parent.ckpt", CONFIG)
 
 

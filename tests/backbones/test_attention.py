@@ -44,7 +44,6 @@ def by_loops(q: Tensor, k: Tensor, v: Tensor, window: tuple[int, int], wrap: boo
 
 
 def assert_defined(inputs, window, wrap, backend, atol):
-    """Values and gradients are those of the definition."""
     weights = torch.randn(inputs[0].shape, generator=torch.Generator().manual_seed(1)).to(inputs[0])
     outputs = by_loops(*inputs, window, wrap), neighbourhood_attention(*inputs, window, wrap, backend=backend)
     results = [[out, *torch.autograd.grad((out * weights).sum(), inputs)] for out in outputs]
