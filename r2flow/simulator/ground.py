@@ -162,30 +162,30 @@ class Ground:
         s = np.geomspace(NEAREST, REACH, SAMPLES).astype(np.float32)[:, None]
         z = self.height(s * rays.cos, s * rays.sin)
         distance, approach = _meet_profiles(s, z, rays)
-        cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + (approach + rays.slope[:, None]) ** 2))
+        face: np.ndarray | bool = False
         if self.kerb > 0:
-            high, _ = _meet_profiles(s, z + np.float32(self.kerb), rays)
-            distance, cosine = self._step_up(distance, high, rays, cosine)
+            high, raised = _meet_profiles(s, z + np.float32(self.kerb), rays)
+            distance, off, face = self._step_up(distance, high, rays)
+            approach = np.where(off, raised, approach)
+        cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + (approach + rays.slope[:, None]) ** 2))
+        cosine = np.where(face, np.maximum(cosine, 0.6), cosine)
         met = np.isfinite(distance)
         cos, sin, approach = (np.broadcast_to(q, met.shape)[met] for q in (rays.cos, rays.sin, approach))
         if self.tufts > 0:
             distance[met] = self._overgrown(distance[met], cos, sin, approach)
         return distance, cosine
 
-    def _step_up(
-        self, low: np.ndarray, high: np.ndarray, rays: Rays, cosine: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Raise everything except carriageways by the kerb.
+    def _step_up(self, low: np.ndarray, high: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Raise everything except carriageways by the kerb: distance, whether off the street and whether on the face.
 
         A ray reaches the raised level first. Off the street it ends there; over the street it continues to the low
         level, or to the kerb's face if that is nearer.
         """
         far, near = np.minimum(low, np.float32(REACH)), np.clip(high, 0, REACH)
         d_high, d_low = (self.off_street(s * rays.cos, s * rays.sin) for s in (near, far))
-        face = (d_high <= 0) & (d_low > 0)
+        off, face = d_high > 0, (d_high <= 0) & (d_low > 0)
         share = d_high / np.where(face, d_high - d_low, 1)
-        distance = np.where(d_high > 0, high, np.where(face, near + share * (far - near), low))
-        return distance, np.where(face, np.maximum(cosine, 0.6), cosine)
+        return np.where(off, high, np.where(face, near + share * (far - near), low)), off, face
 
     def _overgrown(self, distance: np.ndarray, c: np.ndarray, s: np.ndarray, approach: np.ndarray) -> np.ndarray:
         """Move intersections with the verge forward by h / approach, for grass and rubble of height h."""

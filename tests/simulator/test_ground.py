@@ -36,7 +36,8 @@ def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
 @pytest.mark.parametrize("kerb", [0.0, 0.12])  # all is off the street, and higher by the kerb
 def test_on_waves_a_ray_ends_where_it_first_meets_the_surface(kerb):
     ground = Ground(OPEN, waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)), kerb=kerb)
-    distance, _ = ground.meet(RAYS)
+    distance, cosine = ground.meet(RAYS)
+    np.testing.assert_allclose(cosine, Ground(OPEN, ground.waves, drop=-kerb).meet(RAYS)[1], atol=1e-3)
     met = np.isfinite(distance)
     s, a = np.where(met, distance, 1.0), np.broadcast_to(RAYS.azimuth, RAYS.shape)
     slope = np.broadcast_to(np.tan(RAYS.lasers.elevation)[:, None], RAYS.shape)

@@ -55,7 +55,6 @@ def test_streets_join_and_objects_stand_apart_and_off_the_carriageways(seed, ind
 
 
 def digests() -> list[str]:
-    """Of scans of three sensors."""
     views = [(HDL64E.resized(32, 512), 4), (SENSORS["os1_64"].resized(32, 256), 3), (SENSORS["vlp16"], 3)]
     return [digest(sensor, 7, k) for sensor, count in views for k in range(count)]
 
