@@ -48,14 +48,15 @@ class Checkpoints(Checkpoint):
 
     def __init__(self, run_dir: str | Path, every: Count = 100, keep: Count = 2) -> None:
         self.run_dir, self.every, self.keep = Path(run_dir), every, keep
-        self._saved = 0
+        self._saved, self._stop = 0, False
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if (batch_idx + 1) % trainer.accumulate_grad_batches:
-            trainer.should_stop = False  # `trainer.max_time` asks again: no run can resume within a step
-        elif trainer.global_step % self.every == 0:
+        stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+        stop = self._stop or trainer.should_stop  # after a whole step: no run can resume within one
+        trainer.should_stop, self._stop = stop and stepped, stop and not stepped
+        if stepped and trainer.global_step % self.every == 0:
             self.save(trainer)
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
