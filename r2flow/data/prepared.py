@@ -97,7 +97,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
     if lacks_reflectance(paths, "skip", reading.columns) is not None:
         return None
     samples = []
-    for index in spread(len(paths), 8):
+    for index in spread(len(paths), 8):  # enough to see every level
         with suppress(InputError):  # reported when the scan is prepared
             samples.append(read_image(Path(paths[index]), replace(reading, reflectance=True))[1])
     values = np.concatenate(samples) if samples else np.zeros(0)

@@ -109,7 +109,7 @@ def rows_from_firings(xyz: np.ndarray, sensor: Sensor) -> np.ndarray | None:
     firings = len(xyz) // rows
     if len(xyz) % rows or firings < 8:
         return None
-    sample = np.linspace(0, firings - 1, min(firings, 256)).astype(np.int64)
+    sample = np.linspace(0, firings - 1, min(firings, 256)).astype(np.int64)  # enough for their order
     elevation = elevations_of(xyz.reshape(firings, rows, 3)[sample].reshape(-1, 3)).reshape(-1, rows)
     middle, scatter = scatter_of(elevation)
     if not scatter < 0.25:

@@ -182,7 +182,7 @@ READERS = {
 
 def check_unpacked(path: Path, size: int) -> None:
     """Refuse a compressed file that declares far more bytes than its size allows."""
-    most = 100 * path.stat().st_size + (1 << 20)
+    most = 100 * path.stat().st_size + (1 << 20)  # bytes: points do not pack as well
     check(0 <= size <= most, f"it unpacks to {size:,} bytes, far more than its own size. Is it damaged?")
 
 
