@@ -114,11 +114,12 @@ def _crossed(draws: ScalarDraws, main: Street) -> tuple[Street, ...]:
     for _ in range(20):  # to where the centre lines cross, `at` along the first and `middle` along the other
         middle, _ = across.locate(*main.place(at, 0.0)[:2])
         at, _ = main.locate(*across.place(middle, 0.0)[:2])
-    if form == "end" and abs(at) > 12:
+    joins = abs(main.locate(*across.place(middle, 0.0)[:2])[1]) < main.half_width  # else they run side by side
+    if form == "end" and joins and abs(at) > 12:
         return (main._replace(stop=at) if at > 0 else main._replace(start=at)), across
-    if form == "left":
+    if form == "left" and joins:
         across = across._replace(start=middle)
-    elif form == "right":
+    elif form == "right" and joins:
         across = across._replace(stop=middle)
     return main, across
 

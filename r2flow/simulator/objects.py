@@ -94,7 +94,7 @@ def _cycle(b: SceneBuilder, x: float, y: float, yaw: float, label: str) -> None:
 
 
 def house(b: SceneBuilder, x: float, y: float, yaw: float, length: float, width: float, height: float) -> bool:
-    """A block with rows of windows under a gable roof, sometimes with a bay or a porch; False if there is no room."""
+    """A block with rows of windows under a gable roof, sometimes with a bay or a porch; False on taken ground."""
     if not b.take(x, y, yaw, length, width):
         return False
     ground = b.level(x, y)

@@ -71,10 +71,9 @@ class SceneBuilder:
     def take(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
         """Take a rectangle of ground for an object, unless another object has part of it."""
         place = Footprint(x, y, math.cos(yaw), math.sin(yaw), length, width)
-        reach = length + width
         for other in self._taken:
-            near = abs(x - other[0]) + abs(y - other[1]) < reach + other[4] + other[5]
-            if near and not (place.separated(other) or other.separated(place)):
+            far = abs(x - other.x) + abs(y - other.y) >= length + width + other.length + other.width
+            if not (far or place.separated(other) or other.separated(place)):
                 return False
         self._taken.append(place)
         return True
