@@ -50,6 +50,8 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     options.pop("init", None)  # the generator has its weights already
     stage: Stage = STAGES.build(options, generator)
     stage.config = dict(config)
+    if not stage.several_sensors and any(part.get("sensor") for part in config["data"].get("parts") or ()):
+        raise InputError(f"stage={options['name']} learns from scans of one sensor: leave sensor out of data.parts.")
     stage.check_data(options["name"], config["data"])
     sampler, few = generator.choose(**dict(config.get("sampler") or {})), config.get("few")
     if sampler.completes:

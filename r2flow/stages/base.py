@@ -87,8 +87,6 @@ class Stage(L.LightningModule):
         if data.get("scans") is not None:
             raise InputError(f"stage={name} learns from pairs alone: leave data.scans out, or give stage=flow_map.")
         check(self.needs_pairs or not on_pairs, f"stage={name} learns from scans, not data=pairs; give stage=reflow.")
-        if not self.several_sensors and any(part.get("sensor") for part in data.get("parts") or ()):
-            raise InputError(f"stage={name} learns from scans of one sensor: leave sensor out of data.parts.")
 
     def setup(self, stage: str) -> None:
         here = self.start, self.config.get("scans")

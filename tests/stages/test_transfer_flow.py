@@ -348,12 +348,16 @@ def test_a_batch_has_crops_of_several_sensors():
 
 @pytest.mark.parametrize(
     ("name", "sensor", "word"),
-    [("rectify", {"name": "vlp16"}, "one sensor"), ("transfer", {"name": "vlp16", "columns": 16}, "crops of 8 x 32")],
+    [
+        *((name, {"name": "vlp16"}, "one sensor") for name in ("rectify", "flow_map")),
+        ("transfer", {"name": "vlp16", "columns": 16}, "crops of 8 x 32"),
+    ],
 )
 def test_a_part_of_another_sensor_that_cannot_be_learned_from_is_refused(name, sensor, word):
     part = {"name": "simulated", "scenes": 4}
     data = {"name": "mixed", "batch_size": 4, "parts": [part, {**part, "sensor": sensor}]}
-    generator = build_generator({**CONFIG, "backbone": tiny_options("hdit")}) if name == "rectify" else built()
+    flow_map = {**CONFIG, "backbone": tiny_options("hdit"), "generator": {"name": "flow_map"}}
+    generator = built() if name == "transfer" else build_generator(flow_map)
     with pytest.raises(InputError, match=word):
         build_stage({**CONFIG, "data": data, "seed": 0, "stage": {"name": name}}, generator)
 
