@@ -161,6 +161,7 @@ def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Pa
 
     assert found() == ("unfolding", "reference")
     assert found(reading={"projection": "spherical"}) == ("spherical", "reference")
+    assert found(name="mixed", root=None, parts=[{"name": "folder", "root": "scans"}]) == ("unfolding", "reference")
     assert found(name="simulated", root=None) == ("spherical", "centre")
 
 
