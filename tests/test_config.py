@@ -71,8 +71,6 @@ def entries(config) -> list[Entry]:
 def test_conf_says_every_option_of_a_constructor(entries: list[Entry]):
     for group, constructor, options, added in entries:
         known = set(options_of(constructor)) - added
-        if group.startswith("stage=distill"):
-            known -= {"time"} - set(options)
         assert set(options) - added == known, group
 
 
