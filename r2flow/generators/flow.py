@@ -50,7 +50,7 @@ class Flow(Generator):
         condition: Condition | None = None,
         **options: Any,
     ) -> Solution:
-        """Solve the ODE from x at t_0, (B, ...), to t_1; for the options see `r2flow.flow.solvers.solve`."""
+        """Solve the ODE from x at t_0, (B, ...), to t_1, without `finish`; options: `r2flow.flow.solvers.solve`."""
         how = sampler or self.sampler
         how.check(self)
         if not isinstance(how, ODESampler):
