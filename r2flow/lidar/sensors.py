@@ -246,5 +246,5 @@ def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
 
 def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
     """The keys of `sensor` in a config: the options of `build_sensor`, and rays through the pixels' centres."""
-    options = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(sensor).items()}
+    options = {key: np.asarray(value).tolist() for key, value in asdict(sensor).items()}  # NumPy's numbers as Python's
     return {**options, "rows": None, "rays": "centre"}

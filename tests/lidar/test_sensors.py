@@ -127,7 +127,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_a_written_sensor_is_read_back(sensor, tmp_path):
-    mine = Sensor(**{**vars(sensor), "name": "mine"})
+    mine = Sensor(**{**vars(sensor), "name": "mine", "elevations": tuple(np.array(sensor.elevations))})
     write_sensor(mine, tmp_path / "mine.yaml", "two\nlines")
     assert read_sensor(tmp_path / "mine.yaml") == mine
     assert read_sensor(tmp_path / "mine.yaml", 8, 64) == mine.resized(8, 64)
