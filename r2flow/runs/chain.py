@@ -55,7 +55,7 @@ def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], confi
             raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")
         begins = dict(flatten(difference)).keys() & {"experiment", "init", "stage.init"}  # a mistyped link does not
         if parent not in (None, *(link.name for link in links)) or (links and not begins):
-            raise InputError(f"chain.{name} needs init=LINK of an earlier link, or an experiment; found init={parent}.")
+            raise InputError(f"chain.{name} starts from {parent or 'nothing'}; give init=EARLIER or an experiment.")
         if parent is not None:
             own.append(override("stage.init", str(Path(folder, parent))))
         # Overrides given for this link alone come last: they replace the link's own keys.
