@@ -324,7 +324,7 @@ def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_pa
     said = complete(file).said
     assert beams in said
     assert "1 scan written" in said
-    used, kept = (int(number.replace(",", "")) for number in re.findall(r"([\d,]+) (?:measured|are kept)", said))
+    used, kept = (int(number.replace(",", "")) for number in re.findall(r"(?:used|kept):[ a-z]* (\d[\d,]*)\b", said))
     flow, (written,) = r2flow.load(run), (file for file in (tmp_path / "out").iterdir() if file.suffix != ".json")
     answer, points, given = flow.complete(file), read_points(file), read_points(written)
     assert len(flow.points(answer[0])[0]) - used == len(given.xyz) - kept >= 0
@@ -413,7 +413,7 @@ def test_points_outside_the_limits_and_sectors_never_scanned_are_told(complete, 
     xyz[:300] /= 100  # 0.1 m away
     xyz[300] = 0  # a ray without return
     write_points(tmp_path / "some.ply", xyz)
-    kept = f"; {len(xyz) - 301:,} are kept, 300 outside 0.5-100 m are left out"
+    kept = f"; kept: {len(xyz) - 301:,}, 300 outside 0.5-100 m left out"
     assert kept in complete(tmp_path / "some.ply", *asked).said
 
 

@@ -104,9 +104,9 @@ def write_completed(
     if used:
         sensor = checkpoint.sensor
         size = "x".join(map(str, sensor.shape))
-        print(f"{used:,} measured points are used, the nearest in each pixel of {size}", end="")
-        lost = f", {outside:,} outside {sensor.min_range:g}-{sensor.max_range:g} m are left out" if outside else ""
-        print(f"; {'' if outside else 'all '}{kept:,} are kept{lost}" if kept else "")
+        print(f"measured points used: {used:,}, the nearest in each pixel of {size}", end="")
+        lost = f", {outside:,} outside {sensor.min_range:g}-{sensor.max_range:g} m left out" if outside else ""
+        print(f"; kept: {'' if outside else 'all '}{kept:,}{lost}" if kept else "")
     return done
 
 
