@@ -201,7 +201,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("", "empty"),
         ("# nothing\n", "no line of numbers"),
         ("x,y,z\n", "no line"),
-        ("x;y;z\n" + "1,5;2,5e0;3\n" * 3, "decimal commas"),
+        *((f"x{mark}y{mark}z\n1,5{mark}-2,5e0{mark}3\n", "decimal commas") for mark in "; "),
         ("1 2\n3 4\n", "2 columns without names"),
         ("1,2,,4\n" * 3, "NaN"),
         ("x y z\n1 2 3 4\n", "longer than the names"),  # numbers of rows, as of R

@@ -100,8 +100,8 @@ def read_text(path: Path) -> Table:
         del rows[0]
     check(rows, "it holds no line of numbers.")
     apart = next((mark for mark in ";\t," if mark in rows[-1]), None)
-    commas = apart != "," and "." not in rows[-1] and re.search(r"(^|[;\t] *)-?\d+,\d+ *($|[;\te])", rows[-1], re.I)
-    check(not commas, "its numbers have decimal commas: write them with points.")
+    decimal = r"\d,\d+(e[-+]?\d+)? +-?\d+,\d" if apart == "," else r"(^|[;\t] *)-?\d+,\d+ *($|[;\te])"
+    check("." in rows[-1] or not re.search(decimal, rows[-1], re.I), "it has decimal commas: write decimal points.")
 
     def words(line: str) -> list[str]:
         return [re.sub(r"\s*[\[(].*", "", word.strip()) for word in line.lstrip("#/ ").split(apart)]
