@@ -57,7 +57,7 @@ def write_samples(
     fitting = [name for name in FORMATS if name != "bin" or checkpoint.encoding.reflectance]
     endings = fitting if formats is None else formats
     if other := [name for name in endings if name not in fitting]:
-        raise InputError(f"--format {','.join(other)} cannot hold these scans; give some of {','.join(fitting)}.")
+        raise InputError(f"--format {','.join(other)!r} cannot hold these scans; give some of {','.join(fitting)}.")
     sampler.check(generator)
     how: dict[str, Any] = {"region": region, "precision": precision}
     part = {k: v for k, v in (how | {"region": region and asdict(region)}).items() if v not in (None, "32-true")}
