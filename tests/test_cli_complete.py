@@ -163,8 +163,7 @@ def test_a_model_of_range_alone_leaves_reflectance_out(complete, tmp_path):
 def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
     path = write_run(tmp_path / "run", network("diffusion"), TRANSFER)
     image = full_scan(tmp_path / "one.npy")
-    asked = tmp_path / "one.npy", "--mask", "rows:2", "--sampler", "repaint", "--steps", 2
-    assert complete(*asked, model=path).quiet
+    assert complete(tmp_path / "one.npy", "--mask", "rows:2", "--sampler", "repaint", "--steps", 2, model=path).quiet
     assert np.array_equal(np.load(tmp_path / "out" / "one.npy")[:, ::2], image[:, ::2])
     note = json.loads((tmp_path / "out" / "manifest.json").read_text())["recipe"]["sampler"]
     assert (note["name"], note["steps"], note["repeats"]) == ("repaint", 2, 16)
@@ -230,7 +229,8 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
     assert complete(tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
 
 
-def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path):
+def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path, monkeypatch):
+    monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))  # no pause
     for place, number in enumerate([0, 1, 0, 1]):
         full_scan(tmp_path / "scans" / f"{place}.npy", number)
     given = prepare_folder(tmp_path / "scans", tmp_path / "prep", SENSOR)
@@ -242,6 +242,7 @@ def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path
     for number in numbers:
         assert np.array_equal(np.load(tmp_path / "out" / f"prep-{number:06d}.npy")[:, ::2], whole[number][:, ::2])
     assert f"1 scan written to {tmp_path / 'out'}, 3 there already" in complete(*asked, 4).said
+    assert "hashing 4/4 scans" in complete(*asked, 4).stderr
 
 
 def test_a_bad_scan_may_be_mended_and_the_command_given_again(complete, tmp_path):
@@ -293,8 +294,7 @@ def test_points_that_are_dropped_are_told(complete, tmp_path):
     rows = np.fromfile(tmp_path / "one.bin", np.float32).reshape(-1, 4)
     rows[::5, 3] = np.nan
     rows.tofile(tmp_path / "one.bin")
-    said = f"are dropped ({len(rows[::5])} points"
-    assert said in complete(tmp_path / "one.bin", "--mask", "rows:2")[2]
+    assert f"are dropped ({len(rows[::5])} points" in complete(tmp_path / "one.bin", "--mask", "rows:2")[2]
 
 
 def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):

@@ -68,7 +68,7 @@ def write_completed(
     settings = {"num": job.num, "fill_gaps": job.fill_gaps, **about, "precision": job.precision}
     store = Store(out, "answers", recipe_of(checkpoint, job.seed, sampler, completion=settings))
     before: dict[str, str] = read_manifest(out, store.kind)["inputs"] if store.check() else {}
-    inputs = {scan.name: scan.identity() for scan in scans}
+    inputs = {scan.name: scan.identity() for scan in track(scans, "hashing", "scans")}
     for name, paths in files.items():
         if before.get(name) != inputs[name] and any(path.exists() for path in paths):
             raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
