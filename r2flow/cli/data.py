@@ -73,9 +73,8 @@ def prepare(
     The same command resumes an interrupted run, shares the work with others at the same time and replaces damaged
     shards. Train on them with python train.py data=prepared data.root=FOLDER.
     """
+    from r2flow.data import prepared
     from r2flow.data.opening import SOURCES, parse
-    from r2flow.data.prepared import plan_files
-    from r2flow.data.prepared import prepare as make
     from r2flow.progress import Bar
 
     options, file = parse(scans)
@@ -83,10 +82,11 @@ def prepare(
     options = replace(options, split=split, drives=[*drives.split(",")] if drives else None)
     drives_found = SOURCES[options.name].find_drives(options)
     check(out.resolve() != Path(options.folder).resolve(), f"{out} holds the scans: give another folder by --out.")
-    store = plan_files(out, options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
+    store = prepared.plan_files(out, options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
     shards, levels = len(store.shards), store.described["levels"]
-    with Bar("checking", shards, "shards") as checked, Bar("preparing", shards, "shards") as made:
-        left_out = make(store, on_bad_scan, workers or cores(), lambda shard: checked(), lambda shard: made())
+    left = store.missing(store.shards) if store.check() else store.shards
+    with Bar("checking", shards, "shards") as checked, Bar("preparing", len(left), "shards") as made:
+        left_out = prepared.prepare(store, on_bad_scan, workers or cores(), lambda _: checked(), lambda _: made())
     size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)
     usable, there = len(store.names) - left_out, shards - round(made.tasks[0].completed)
     content = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"

@@ -162,8 +162,7 @@ def test_missing_pairs_are_named(tmp_path: Path):
 def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
     store = store_in(tmp_path, num=12)
     make_pairs(store, grow)
-    source = PairSource(store)
-    dataset = PairDataset(source, seed=3, purpose="training")
+    dataset = PairDataset(PairSource(store), seed=3, purpose="training")
     item = dataset[(70, 11)]
     assert torch.equal(item["x_0"], store.noise(11))
     assert item["k"] == 70

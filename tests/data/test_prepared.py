@@ -343,16 +343,18 @@ def test_a_manifest_that_is_damaged_or_missing_is_named(clouds: Path, tmp_path: 
         prepared_in(tmp_path)
 
 
-def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path):
+def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path, monkeypatch):
+    monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))  # no pause
     out = tmp_path / "out"
-    typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 4)
-    said = r2flow(*typed, "--workers", 1).said
-    assert f"{out}: 6 scans in 2 shards, 0.0 MiB; reflectance as n/256" in said
-    (out / "scans-000001.safetensors").unlink()
-    assert "6 scans in 2 shards (1 there already), 0.0 MiB" in r2flow(*typed, "--workers", 1).said
+    typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 2)
+    assert f"{out}: 6 scans in 3 shards, 0.0 MiB; reflectance as n/256" in r2flow(*typed, "--workers", 1).said
+    for shard in (1, 2):
+        (out / f"scans-{shard:06d}.safetensors").unlink()
+    done = r2flow(*typed, "--workers", 1)
+    assert "6 scans in 3 shards (1 there already), 0.0 MiB" in done.said
+    assert "preparing 2/2 shards" in done.stderr
     source = prepared_in(out)
-    raw = read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))
-    assert np.abs(source[5] - raw).max() <= 1e-3
+    assert np.abs(source[5] - read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))).max() <= 1e-3
 
 
 def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):

@@ -131,5 +131,4 @@ def test_the_nearest_return_of_each_quarter_is_that_of_a_search(share, ring):
     down, aside = torch.where(there[:, None], found, 0).long().unbind(1)
     row, column = torch.arange(9)[:, None] + down, (torch.arange(16) + aside) % 16
     hit = returned[torch.arange(2)[None, :, None, None].expand_as(row), row, column]
-    sides = torch.stack([down[0] < 0, down[1] > 0, aside[2] < 0, aside[3] > 0])
-    assert (hit & sides)[there].all()
+    assert (hit & torch.stack([down[0] < 0, down[1] > 0, aside[2] < 0, aside[3] > 0]))[there].all()
