@@ -52,7 +52,6 @@ __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
 
 log = logging.getLogger("r2flow")
 
-# Warnings of Lightning about intended choices.
 EXPECTED_WARNINGS = (
     ".*does not have many workers.*",
     "Total length of .list. across ranks is zero.*",

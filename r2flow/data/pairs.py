@@ -25,6 +25,7 @@ from r2flow.models import name_of
 from r2flow.processes import place
 from r2flow.progress import Bar
 from r2flow.samplers import build_sampler
+from r2flow.signals import LATER, Stopped
 from r2flow.store import Damaged, Store
 
 
@@ -97,12 +98,15 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
     sampler.check(flow)
     check(sampler.paired, f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
     usable, evaluations, start, seconds = list[bool](), 0, time.monotonic(), 0.0  # without waiting for others
+    launcher = os.getppid() if os.environ.get("LOCAL_RANK", "0") != "0" else None  # the process that started this one
 
     def make_shard(shard: int) -> None:
         nonlocal evaluations, seconds
         store.mend([shard])
         batches = []
         for batch in store.batches_of(shard):
+            if launcher not in (None, os.getppid()):  # killed: this process would draw all pairs and then fail
+                raise Stopped(LATER, "")
             batches.append(solve_batch(store, flow, batch))
             evaluations += int(batches[-1]["evaluations"].sum())
             usable.extend(batches[-1]["usable"].tolist())
@@ -121,9 +125,8 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         store.begin()
         rank, ranks = place()  # of a run, whose processes verify a part each
         store.mend(store.shards[rank::ranks])
-        missing = store.missing(store.shards)
-        random.Random().shuffle(missing)  # processes rarely meet, also where locks do not reach other machines
-        store.make(missing, make_shard, wait=wait)
+        missing = store.missing(store.shards)  # shuffled: processes rarely meet, also without common locks
+        store.make(random.Random().sample(missing, len(missing)), make_shard, wait=wait)
     if usable:
         unusable = "" if all(usable) else f", {usable.count(False)} did not converge and are left out"
         rate, cost = len(usable) / seconds, evaluations / len(usable)

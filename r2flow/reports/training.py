@@ -16,7 +16,6 @@ from r2flow.reports.pictures import save_figure
 
 Curve = tuple[np.ndarray, np.ndarray]
 
-# Logged names and panel titles.
 CURVES = {
     "train/loss": "training loss", "val/loss": "validation loss", "curvature/bend": "bend, s / length²",
 }  # fmt: skip

@@ -21,6 +21,7 @@ from r2flow.models import find_model
 from r2flow.noise import standard_normal
 from r2flow.runs.lineage import pairs_of
 from r2flow.samplers import build_sampler
+from r2flow.signals import LATER, Stopped
 from r2flow.store import Store
 from tests.conftest import files
 from tests.fields import Field
@@ -197,6 +198,20 @@ def test_who_waits_says_for_whom_and_who_does_not_leaves_the_rest(tmp_path: Path
     timer.join()
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     assert caplog.text.count("waiting for ") == 1
+    assert not store.missing(store.shards)
+
+
+def test_a_process_of_a_run_stops_drawing_when_the_one_that_launched_it_is_gone(tmp_path: Path, monkeypatch):
+    store = store_in(tmp_path)
+    monkeypatch.setattr("os.getppid", lambda: 1 if store.missing(store.shards) != [*store.shards] else 7)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    with pytest.raises(Stopped) as stopped:
+        make_pairs(store, grow)
+    assert stopped.value.code == LATER
+    assert len(store.missing(store.shards)) == len(store.shards) - 1  # the shard that it was drawing
+    monkeypatch.setenv("LOCAL_RANK", "0")  # the launching process outlives its shell
+    monkeypatch.setattr("os.getppid", iter(range(100)).__next__)
+    make_pairs(store, grow)
     assert not store.missing(store.shards)
 
 

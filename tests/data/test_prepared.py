@@ -72,9 +72,6 @@ def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options
     return ScanFiles(paths, Reading(sensor, reflectance=True, **options), root)
 
 
-# Codes
-
-
 @pytest.mark.parametrize("far", [None, 120.0, 245.0, 500.0])
 def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | None):
     near, far = sensor.min_range, far or sensor.max_range
@@ -121,9 +118,6 @@ def test_the_scale_of_files_of_points_is_not_that_of_range_images(tmp_path: Path
     assert plan_of(tmp_path / "scans", reflectance_scale=255.0).described["levels"] == levels
 
 
-# What is read is what was projected
-
-
 def test_prepared_scans_are_the_raw_ones_to_the_stated_quantisation(clouds: Path, tmp_path: Path):
     raw, prepared = raw_of(clouds), prepared_in(make(tmp_path, plan_of(clouds)), SMALL)
     assert len(prepared) == 10
@@ -157,9 +151,6 @@ def test_real_scans_keep_their_reflectance_to_the_bit(shared, tmp_path, layout, 
         assert image[0].astype(bool).mean() > 0.5
         assert np.array_equal(image[1], other[1])
         assert np.abs(image[0] - other[0]).max() <= MILLIMETRE
-
-
-# What is stored
 
 
 def test_a_shard_is_three_bytes_a_pixel_and_readable_by_anybody(clouds: Path, tmp_path: Path):
@@ -240,9 +231,6 @@ def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch
     assert len(prepared_in(tmp_path)) == 10
 
 
-# Scans that cannot be used
-
-
 def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tmp_path: Path, caplog):
     root = tmp_path / "scans"
     shutil.copytree(clouds, root)
@@ -289,9 +277,6 @@ def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_pa
         kept.append(len(list(folder.glob("scans-*"))))
     assert kept == sorted(kept)  # what was whole stays
     assert files(make(folder, plan)) == one
-
-
-# Damage
 
 
 def swapped(path: Path) -> None:

@@ -27,7 +27,6 @@ from r2flow.registry import Registry
 
 R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights/"
 
-# Published files.
 SOURCES: Registry[str] = Registry(
     "network with published weights",
     rangenet53="http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/darknet53-1024.tar.gz",
