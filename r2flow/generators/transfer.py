@@ -227,7 +227,7 @@ class TransferFlow(Flow):
 
         x_1, (B, C, H, W), are crops that do not span a full turn, t their times, (B,); `steps` are those of
         `Surroundings.of`, `rows` the output of `RowFeatures`. In training each loss is the mean over the rays of
-        the batch, on all devices, in eval mode the mean over the scans' own losses.
+        the batch (of an accumulated part), on all devices, in eval mode the mean over the scans' own losses.
         """
         about = Surroundings.of(self.space, condition, ring=False, steps=steps)
         known = condition[KNOWN]
