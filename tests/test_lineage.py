@@ -147,8 +147,7 @@ def test_each_set_of_scans_says_its_whole_reading():
         assert set(one["reading"]) == whole
         assert one["reading"]["convention"] == "reference"
     assert reading_in(found) == found  # a run that is resumed says the same
-    pairs = reading_in({"name": "pairs", "scans": part})
-    assert pairs["scans"]["reading"]["reflectance_scale"] == 0.012
+    assert reading_in({"name": "pairs", "scans": part})["scans"]["reading"]["reflectance_scale"] == 0.012
 
 
 def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):
@@ -162,7 +161,8 @@ def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Pa
     assert found() == ("unfolding", "reference")
     assert found(reading={"projection": "spherical"}) == ("spherical", "reference")
     assert found(name="mixed", root=None, parts=[{"name": "folder", "root": "scans"}]) == ("unfolding", "reference")
-    assert found(name="simulated", root=None) == ("spherical", "centre")
+    for name, parts in (("simulated", None), ("mixed", [{"name": "simulated"}])):
+        assert found(name=name, root=None, parts=parts) == ("spherical", "centre")
 
 
 def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from r2flow.data.opening import SOURCES, scale_of
-from r2flow.data.options import FOLDER, MIXED, PAIRS, SIMULATED, Data, DataOptions, PartOptions, SourceOptions
+from r2flow.data.options import FOLDER, MIXED, PAIRS, Data, DataOptions, PartOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.sources import made_here
 from r2flow.errors import InputError, check
@@ -24,7 +24,7 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     """
     check_options("data", DataOptions, data)
     run = DataOptions(**data)
-    inherited = () if run.name == SIMULATED else parent or () if run.name == PAIRS else ("projection", "convention")
+    inherited = parent or () if run.name == PAIRS else ("projection", "convention")
     reading = {**{key: parent[key] for key in inherited if parent and parent.get(key) is not None}, **run.chosen}
 
     def whole(options: Mapping[str, Any], usual: Mapping[str, Any]) -> Data:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.config import RULES, key_of, rule
-from r2flow.data.options import PairOptions
+from r2flow.data.options import SIMULATED, PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.data.resolving import resolve
@@ -80,7 +80,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
             if value not in (None, theirs.get(key)) and f"data.reading.{key}" in keys:
                 raise InputError(f"data.reading.{key} is that of the flow that draws the pairs: leave it out.")
         data["reading"] = theirs
-    elif parent:
+    elif parent and {part.get("name") for part in data.get("parts") or [data]} != {SIMULATED}:  # its rays are given
         reading = parent.config.get("data", {}).get("reading")
     return {**config, "data": resolve(data, config["sensor"].get("reflectance_scale"), reading)}
 
