@@ -98,7 +98,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
     sampler.check(flow)
     check(sampler.paired, f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
     usable, evaluations, start, seconds = list[bool](), 0, time.monotonic(), 0.0  # without waiting for others
-    launcher = os.getppid() if os.environ.get("LOCAL_RANK", "0") != "0" else None  # the process that started this one
+    launcher = os.getppid() if int(os.environ.get("LOCAL_RANK") or 0) else None  # the process that started this one
 
     def make_shard(shard: int) -> None:
         nonlocal evaluations, seconds
@@ -106,7 +106,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         batches = []
         for batch in store.batches_of(shard):
             if launcher not in (None, os.getppid()):  # killed: this process would draw all pairs and then fail
-                raise Stopped(LATER, "")
+                raise Stopped(LATER, "stopped: the process that launched this one has ended")
             batches.append(solve_batch(store, flow, batch))
             evaluations += int(batches[-1]["evaluations"].sum())
             usable.extend(batches[-1]["usable"].tolist())
