@@ -162,8 +162,6 @@ def saved(tmp_path: Path) -> tuple[Path, dict]:
 
 
 class Done(NamedTuple):
-    """How a command ended."""
-
     returncode: int
     stdout: str
     stderr: str

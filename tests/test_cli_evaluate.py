@@ -191,8 +191,6 @@ def test_an_evaluation_resumes(points, saved, monkeypatch):
 
 
 class MeanRange(SumMetric):
-    """A metric of a user's: the difference of the mean ranges."""
-
     name, representation, width, biased = "mine", "range image", 2, True
 
     def rows(self, scans):

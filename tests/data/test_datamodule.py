@@ -195,8 +195,6 @@ def prepared_360(kitti_360: Path, tmp_path: Path) -> Path:
 
 
 class TestPrepared:
-    """Prepared scans are a data set like others: by drives, in a mixture, held out."""
-
     def test_they_are_the_scans_of_the_raw_files(self, kitti_360: Path, prepared_360: Path):
         options = {"split": "train", "validation": {"share": 0.3}}
         raw = module(name="kitti_360", root=str(kitti_360), **options)

@@ -43,8 +43,6 @@ def write_image(path: Path, number: int, channels: int = 2, size: tuple[int, int
 
 
 class TestSamples:
-    """Samples say their own size and sensor."""
-
     def samples(self, folder: Path, size: tuple[int, int] = (8, 32)) -> Path:
         Store(folder, "samples", {"reading": Reading(SENSORS["hdl64e"].resized(*size)).described()}).begin()
         write_image(folder / "000000.npy", 2, size=size)
@@ -98,8 +96,6 @@ class TestSamples:
 
 
 class TestWhatR2FlowWrote:
-    """Size, sensor and scale of simulated scans are believed."""
-
     def test_simulated_scans_need_no_sensor_and_no_size(self, tmp_path: Path, caplog):
         sensor = SENSORS["vlp32c"].resized(16, 64)
         write_folder(SimulatedFolder(tmp_path, sensor, 3, ("ply",)), [5], workers=1)
@@ -132,6 +128,8 @@ class TestWhatR2FlowWrote:
             assert scan.shape == (2, *SENSORS["vlp16"].shape)
             assert scan[0].max() == 10
             assert not scan[1].any()
+        np.save(tmp_path / "a.npy", np.full((1, *SENSORS["vlp16"].shape), [10.0, 150.0] * 512, np.float32))
+        assert r2flow.read(tmp_path / "a.npy", "vlp16")[0, 0, :2].tolist() == [10, 0]  # it measures up to 100 m
 
     def test_reflectance_of_another_scale_is_scaled_and_of_an_uncommon_one_with_a_warning(self, tmp_path: Path, caplog):
         for stored, scale, value in ((204, None, 0.8), (51, 102, 0.5), (51, None, 0.51), (0.048, None, 0.96)):

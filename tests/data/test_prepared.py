@@ -17,7 +17,7 @@ from safetensors.numpy import load_file
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import SOURCES, find_drives
 from r2flow.data.options import SourceOptions
-from r2flow.data.prepared import PreparedStore, plan_files, prepare
+from r2flow.data.prepared import PreparedStore, plan_files, prepare, refuse_other_images
 from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import ScanFiles
@@ -52,9 +52,7 @@ def clouds(tmp_path_factory) -> Path:
 
 
 def plan_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", shard_scans: int = 3, **how) -> PreparedStore:
-    return plan_files(
-        "unused", layout, root, find_drives(layout, root), Reading(sensor, **how), shard_scans=shard_scans
-    )
+    return plan_files("unused", layout, root, find_drives(layout, root), Reading(sensor, **how), shard_scans)
 
 
 def make(folder: Path, plan: PreparedStore, **options) -> Path:
@@ -132,6 +130,7 @@ def test_prepared_scans_are_the_raw_ones_to_the_stated_quantisation(clouds: Path
     assert part.names == ["drive1/000009.bin"]
     assert np.array_equal(part[0], prepared[9])
     assert np.array_equal(pickle.loads(pickle.dumps(part))[0], prepared[9])
+    assert np.array_equal(prepared_in(tmp_path, SMALL, reflectance=False)[9], prepared[9][:1])
 
 
 @pytest.mark.parametrize(
@@ -158,9 +157,7 @@ def test_a_shard_is_three_bytes_a_pixel_and_readable_by_anybody(clouds: Path, tm
     assert list(files(tmp_path)) == [MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
     tensors = load_file(tmp_path / "scans-000003.safetensors")  # ten scans by threes: one is left
     found = {name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()}
-    assert found == {
-        "range": ("uint16", (1, 4, 16)), "reflectance": ("uint8", (1, 4, 16)),
-    }  # fmt: skip
+    assert found == {"range": ("uint16", (1, 4, 16)), "reflectance": ("uint8", (1, 4, 16))}
 
 
 def test_nothing_tells_where_the_files_lie_or_how_many_processes_read_them(clouds: Path, tmp_path: Path):
@@ -199,7 +196,10 @@ def test_scans_prepared_for_other_images_are_refused(clouds, tmp_path, changes: 
         prepared_in(tmp_path, replace(SMALL, **changes), **options)
     with pytest.raises(InputError, match="holds other scans: "):
         make(tmp_path, plan_of(clouds, replace(SMALL, **changes), **options))
-    prepared_in(tmp_path, replace(SMALL, name="mine", height=2.0))  # no pixel depends on these
+    prepared_in(tmp_path, replace(SMALL, name="mine", height=2.0, firing=(1, 0, 2, 3)))  # no pixel depends on these
+    plan = plan_of(clouds, projection="unfolding")
+    with refused("firing=None there"):
+        refuse_other_images(plan, replace(plan.reading, sensor=replace(SMALL, firing=(1, 0, 2, 3))))
 
 
 def test_other_files_of_the_same_names_are_refused_and_a_mended_one_is_taken(clouds: Path, tmp_path: Path):
@@ -216,9 +216,8 @@ def test_other_files_of_the_same_names_are_refused_and_a_mended_one_is_taken(clo
             make(out, plan_of(root))
         (out / "scans-000002.safetensors").unlink(missing_ok=True)  # then as if killed
     (out / "scans-000001.safetensors").unlink()
-    assert [name for name, content in files(make(out, plan_of(root))).items() if content != whole[name]] == [
-        "scans-000001.safetensors"
-    ]
+    mended = files(make(out, plan_of(root)))
+    assert [name for name in mended if mended[name] != whole[name]] == ["scans-000001.safetensors"]
 
 
 def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch):
@@ -371,7 +370,6 @@ def wide(numbered: Path, tmp_path: Path) -> Path:
 
 
 def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
-    """One option names them for every verb that reads scans."""
     columns, small = ("--columns", "time,z,y,x,intensity,_"), ("--size", "4x16", "--workers", 1)
     for out, given in (("one", (numbered,)), ("two", (wide, *columns))):
         assert r2flow("prepare", *given, *small, "--out", tmp_path / out).quiet

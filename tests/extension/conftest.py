@@ -34,8 +34,6 @@ TINY = [
 
 @dataclass(frozen=True)
 class Family:
-    """What a user types to train what a file of theirs adds."""
-
     name: str
     file: str
     choices: tuple[str, ...]

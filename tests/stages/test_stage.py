@@ -29,8 +29,6 @@ class Linear(Generator):
 
 
 class Automatic(Stage):
-    """Descends from the square of a linear map."""
-
     def __init__(self) -> None:
         torch.manual_seed(0)
         super().__init__(Linear(), learning_rate=0.1, warmup_images=16)
@@ -46,8 +44,6 @@ class Automatic(Stage):
 
 
 class Manual(Automatic):
-    """The same by its own hand, beside a second loss with an optimiser of its own."""
-
     def __init__(self) -> None:
         super().__init__()
         self.automatic_optimization, self.gradient_clip_val = False, CLIP
@@ -96,8 +92,6 @@ def test_a_loss_without_a_gradient_or_of_many_numbers_is_refused(loss):
 
 
 class Slope(Stage):
-    """One step of SGD, of the length of its clipped gradient."""
-
     def __init__(self, slope: float) -> None:
         super().__init__(Linear(), warmup_images=0)
         self.automatic_optimization, self.gradient_clip_val, self.slope = False, CLIP, slope

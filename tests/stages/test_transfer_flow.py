@@ -110,6 +110,7 @@ def test_the_returns_of_another_sensor_are_those_of_higher_rows(flow, scans):
     about, elevations = Surroundings.of(flow.space, state, True, steps), flow.elevations.expand(3, -1)
     rows, raised = (flow.rows(e, steps, torch.zeros(3) > 0) for e in (elevations, elevations + math.radians(3)))
     t, x = torch.zeros(()), about.start
+    assert torch.equal(x[state["known"] > 0], state["image"][state["known"] > 0])
     found, same, above = (f.answers(t, x, about, r) for f, r in ((other, rows), (flow, rows), (flow, raised)))
     torch.testing.assert_close((found.ranges, found.returns), (same.ranges, above.returns))
     assert not torch.equal(same.returns, above.returns)
@@ -153,8 +154,6 @@ def test_reflectance_is_the_mean_over_the_candidates(flow):
 
 
 def integral(answers: Answers, end: float, weight=lambda x: 1.0) -> float:
-    """Of the density of log r times a weight, up to an end."""
-
     def weighed(x: float) -> float:
         return weight(x) * float(answers.log_density(torch.tensor(x, dtype=torch.float64).reshape(1, 1, 1, 1)).exp())
 
@@ -255,6 +254,14 @@ def test_rows_far_beyond_the_measured_ones_stay_empty(flow):
     assert (r > 0).all(1).tolist() == [False, False, True, True, True, True, True, False]
 
 
+def test_a_ray_between_two_returns_of_its_row_starts_between_them(flow):
+    images = torch.zeros(1, 2, 8, 32)
+    images[0, :, 4, [0, 4]] = torch.tensor([[10.0, 30.0], [0.4, 0.8]])
+    state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN))
+    about = Surroundings.of(flow.space, condition_of(flow.space, images, state), True, torch.full((1, 2), 0.01))
+    assert flow.space.decode(about.start)[0, :, 4, 1].tolist() == pytest.approx([12, 0.5], rel=1e-5)  # linear in 1 / r
+
+
 def test_a_coarser_image_has_the_nearest_return_of_each_block(flow):
     images = torch.zeros(1, 2, 8, 32)
     images[0, :, 3, 5] = torch.tensor([30.0, 0.25])
@@ -272,15 +279,21 @@ def test_a_part_of_a_scan_and_what_is_known_of_it_depend_on_the_image_alone(flow
         for _ in range(2)
     ]
     for one, other in zip(*parts, strict=True):
-        assert one.keys() == other.keys()
         assert all(torch.equal(one[name], other[name]) for name in one)
         assert one["x_1"].shape == (2, 4, 16)
         assert torch.equal(one["image"], one["x_1"] * one["known"])
-    assert len({float(one["known"].mean()) for one in parts[0]}) > 5
+    rows = [one["known"][0].mean(1).tolist() for one in parts[0]]  # of a sensor of few beams one, any of them
+    assert {row.index(1) for row in rows if sum(row) == max(row) == 1} == {0, 1, 2, 3}
     rng = noise.generator(0, "condition", 0)
     silent = Tasks(rows=4, columns=16, silent=0.99)(flow.space, x_1, flow.space.sensor, rng)
     assert silent["known"][0].any()
     assert not silent["known"][1].any()
+    often, small = Tasks(rows=4, columns=8, halved=0.99), coarser(flow.space, x_1)
+    half = often(flow.space, x_1, flow.space.sensor, rng)
+    assert any(torch.equal(half["x_1"], small.roll(k, 2)) for k in range(8))
+    pairs = np.reshape(flow.space.sensor.elevations, (4, 2)).mean(1)
+    assert half["elevations"].rad2deg().tolist() == pytest.approx(pairs)
+    assert half["steps"][1].item() == pytest.approx(2 * math.pi / 8)
     for shape in ((9, 64), (8, 66)):  # not in whole blocks of 2 x 4 pixels
         often, sensor = Tasks(rows=4, columns=16, halved=0.99), build_sensor("hdl64e", *shape)
         assert often(flow.space, torch.zeros(2, *shape), sensor, rng)["x_1"].shape == (2, 4, 16)
@@ -337,6 +350,8 @@ def test_a_batch_has_crops_of_several_sensors():
         rows = [float(e) for e in sensor.rays()[0, :, 0]]
         top = rows.index(float(batch["elevations"][i, 0]))
         assert batch["elevations"][i].tolist() == rows[top : top + 8]
+        steps = (rows[top] - rows[top + 7]) / 7, 2 * math.pi / sensor.columns
+        assert batch["steps"][i].tolist() == pytest.approx(steps)
         whole = torch.from_numpy(simulate(sensor, 0, (2, 3, 6, 7)[i]).image)  # each part has its own scenes
         if sensor != space.sensor:  # intensities of another sensor are scaled to a mean
             whole[1] = (whole[1] * 0.265 / whole[1][whole[0] > 0].mean()).clamp(max=1)
