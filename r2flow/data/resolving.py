@@ -37,7 +37,7 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
         data["parts"] = [whole(part, reading) for part in _checked_parts(run)]
     if run.scans is not None:
         _check_set("data.scans", SourceOptions, run.scans)
-        data["scans"] = whole(run.scans, {})
+        data["scans"] = whole(run.scans, {key: reading[key] for key in reading.keys() & {"projection", "convention"}})
     other = run.validation_options.data
     if other is not None and run.name != PAIRS:
         held = {"name": run.name, "root": run.root, "scenes": run.scenes, **other}
