@@ -18,6 +18,7 @@ from r2flow.data.options import DataOptions, PairOptions
 from r2flow.errors import InputError
 from r2flow.registry import options_of
 from r2flow.runs.composing import CONF, choices, compose
+from r2flow.runs.lineage import Parent
 from r2flow.stages import STAGES
 from r2flow.training import check
 
@@ -142,6 +143,8 @@ def test_a_chosen_backbone_is_whole_at_every_size(backbone: str):
 @pytest.mark.parametrize("asked", ["backbone=hdit_small", "backbone.depths=[1]"])
 def test_a_backbone_for_a_system_with_its_own_network_is_refused(asked: str):
     command = ["experiment=vanilla_gan", "size=small"]
-    assert check(compose(command), command)["backbone"] is None
+    gan = check(compose(command), command)
+    with pytest.raises(InputError, match=r"stage\.init names a run without a backbone"):
+        check(compose(["stage=flow_map", "data=pairs"]), parent=Parent(gan, Path("gan")))
     with pytest.raises(InputError, match="vanilla_gan has its own network: leave backbone.* out"):
         check(compose([*command, asked]), [*command, asked])

@@ -31,6 +31,7 @@ def build_backbone(
 
     `in_channels` includes the channels of a condition; `out_channels` None means as many.
     """
+    check(options is not None, "stage.init names a run without a backbone: leave it out, or name a flow.")
     wanted = {"in_channels": in_channels, "out_channels": out_channels, "second_time": second_time or None}
     given = {name: value for name, value in wanted.items() if value is not None}  # a plug-in may not know the others
     built: Backbone = BACKBONES.build({**options, **given}, rays)
