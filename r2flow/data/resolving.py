@@ -10,7 +10,7 @@ from r2flow.data.reading import AUTO
 from r2flow.data.sources import made_here
 from r2flow.errors import InputError, check
 from r2flow.lidar.sensors import ENDINGS, build_sensor, options_of_sensor, read_sensor
-from r2flow.registry import check_options
+from r2flow.registry import check_options, construct
 
 log = logging.getLogger(__name__)
 
@@ -22,8 +22,7 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     `scale` is the value of full reflectance in files of the sensor; `parent` the reading of the run that this run
     starts from, or of the flow that draws its pairs.
     """
-    check_options("data", DataOptions, data)
-    run = DataOptions(**data)
+    run = construct("data", DataOptions, data)
     inherited = parent or () if run.name == PAIRS else ("projection", "convention")
     reading = {**{key: parent[key] for key in inherited if parent and parent.get(key) is not None}, **run.chosen}
 

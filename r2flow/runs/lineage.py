@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.config import RULES, key_of, rule
-from r2flow.data.options import SIMULATED, PairOptions
+from r2flow.data.options import SIMULATED, DataOptions, PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.data.resolving import resolve
@@ -14,7 +14,7 @@ from r2flow.errors import InputError
 from r2flow.generators import GENERATORS
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint, weights_hash
 from r2flow.models import name_of
-from r2flow.registry import check_options, options_of
+from r2flow.registry import check_options, construct, options_of
 from r2flow.stages import STAGES
 
 
@@ -52,6 +52,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     """
     config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     config["generator"], data, reading = generator_of(config, parent), config["data"], None
+    chosen = construct("data", DataOptions, data).chosen
     if parent is None:
         stage = config["stage"]["name"]
         needs = STAGES[stage].needs_parent or STAGES[stage].needs_pairs
@@ -76,8 +77,8 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         data["root"] = data["root"] or str(default_folder(drawer.path))
         data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
         theirs = drawer.config.get("data", {}).get("reading") or {}
-        for key, value in (data.get("reading") or {}).items():
-            if value not in (None, theirs.get(key)) and f"data.reading.{key}" in keys:
+        for key, value in chosen.items():
+            if value != theirs.get(key) and {"data.reading", f"data.reading.{key}"} & {*keys}:
                 raise InputError(f"data.reading.{key} is that of the flow that draws the pairs: leave it out.")
         data["reading"] = theirs
     elif parent and {part.get("name") for part in data.get("parts") or [data]} != {SIMULATED}:  # its rays are given
@@ -126,8 +127,7 @@ def inherited(key: str, config: Mapping[str, Any]) -> str:
 def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:
     """The generator of a run: the config's `generator`, else the stage's, else the parent's (its `goes_on_as`); without
     a config's `generator`, with the parent's options as far as they apply."""
-    chosen = config.get("generator")
-    if chosen:
+    if chosen := config.get("generator"):
         return {"name": chosen} if isinstance(chosen, str) else dict(chosen)
     parental = (parent and parent.config.get("generator")) or {"name": "rectified_flow"}
     chosen = STAGES[config["stage"]["name"]].generator_name or getattr(GENERATORS[parental["name"]], "goes_on_as", None)
