@@ -23,6 +23,7 @@ import lightning as L
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.model_helpers import is_overridden
 
 from r2flow.callbacks import build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
@@ -308,8 +309,8 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     if run.trainer.is_global_zero:
         log_config(run.trainer.loggers, run.config)
     try:
-        if last is None and run.config["stage"].get("init"):  # what the end of the run is compared with
-            run.trainer.validate(run.stage, run.data, verbose=False)
+        if last is None and run.config["stage"].get("init") and is_overridden("validation_step", run.stage):
+            run.trainer.validate(run.stage, run.data, verbose=False)  # what the end of the run is compared with
         run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
     except MisconfigurationException as error:  # as of limit_val_batches, with few scans
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None

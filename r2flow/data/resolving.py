@@ -53,8 +53,7 @@ def _whole_reading(options: SourceOptions, usual: Mapping[str, Any], scale: floa
     reading: Data = {"projection": "spherical", "convention": "centre", "columns": None, "on_bad_scan": "error"}
     reading["reflectance_scale"] = scale_of(options, scale) if options.name in SOURCES else 1.0
     reading |= {**usual, **options.chosen}
-    written = options.name == FOLDER and made_here(options.folder)
-    return {**reading, "reflectance_scale": 1.0} if written else reading
+    return {**reading, "reflectance_scale": 1.0} if options.name == FOLDER and made_here(options.folder) else reading
 
 
 def _checked_parts(run: DataOptions) -> list[Data]:

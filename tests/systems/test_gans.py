@@ -323,10 +323,11 @@ def test_a_generator_with_a_mask_needs_draws():
 
 
 def test_each_row_of_the_log_has_the_augmentation_of_its_step_and_the_last_penalty(tmp_path: Path):
-    run = build(compose([
+    options = [
         "experiment=dusty2", "size=small", *TINY, "trainer.max_steps=5", "trainer.log_every_n_steps=1", "loggers=[csv]",
         f"run_dir={tmp_path}", "callbacks.pictures=null", "samples.num=0",
-    ]))  # fmt: skip
+    ]  # fmt: skip
+    run = build(compose(options))
     stage: Any = run.stage
     expected: list[float] = []
     stage.on_train_batch_end = lambda *_: expected.append(float(stage.augment.p))
@@ -335,6 +336,7 @@ def test_each_row_of_the_log_has_the_augmentation_of_its_step_and_the_last_penal
     assert curves["train/augmented"][1].tolist() == pytest.approx(expected)
     assert len(set(expected)) == 3  # in five steps it moves after every second
     assert [len(set(each)) for each in curves["train/last_r1"]] == [4, 2]
+    assert fit(build(compose([*options, f"stage.init={tmp_path}", f"run_dir={tmp_path / 'tuned'}"]))).finished
 
 
 @pytest.mark.slow

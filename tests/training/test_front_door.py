@@ -27,7 +27,6 @@ REFUSED = {
     "~backbone": "~backbone leaves the run without its backbone",
     "callbacks.ema={evry: 3}": "no key 'callbacks.ema.evry'. Did you mean 'callbacks.ema.every'?",
     "+callbacks.emaa={}": "Did you mean 'ema'?",
-    "callbacks.ema.decay=2": "decay must be a finite number in [0, 1)",
     "callbacks.ema=3": "callbacks.ema must be a group of keys, found 3",
     "samples=null": "samples must be a group of keys, found None",
     "sampler.grid=[a,b]": "grid must be a word or a list, each a finite number",
@@ -70,7 +69,6 @@ REFUSED = {
     "+stage.batch_size=9": "stage.batch_size is the run's: leave it out, and give data.batch_size",
     # What a name, a size or a number does not fit; several words apart.
     "bakcbone.base_channels=8": "no key 'bakcbone.base_channels' | Did you mean 'backbone.base_channels'?",
-    "backbone=hditt": "no backbone config named 'hditt' | Did you mean 'hdit'?",
     "hydra/sweeper=optuna": "no hydra/sweeper config named 'optuna'; known: basic. Others are plug-ins of Hydra",
     "sensor=mine": "no sensor config named 'mine' | sensor=FILE.yaml",
     "sensor.columns=100": "100 | nearest",
