@@ -112,18 +112,19 @@ class PlainFormatter(logging.Formatter):
         return printable(super().format(record))
 
 
-class _Unbroken(io.FileIO):
-    """A file descriptor that can be written to after its reader (`| head`) has ended or its terminal is closed."""
+class Unbroken(io.FileIO):
+    """A file descriptor that can be written to after its reader, terminal or disk room is gone; work goes on."""
+
+    lost: OSError | None = None  # of standard output, if it was not the end of its reader (`| head`)
 
     def write(self, data: Any) -> int:
         try:
             return super().write(data)
         except OSError as error:
-            if error.errno not in (errno.EPIPE, errno.EIO):
-                raise
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, self.fileno())
-            os.close(null)
+            if self.fileno() == 1 and error.errno not in (errno.EPIPE, errno.EIO):
+                Unbroken.lost = OSError(error.errno, error.strerror, "standard output")
+            with open(os.devnull, "wb") as null:
+                os.dup2(null.fileno(), self.fileno())
             return len(data)
 
 
@@ -135,7 +136,7 @@ def open_streams() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (open until exit)
         elif stream is getattr(sys, f"__{name}__"):
             stream.flush()
-            raw = io.BufferedWriter(_Unbroken(stream.fileno(), "w", closefd=False))
+            raw = io.BufferedWriter(Unbroken(stream.fileno(), "w", closefd=False))
             lines = name == "stderr" or stream.isatty()
             setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, "backslashreplace", line_buffering=lines))
         elif isinstance(stream, io.TextIOWrapper):

@@ -122,6 +122,14 @@ def test_several_processes_write_lines_on_a_terminal_too(capsys, monkeypatch, to
     assert capsys.readouterr() == ("", f"process 2 of 8: drawing 32/{total} pairs  0.40/s  {left} left\n")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no /dev/full")
+def test_what_is_printed_to_a_full_disk_is_one_line():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*R2FLOW, "weights"], stdout=full, stderr=subprocess.PIPE, text=True)
+        assert subprocess.run([*R2FLOW, "weights"], stdout=subprocess.DEVNULL, stderr=full).returncode == 0
+    assert (done.returncode, done.stderr) == (2, "error: standard output: No space left on device\n")
+
+
 def test_work_goes_on_where_standard_error_was_closed(monkeypatch):
     monkeypatch.setattr(sys, "stderr", None)
     assert list(track([1, 2], "reading")) == [1, 2]

@@ -10,7 +10,7 @@ import typer
 from r2flow import __version__
 from r2flow.cli import data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
 from r2flow.cli.app import app
-from r2flow.errors import InputError, PlainFormatter, check, explain_mistake, one_line, open_streams
+from r2flow.errors import InputError, PlainFormatter, Unbroken, check, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import Stopped, listening, stop_at_once
 
@@ -64,6 +64,9 @@ def _run() -> None:
             print(f"r2flow {__version__}")
             sys.exit(0)
         code = app(arguments, prog_name="r2flow", standalone_mode=False)
+        sys.stdout.flush()
+        if Unbroken.lost:
+            raise Unbroken.lost
     except (InputError, OSError) as error:
         message = explain_mistake(error)
     except (ImportError, MemoryError, RuntimeError) as error:
