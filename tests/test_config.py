@@ -108,12 +108,14 @@ def test_an_override_that_is_printed_is_read_back(path: str):
     assert (key_of(text), getattr(value, "text", value)) == ("stage.init", path)
 
 
-def test_a_value_needs_no_quotes_unless_it_has_brackets_or_quotes():
+def test_a_value_needs_no_quotes_unless_it_has_brackets_or_quotes(monkeypatch):
     texts = {"~/é": f"{Path.home()}/é", " a&b #1\t": "a&b #1", "2011_09_26": "2011_09_26"}
     texts |= {"[1_0, 2011_09_26 ,2011_09_28]": [10, "2011_09_26", "2011_09_28"], "'a,2011_09_26'": "a,2011_09_26"}
     for value, read in (texts | {"320_000": 320_000, "\t-1_000": -1000, "7\t": 7, "0.000_1": 1e-4}).items():
         assert compose([f"run_dir={value}"])["run_dir"] == read
     assert [compose([f"name={name}"])["run_dir"] for name in ("1e5", "007")] == ["runs/1e5", "runs/007"]
+    monkeypatch.setattr(Path, "home", None)  # as of a user without a home
+    assert compose(["run_dir=é"])["run_dir"] == "é"
 
 
 @pytest.mark.parametrize("experiment", ["lidm_autoencoder", "lidargen", "dusty2"])

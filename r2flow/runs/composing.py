@@ -217,7 +217,7 @@ def _plain(text: str) -> str:
     dates = r"""('[^']*'|"[^"]*")|(?<=[=,[])( *)(\d{4}_\d\d_\d\d)(?= *([],]|$))"""  # also in lists and sweeps
     text = re.sub(dates, lambda found: found[1] or f"{found[2]}'{found[3]}'", text.strip())
     key, _, value = text.partition("=")
-    value = re.sub("^~(?=/|$)", str(Path.home()), value.strip())
+    value = re.sub("^~(?=/|$)", lambda _: str(Path.home()), value.strip())
     number = re.fullmatch(r"-?\d{1,3}(_\d{3})*(\.[\d_]*)?", value)
     odd = key == "name" or (re.search(r"[^\t -}]|[&#]|\d_\d", text) and not number)
     plain = re.fullmatch(r"[\w.@/+]+", key) and not re.search(r"""[][{}(),='"]""", value)
