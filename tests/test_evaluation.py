@@ -97,6 +97,7 @@ class TestCache:
         for path in cache.folder.glob("*/*"):
             path.write_bytes(path.read_bytes()[:100])
         assert figures(there, other, cache) == expected
+        assert figures(there, other, Cache(tmp_path / ("n" * 256))) == expected  # which cannot be read or written
 
     def test_a_transposed_state_is_kept_and_another_recipe_gathered_again(self, tmp_path):
         cache, state = Cache(tmp_path), torch.arange(6.0).view(2, 3).T

@@ -51,10 +51,10 @@ class Cache:
         return Store(self.folder / checksum(key)[:24], "statistics", {"key": key})
 
     def read(self, key: str) -> Statistics | None:
-        """Read the statistics of a key from `key_of`; None if missing or damaged."""
+        """Read the statistics of a key from `key_of`; None if missing, damaged or not readable."""
         try:
             states, notes = self._store(key).read(0)
-        except (FileNotFoundError, Damaged, InputError):
+        except (OSError, Damaged, InputError):
             return None
         return Statistics({name: torch.from_numpy(value) for name, value in states.items()}, **notes)
 
