@@ -155,8 +155,7 @@ def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):
 def test_a_model_of_range_alone_leaves_reflectance_out(complete, tmp_path):
     path = write_run(tmp_path / "run", network(reflectance=False), TRANSFER)
     full_scan(tmp_path / "one.bin")
-    said = complete(tmp_path / "one.bin", "--mask", "rows:2", model=path).said
-    assert "answers have no reflectance" in said
+    assert "answers have no reflectance" in complete(tmp_path / "one.bin", "--mask", "rows:2", model=path).said
     assert read_points(tmp_path / "out" / "one.ply").reflectance is None
 
 

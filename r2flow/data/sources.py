@@ -92,8 +92,8 @@ def made_here(root: str | Path) -> bool:
         folder = folder.parent
     if not folder.is_dir() or manifest_of(folder):
         return folder.is_dir()
-    with os.scandir(folder) as entries:  # knows folders without a system call per file
-        below = [entry.path for entry in entries if entry.is_dir() or scan_ending(entry.name)]
+    with os.scandir(folder) as entries:  # knows folders without a system call per file; fails at a loop of links
+        below = [e.path for e in entries if scan_ending(e.name) or (os.path.isdir(e) if e.is_symlink() else e.is_dir())]
     return bool(below) and all(map(manifest_of, below))
 
 

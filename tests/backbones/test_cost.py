@@ -55,8 +55,7 @@ class Other(nn.Module):
 
     def forward(self, x):  # (B, 3, 8, 16)
         tokens = self.recurrent(self.convolution(self.transposed(x)[..., :8, :16].flatten(2)).mT)[0]
-        attended = torch.einsum("bqc,bkc->bqk", tokens, tokens).softmax(-1) @ tokens
-        return attended.mT.unflatten(2, (8, 16))
+        return (torch.einsum("bqc,bkc->bqk", tokens, tokens).softmax(-1) @ tokens).mT.unflatten(2, (8, 16))
 
 
 def test_other_layers_by_hand():

@@ -15,7 +15,7 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairSource, PairStore, make_pairs
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve_reflectance
-from r2flow.data.sources import InMemory
+from r2flow.data.sources import InMemory, made_here
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
@@ -171,6 +171,8 @@ class TestReflectance:
 
 def test_a_broken_link_is_not_suggested_for_itself(tmp_path: Path):
     (tmp_path / "b.bin").symlink_to("/nonexistent")
+    (tmp_path / "loop").symlink_to("loop")
+    assert not made_here(tmp_path)
     with pytest.raises(InputError, match=r"b\.bin is a broken link\. Give a scan file.* or a run\.$"):
         open_scans(tmp_path / "b.bin")
     (tmp_path / "bb.bin").touch()
