@@ -139,5 +139,3 @@ def open_streams() -> None:
             raw = io.BufferedWriter(Unbroken(stream.fileno(), "w", closefd=False))
             lines = name == "stderr" or stream.isatty()
             setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, "backslashreplace", line_buffering=lines))
-        elif isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")

@@ -100,8 +100,7 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
 
 def test_a_thinned_scan_is_not_taken_for_another_sensors(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     quarter = Sensor("quarter", SENSORS["hdl64e_rings"].elevations[::4], columns=1024)
-    file = write_scans(tmp_path / "scans", quarter, 1, 1) / "000000.bin"
-    assert package.read(file).shape == (2, 64, 1024)
+    assert package.read(write_scans(tmp_path / "scans", quarter, 1, 1) / "000000.bin").shape == (2, 64, 1024)
     assert "they fit 'hdl32e'" in caplog.text  # the nearest of all
 
 
@@ -112,8 +111,7 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     assert raw.max() > 250
     npy, image = ("--format", "npy", "-o", tmp_path / "image"), tmp_path / "image" / "000000.npy"
     assert r2flow("show", scans / "000000.bin", "--sensor", out, *npy)[0] == 0
-    expected = np.unique(raw / np.float32(255))
-    assert set(np.unique(np.load(image)[1])) <= {0, *expected}
+    assert set(np.unique(np.load(image)[1])) <= {0, *np.unique(raw / np.float32(255))}
     assert np.load(image)[1].max() > 0.95
     assert r2flow("prepare", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1).quiet
     assert read_manifest(tmp_path / "prepared")["recipe"]["reading"]["reflectance_scale"] == 255

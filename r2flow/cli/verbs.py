@@ -70,14 +70,14 @@ def _run() -> None:
     except (InputError, OSError) as error:
         message = explain_mistake(error)
     except (ImportError, MemoryError, RuntimeError) as error:
-        homeless = "home directory" in str(error)
-        if not isinstance(error, MemoryError) and not homeless and not any(words in str(error) for words in FULL):
-            raise
-        size = re.search(r"allocate ([\d.]+ \w+)", str(error))
-        more = f" for {size[1]} more" if size else ""
-        message = f"the memory has no room{more}; give smaller batches or images, or more memory."
-        if homeless:
+        if "home directory" in str(error):
             message = "~ is no folder: write the path in full, or set HOME; for the cache, XDG_CACHE_HOME."
+        elif isinstance(error, MemoryError) or any(words in str(error) for words in FULL):
+            size = re.search(r"allocate ([\d.]+ \w+)", str(error))
+            more = f" for {size[1]} more" if size else ""
+            message = f"the memory has no room{more}; give smaller batches or images, or more memory."
+        else:
+            raise
     except USAGE_ERROR as error:
         text = one_line(error.format_message()).rstrip(".") or "no verb given"
         message = f"{text}{'.' * (not text.endswith('?'))} See --help."

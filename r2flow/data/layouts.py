@@ -217,8 +217,7 @@ def named_drive(drives: list[Drive], name: str) -> Drive:
     if len(matches) != 1:
         names = [drive.name for drive in drives]
         listed = "none, its scans are in one folder" if names == ["."] else ", ".join(names)
-        problem = "no drive" if not matches else f"{len(matches)} drives"
-        raise InputError(f"{problem} named {name!r}; known: {listed}.")
+        raise InputError(f"{len(matches) or 'no'} drive{'s' * (len(matches) > 1)} named {name!r}; known: {listed}.")
     return matches[0]
 
 

@@ -77,8 +77,7 @@ class InverseDepth(Inverse):
     """r_min / r within the range limits, else 0, in both directions and without tolerance, as in DUSty."""
 
     def forward(self, r: Tensor) -> Tensor:
-        inside = (r >= self.min_range) & (r <= self.max_range)
-        return torch.where(inside, super().forward(r), 0.0)
+        return torch.where((r >= self.min_range) & (r <= self.max_range), super().forward(r), 0.0)
 
     def inverse(self, y: Tensor) -> Tensor:
         inverse = y / self.min_range

@@ -176,8 +176,7 @@ def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]
         ]
         return ["set", "its scans : real", *cells], lines
     columns = ["", *(f"{c.title} {size}" for c, size in zip(comparisons, sizes, strict=True))]
-    lines = [[title, *(v.get((c.kind, c.name), "") for c in comparisons)] for title, v in cells.items()]
-    return columns, lines
+    return columns, [[title, *(v.get((c.kind, c.name), "") for c in comparisons)] for title, v in cells.items()]
 
 
 def _distances(comparisons: Sequence[Comparison]) -> dict[str, bool]:

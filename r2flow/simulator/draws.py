@@ -39,8 +39,7 @@ def hypotenuse(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @cache
 def _normal_quantiles() -> np.ndarray:
-    law = NormalDist()
-    return np.array([law.inv_cdf((k + 0.5) / _ENTRIES) for k in range(_ENTRIES)], np.float32)
+    return np.array([NormalDist().inv_cdf((k + 0.5) / _ENTRIES) for k in range(_ENTRIES)], np.float32)
 
 
 @cache

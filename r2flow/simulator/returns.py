@@ -94,8 +94,7 @@ def _in_patches(rays: Rays, rng: np.random.Generator) -> np.ndarray:
     """Uniform draws that PATCH neighbouring columns of a laser share, (B, W)."""
     b, w = rays.shape
     patches = rng.random((b, w // PATCH + 2), dtype=np.float32)
-    start = rng.integers(0, PATCH, (b, 1))
-    return np.take_along_axis(patches, (np.arange(w) + start) // PATCH, axis=1)
+    return np.take_along_axis(patches, (np.arange(w) + rng.integers(0, PATCH, (b, 1))) // PATCH, axis=1)
 
 
 def _nearest(

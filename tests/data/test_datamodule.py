@@ -87,8 +87,7 @@ def test_the_fingerprint_does_not_know_how_the_root_was_written(numbered: Path, 
     monkeypatch.chdir(numbered.parent)
     name = numbered.name
     written = [str(numbered), name, f"./{name}", f"{name}//", f"../{numbered.parent.name}/{name}"]
-    prints = {module(name="folder", root=root).fingerprint() for root in written}
-    assert len(prints) == 1
+    assert len({module(name="folder", root=root).fingerprint() for root in written}) == 1
 
 
 FOLDER = {"name": "folder", "root": "x"}

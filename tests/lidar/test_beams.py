@@ -116,8 +116,7 @@ def test_the_scale_of_reflectance_is_estimated(values, scale):
     assert full_reflectance([points]) == scale
     assert full_reflectance([Points(points.xyz)]) is None
     if scale:
-        highest = scaled_reflectance("a.bin", points, scale).max()
-        assert highest == pytest.approx(min(values.max() / scale, 1))
+        assert scaled_reflectance("a.bin", points, scale).max() == pytest.approx(min(values.max() / scale, 1))
 
 
 def test_range_limits_include_all_but_stray_returns():

@@ -56,8 +56,7 @@ def test_each_has_its_nearest_over_turns_and_mirror_and_copies_are_found(sets, m
     for place in (3, 4, 5):  # the figure draws the training scan as the sample shows it
         np.testing.assert_array_equal(one.match(place)[0], made["generated"][place][0])
     result = copies_result(one, real)
-    count = (one.distances < min(real.distances)).sum()
-    assert f"{count} of 6 scans" in result.remarks[0]
+    assert f"{(one.distances < min(real.distances)).sum()} of 6 scans" in result.remarks[0]
     assert result.figures["copies"] == np.median(one.distances)
     wins = np.mean([a < b for a in one.distances for b in real.distances])
     assert result.figures["copies_nearer"] == pytest.approx(wins)

@@ -67,8 +67,7 @@ def digest(sensor: Sensor, seed: int, index: int) -> str:
 
 def test_the_same_seed_and_index_give_the_same_scan_in_any_order():
     first = [digest(SMALL, 7, index) for index in range(4)]
-    again = [digest(SMALL, 7, index) for index in reversed(range(4))]
-    assert first == again[::-1]
+    assert first == [digest(SMALL, 7, index) for index in reversed(range(4))][::-1]
     assert len({*first, digest(SMALL, 8, 0)}) == 5
 
 

@@ -151,8 +151,7 @@ def test_singular_values_come_near_one_and_directions_stay(shape):
 
 
 def test_matrices_between_hidden_layers_are_learned_so():
-    hidden = {name for name, p in network().named_parameters() if is_hidden_matrix(p)}
-    assert hidden == {"1.weight", "3.weight"}
+    assert {name for name, p in network().named_parameters() if is_hidden_matrix(p)} == {"1.weight", "3.weight"}
 
 
 def test_all_other_weights_are_adamw_s():

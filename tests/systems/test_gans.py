@@ -268,8 +268,7 @@ def test_a_published_file_is_a_generator(shared: Path, name: str, averaged: bool
     checkpoint = load_checkpoint(shared / "oracle_baselines" / f"{name}_published.pth", averaged=averaged)
     assert checkpoint.config["published"] == io["cfg"]
     assert checkpoint.step == 1_000_000 // 32
-    network = checkpoint.generator.network
-    assert sum(p.numel() for p in network.parameters()) == io["num_parameters"]["G"]
+    assert sum(p.numel() for p in checkpoint.generator.network.parameters()) == io["num_parameters"]["G"]
     made = checkpoint.generator.made(io["z"], io["uniform"], truncation=io["truncation_psi"])
     apart = (made["image"] - io["outputs"]["image"]).abs().max() / io["outputs"]["image"].abs().max()
     assert (apart < 1e-4) == averaged

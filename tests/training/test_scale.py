@@ -76,8 +76,7 @@ def test_two_processes_have_the_losses_of_one(one: Path, two: Path):
 def test_two_processes_share_one_average_and_one_writes(one: Path, two: Path):
     average = [json.loads((two / "record" / f"average-{rank}.json").read_text()) for rank in (0, 1)]
     assert average[0] == average[1]
-    writers = {path.name.split("-")[1] for path in (two / "record").glob("wrote-*")}
-    assert writers == {"0"}
+    assert {path.name.split("-")[1] for path in (two / "record").glob("wrote-*")} == {"0"}
     assert [p.name for p in checkpoints_of(two / "runs" / "two")] == ["step-00000020.ckpt", "step-00000018.ckpt"]
     torch.testing.assert_close(weights(one / "runs" / "one"), weights(two / "runs" / "two"), rtol=0, atol=1e-4)
 
