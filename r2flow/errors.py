@@ -113,7 +113,7 @@ class PlainFormatter(logging.Formatter):
 
 
 class Unbroken(io.FileIO):
-    """A file descriptor that can be written to after its reader, terminal or disk room is gone; work goes on."""
+    """A file descriptor that can be written to after its reader, terminal or disk room is gone."""
 
     lost: OSError | None = None  # of standard output, if it was not the end of its reader (`| head`)
 

@@ -163,8 +163,7 @@ def test_the_own_grids_of_chord_and_renoise_are_late():
 
 def test_a_run_notes_the_sampler_for_few():
     config = {"stage": {"name": "flow_map"}, "data": DATA, "seed": 0}
-    stage = build_stage({**config, "few": {"name": "chord"}}, flow_map())
-    assert stage.generator.few == build_sampler("chord")
+    assert build_stage({**config, "few": {"name": "chord"}}, flow_map()).generator.few == build_sampler("chord")
     with pytest.raises(InputError, match="cord"):
         build_stage({**config, "few": {"name": "cord"}}, flow_map())
 

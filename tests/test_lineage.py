@@ -148,8 +148,8 @@ def test_each_set_of_scans_says_its_whole_reading():
         assert one["reading"]["convention"] == "reference"
     assert reading_in(found) == found  # a run that is resumed says the same
     pairs = {"name": "pairs", "scans": part, "reading": {"projection": "unfolding", "reflectance_scale": 2.0}}
-    beside = reading_in(pairs)["scans"]["reading"]
-    assert (beside["projection"], beside["reflectance_scale"]) == ("unfolding", 0.012)
+    scans = reading_in(pairs)["scans"]["reading"]
+    assert (scans["projection"], scans["reflectance_scale"]) == ("unfolding", 0.012)
 
 
 def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):

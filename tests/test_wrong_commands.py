@@ -33,7 +33,7 @@ VERBS = """
 nope # No such command 'nope'
 sampel -c run -o out # Did you mean 'sample'?
 sample empty -o out
-info ~nouser/run # ~ is no folder
+info ~nouser/run # ~ stands for nothing
 sample run -o out --sampler dopri5 --steps 50 # steps
 sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column

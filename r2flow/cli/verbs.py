@@ -71,7 +71,7 @@ def _run() -> None:
         message = explain_mistake(error)
     except (ImportError, MemoryError, RuntimeError) as error:
         if "home directory" in str(error):
-            message = "~ is no folder: write the path in full, or set HOME; for the cache, XDG_CACHE_HOME."
+            message = "~ stands for nothing here: write the path in full, or set HOME; for the cache, XDG_CACHE_HOME."
         elif isinstance(error, MemoryError) or any(words in str(error) for words in FULL):
             size = re.search(r"allocate ([\d.]+ \w+)", str(error))
             more = f" for {size[1]} more" if size else ""

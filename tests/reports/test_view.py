@@ -176,8 +176,7 @@ class TestTheVerb:
         for name, highest in (("a", 80), ("b", 204)):
             write_points(tmp_path / "in" / f"{name}.ply", np.array([[10.0, 0, 0]]), np.array([highest]))
         assert r2flow("show", *(tmp_path / "in" / n for n in given), "--format", "npy", "-o", tmp_path / "out")[0] == 0
-        found = [np.load(tmp_path / "out" / f"{name}.npy")[1].max() for name in "ab"]
-        assert found == pytest.approx([80 / 255, 0.8])
+        assert [np.load(tmp_path / "out" / f"{name}.npy")[1].max() for name in "ab"] == pytest.approx([80 / 255, 0.8])
 
     def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path):
         for name, image in zip("ab", images(2), strict=True):

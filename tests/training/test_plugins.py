@@ -35,8 +35,7 @@ def _as_before() -> Iterator[None]:
 def test_a_plugin_stands_anywhere_on_the_command_line():
     assert take_plugins(["sample", "--num", "1"]) == (["sample", "--num", "1"], [])
     assert take_plugins(["--plugin", "a.b", "sample", "x"]) == (["sample", "x"], ["a.b"])
-    line = ["sample", "x", "--plugin=a.b", "--plugin", "./c.py"]
-    assert take_plugins(line) == (["sample", "x"], ["a.b", "./c.py"])
+    assert take_plugins(["sample", "x", "--plugin=a.b", "--plugin", "./c.py"]) == (["sample", "x"], ["a.b", "./c.py"])
 
 
 def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path):
