@@ -126,10 +126,10 @@ class Cylinders(NamedTuple):
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
         u, v = x - self.x[k], y - self.y[k]
         away = hypotenuse(u, v)
-        on_top = z - self.top[k] > away - self.radius[k]
-        below = self.bottom[k] - z > away - self.radius[k]
-        side = np.where(on_top | below, 0, 1 / np.maximum(away, 1e-6))
-        return _round(u * side, v * side, on_top.astype(np.float32) - below)
+        over, under = z - self.top[k], self.bottom[k] - z
+        on_lid = np.maximum(over, under) > away - self.radius[k]
+        side = np.where(on_lid, 0, 1 / np.maximum(away, 1e-6))
+        return _round(u * side, v * side, np.where(on_lid, np.sign(over - under), 0))
 
 
 class Blobs(NamedTuple):

@@ -117,10 +117,10 @@ def test_the_share_of_pulses_through_leaves_is_exponential_in_their_path():
 
 
 def test_walls_seen_face_on_have_cosine_one_and_grazed_ground_sin_e():
-    hits, _, rays = look(("building", Boxes(10.0, 0.0, 0.0, 1.0, 40.0, -1.0, 9.0)))
-    middle = HDL64E.columns // 2
+    wall, disc = Boxes(10.0, 0.0, 0.0, 1.0, 40.0, -1.0, 9.0), Cylinders(-6.0, 0.0, 2.0, -0.5, 0.01)
+    hits, _, rays = look(("building", wall), ("pole", disc))
     e = rays.lasers.elevation
-    wall = hits.label[:, middle] == LABELS["building"]
-    np.testing.assert_allclose(hits.cosine[wall, middle], np.cos(e[wall]), atol=1e-4)
-    flat = (hits.label[:, 0] == LABELS["terrain"]) & (e < -0.05)
+    wall = hits.label[:, 512] == LABELS["building"]  # ahead
+    np.testing.assert_allclose(hits.cosine[wall, 512], np.cos(e[wall]), atol=1e-4)
+    flat = np.isin(hits.label[:, 0], [LABELS["terrain"], LABELS["pole"]]) & (e < -0.05)
     np.testing.assert_allclose(hits.cosine[flat, 0], np.sin(-e[flat]), atol=1e-4)
