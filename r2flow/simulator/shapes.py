@@ -149,9 +149,8 @@ class Blobs(NamedTuple):
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
         """Roots of |p(s) - c|^2 = 1 in units of the semi-axes; the near root moves inwards by the free path."""
         k, w, middle, half = _chords(self, rays)
-        ahead = middle - half > NEAR
-        k, w, middle, half = k[ahead], w[ahead], middle[ahead], half[ahead]
-        n, b = row_windows(rays, middle - half, middle + half, self.z[k] - self.height[k], self.z[k] + self.height[k])
+        near = np.maximum(middle - half, NEAR)
+        n, b = row_windows(rays, near, middle + half, self.z[k] - self.height[k], self.z[k] + self.height[k])
         k, w, middle, half = k[n], w[n], middle[n], half[n]
         level = (1 / self.radius**2)[k]  # (s - middle)^2 level + (z + s T - c)^2 upright = half^2 level
         upright = (1 / self.height**2)[k]
@@ -161,9 +160,9 @@ class Blobs(NamedTuple):
         d = h * h - a * ((middle**2 - half**2) * level + rise**2 * upright)
         root = np.sqrt(np.maximum(d, 0))
         distance = (h - root) / a
-        path = self.path[k]
+        path, ahead = self.path[k], distance > NEAR
         distance += path * _depths(k, b, w, rng) / np.sqrt(1 + slope**2)
-        hit = (d > 0) & ((path == 0) | (distance < (h + root) / a))
+        hit = (d > 0) & ahead & ((path == 0) | (distance < (h + root) / a))
         return Fragments((b * rays.columns + w)[hit], distance[hit], k[hit])
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:

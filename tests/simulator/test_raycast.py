@@ -40,11 +40,11 @@ def test_lasers_above_the_origin_see_flat_ground_at_their_own_height():
     np.testing.assert_allclose(hits.distance[down], np.repeat(exact[down, None], HDL64E.columns, 1), rtol=1e-5)
 
 
-def test_a_sphere_is_met_at_the_root_of_its_quadratic():
-    centre, radius = np.array([9.0, 4.0, 1.2]), 1.1
+@pytest.mark.parametrize(("centre", "radius"), [((9.0, 4.0, 1.2), 1.1), ((0.3, 0.2, -0.05), 1.5)])  # ahead, below
+def test_a_sphere_is_met_at_the_root_of_its_quadratic(centre, radius):
     hits, r, rays = look(("person", Blobs(*centre, radius, radius, 0.0)))
     d = directions(rays)
-    c = centre - [0, 0, HEIGHT]
+    c = np.subtract(centre, [0, 0, HEIGHT])
     along = np.tensordot(c, d, 1)
     root = radius**2 - (c @ c - along**2)
     exact = along - np.sqrt(np.where(root > 0, root, np.nan))
