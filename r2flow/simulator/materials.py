@@ -12,10 +12,10 @@ class Material(NamedTuple):
     name: str
     albedo: float  # mean reflectance at perpendicular incidence
     spread: float  # standard deviation of albedo between objects
-    texture: float  # standard deviation of reflectance between pixels
+    texture: float  # scale of the noise of reflectance between pixels; its standard deviation is 1.3 of it
     gloss: float  # g in the incidence falloff (1 + g) c / (c + g), c the cosine; a mirror has a large g
     swallow: float  # share of pulses that do not return, for any angle and distance
-    depth: float  # mean depth in metres at which pulses return from inside (leaves, grass)
+    depth: float  # mean depth, along the ground, in metres at which pulses return from inside (leaves, grass)
 
 
 MATERIALS = (
