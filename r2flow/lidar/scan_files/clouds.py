@@ -15,6 +15,7 @@ from r2flow.errors import check
 from r2flow.lidar.scan_files.points import NoPointsError
 
 PCD_KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+PCD_KINDS = ("binary", "binary_compressed")
 PCD_TYPES = {f"{kind}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {"F4", "F8"}
 PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_CODES = {  # NumPy's codes of PLY's types
@@ -50,28 +51,23 @@ def read_pcd(path: Path) -> Table:
         raise NoPointsError("it declares 0 points; leave it out, or fetch it again.")
     kind, body = " ".join(header["DATA"]), data[start:]
     if kind == "ascii":
-        table = text_table(body.decode("ascii").splitlines(), count, sum(widths))
+        table = text_table(body, [count], 0, sum(widths))
         offsets = np.cumsum([0, *widths])
         return names, [table[:, i] if n == 1 else table[:, i : i + n] for i, n in zip(offsets, widths, strict=False)]
+    check(kind in PCD_KINDS, f"it declares DATA {kind[:24]!r}; known: ascii, {', '.join(PCD_KINDS)}.")
     fields = enumerate(zip(kinds, widths, strict=True))
     row = np.dtype([(str(i), f"<{k.lower()}", (n,) if n > 1 else ()) for i, (k, n) in fields])
-    size = count * row.itemsize
+    size = stored = count * row.itemsize
+    if kind == "binary_compressed":
+        stored, unpacked = struct.unpack_from("<II", body)
+        check(unpacked == size, f"it declares points of {size} bytes, its compressed data {unpacked}. Is it damaged?")
+        body = body[8:]
+    check(len(body) >= stored and not body[stored:].strip(b"\0\r\n "), _wrong_size(stored, len(body)))  # padded pages
     if kind == "binary":
-        check(len(body) >= size and not body[size:].strip(b"\0\r\n "), _wrong_size(size, len(body)))  # padded pages
         points = np.frombuffer(body, row, count)
         return names, [points[name] for name in row.names or ()]
-    check(kind == "binary_compressed", f"it declares DATA {kind[:24]!r}; known: ascii, binary, binary_compressed.")
-    packed, unpacked = struct.unpack_from("<II", body)
-    check(unpacked == size, f"it declares points of {size} bytes, its compressed data {unpacked}. Is it damaged?")
-    body = body[8:]
-    check(len(body) >= packed and not body[packed:].strip(b"\0\r\n "), _wrong_size(packed, len(body)))
-    blocks = memoryview(decompress_lzf(body[:packed], size))
-    arrays = []  # stored field by field: all x, then all y, ...
-    for kind, width in zip(kinds, widths, strict=True):
-        array = np.frombuffer(blocks, f"<{kind.lower()}", count * width)
-        arrays.append(array if width == 1 else array.reshape(count, width))
-        blocks = blocks[array.nbytes :]
-    return names, arrays
+    blocks = decompress_lzf(body[:stored], size)  # field by field: all x, then all y, ...
+    return names, [np.frombuffer(blocks, f, count, count * offset) for f, offset, *_ in (row.fields or {}).values()]
 
 
 def write_pcd(file: IO[bytes], table: np.ndarray, names: tuple[str, ...]) -> None:
@@ -118,16 +114,14 @@ def read_ply(path: Path) -> Table:
     check(kind, f"it has no 'format' line in its header; known: {', '.join(PLY_ORDERS)}, each 1.0.")
     index = next((i for i, element in enumerate(elements) if element.name == "vertex"), -1)
     check(index >= 0, "it has no element 'vertex', which holds the points.")
-    before, vertex = elements[:index], elements[index]
+    vertex = elements[index]
     check(not any(element.listed for element in elements[: index + 1]), "it has lists in or before its points.")
     if not vertex.count:
         raise NoPointsError("it declares 0 points; leave it out, or fetch it again.")
     names = [name for name, _ in vertex.fields]
     if kind == "ascii":
-        rows = [line for line in data[start:].decode("ascii").splitlines() if line.strip()]
-        declared, first = (sum(element.count for element in part) for part in (elements, before))
-        check(declared == len(rows), f"it declares {declared} rows but holds {len(rows)}. Is it whole?")
-        return names, list(text_table(rows[first : first + vertex.count], vertex.count, len(names)).T)
+        table = text_table(data[start:], [element.count for element in elements], index, len(names))
+        return names, list(table.T)
     order = PLY_ORDERS[kind]
     kinds = [np.dtype([(str(i), order + code) for i, (_, code) in enumerate(element.fields)]) for element in elements]
     sizes = [element.count * kind.itemsize for element, kind in zip(elements, kinds, strict=True)]
@@ -149,11 +143,12 @@ READERS = {".pcd": read_pcd, ".ply": read_ply}
 WRITERS = {".pcd": write_pcd, ".ply": write_ply}
 
 
-def text_table(lines: list[str], rows: int, width: int) -> np.ndarray:
-    """Numbers in all lines that are not blank, float64 (rows, width)."""
-    lines = [line for line in lines if line.strip()]
-    check(len(lines) == rows, f"it declares {rows} points but holds {len(lines)} lines. Is it whole?")
-    table = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
+def text_table(body: bytes, counts: list[int], index: int, width: int) -> np.ndarray:
+    """Numbers of element `index` of a text with `counts` lines an element, float64 (counts[index], width)."""
+    lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
+    check(len(lines) == sum(counts), f"it declares {sum(counts)} rows but holds {len(lines)}. Is it whole?")
+    first = sum(counts[:index])
+    table = np.loadtxt(lines[first : first + counts[index]], dtype=np.float64, comments=None, ndmin=2)
     check(table.shape[1] == width, f"it has {table.shape[1]} numbers a line where its header declares {width}.")
     return table
 
