@@ -88,7 +88,8 @@ def project_indices(
     points = xyz
     if not finite.all():  # rays without a return: fired in unfolding, but not in any pixel
         points, r = np.where(finite[:, None], xyz, np.float32(0)), np.where(finite, r, np.float32(0))
-    row = _rows(xyz if projection == "unfolding" else points, r, sensor, projection, convention, ring)
+    unfolding = projection == "unfolding"
+    row = unfolded_rows(xyz, sensor, convention, ring) if unfolding else _rows(points, r, sensor, convention)
     pixel = row * columns
     pixel += _columns(points, columns, convention)
     within = finite & (r >= sensor.min_range) & (r <= sensor.max_range)
@@ -111,12 +112,8 @@ def project_indices(
     return hit, chosen, r[chosen]
 
 
-def _rows(
-    xyz: np.ndarray, r: np.ndarray, sensor: Sensor, projection: str, convention: Convention, ring: np.ndarray | None
-) -> np.ndarray:
-    """Row of every point, (N,) int64; outside [0, H) for points outside the view."""
-    if projection == "unfolding":
-        return unfolded_rows(xyz, sensor, convention, ring)
+def _rows(xyz: np.ndarray, r: np.ndarray, sensor: Sensor, convention: Convention) -> np.ndarray:
+    """Row of every point's elevation, (N,) int64; outside [0, H) for points outside the view."""
     rows = sensor.shape[0]
     elevation = np.arcsin(xyz[:, 2] / np.maximum(r, np.float32(1e-12)))
     edges = np.deg2rad(sensor.row_edges)
