@@ -41,14 +41,12 @@ class Region:
 
     def crop(self, image: Tensor) -> Tensor:
         """Crop an image, (..., H, W), to (..., height, width)."""
-        rows, columns = self.rows.to(image.device), self.columns.to(image.device)
-        return image.index_select(-2, rows).index_select(-1, columns)
+        return image[..., self.rows[:, None], self.columns]
 
     def place(self, part: Tensor) -> Tensor:
         """Insert a part, (..., height, width), into an image of zeros, (..., H, W)."""
         image = part.new_zeros(*part.shape[:-2], *self.shape)
-        rows, columns = self.rows.to(part.device), self.columns.to(part.device)
-        image[..., rows[:, None], columns] = part
+        image[..., self.rows[:, None], self.columns] = part
         return image
 
     def widened(self, unit: tuple[int, int]) -> "Region":
