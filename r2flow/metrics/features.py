@@ -28,6 +28,7 @@ class FeatureMetric(ScanMetric):
     """A metric whose rows are a network's features; a name in `EXTRACTORS` loads the network with its weights."""
 
     representation = "features of a network"
+    keeping = True
     kind: ClassVar[str]
     names: ClassVar[Mapping[str, str]] = {}
 
@@ -109,7 +110,6 @@ class FrechetDistance(FeatureMetric):
     kind = "frechet"
     names = FIELD_NAMES
     settings: ClassVar[Mapping[str, Any]] = {"covariance": "unbiased, n - 1"}
-    keeping = True
     biased = True
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
@@ -130,7 +130,6 @@ class KernelDistance(FeatureMetric):
 
     kind = "kid"
     settings: ClassVar[Mapping[str, Any]] = {"kernel": "(a b / D + 1)^3", "estimate": "unbiased, all pairs"}
-    keeping = True
     biased = False
 
     def distance(self, real: Tensor, generated: Tensor) -> Tensor:
@@ -162,7 +161,6 @@ class Manifold(FeatureMetric):
 
     kind = "manifold"
     settings: ClassVar[Mapping[str, Any]] = {"neighbours": NEIGHBOURS, "distance": "Euclidean"}
-    keeping = True
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         names = [f"{name}_{self.name.removeprefix('manifold_')}" for name in NAMES]
@@ -219,7 +217,6 @@ class TwoSample(FeatureMetric):
     kind = "auc"
     names: ClassVar[Mapping[str, str]] = {"handcrafted": "auc", "handcrafted_range": "auc_range"}
     settings: ClassVar[Mapping[str, Any]] = {"classifier": "logistic regression, ridge 1", "folds": "two halves"}
-    keeping = True
     fewest = 4  # two to train on, two to test
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
