@@ -131,7 +131,9 @@ def gather_real(
     if cache is not None:
         keys = {name: key_of(metric, real, chosen[name][1] + points) for name, metric in metrics.items()}
         cached = {name: entry for name, key in keys.items() if (entry := cache.read(key)) is not None}
-        statistics = {name: replace(cached[name], chosen=chosen[name][1]) for name in _common(set(cached))}
+        readers = summed(torch.tensor([int(name in cached) for name in metrics])).tolist()
+        everywhere = [name for name, count in zip(metrics, readers, strict=True) if count == place()[1]]
+        statistics = {name: replace(cached[name], chosen=chosen[name][1]) for name in everywhere}
     missing = {name: metric for name, metric in metrics.items() if name not in statistics}
     for metric in missing.values():
         metric.reset()
@@ -234,13 +236,3 @@ def _update(
                 check(batch.images._version == version, f"metric {name} edits the scans of all metrics: edit a copy.")
             advance(len(batch))
     return int(summed(torch.tensor(empty)))
-
-
-def _common(names: set[str]) -> set[str]:
-    """Names cached on every process: all processes read a metric from the cache, or none."""
-    _, ranks = place()
-    if ranks == 1:
-        return names
-    all_names: list[set[str]] = [set()] * ranks
-    torch.distributed.all_gather_object(all_names, names)
-    return set.intersection(*all_names)
