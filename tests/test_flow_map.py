@@ -8,7 +8,7 @@ import torch
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import FlowDataset
 from r2flow.data.options import PairOptions
-from r2flow.data.pairs import PairDataset, PairSource, PairStore, make_pairs
+from r2flow.data.pairs import PairDataset, PairStore, make_pairs
 from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES
@@ -189,7 +189,7 @@ def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_
     options = PairOptions(sampler={"name": "adams3", "steps": 64}, num=6, knots=7, batch_size=2, parent="a")
     store = PairStore(tmp_path, options, (2, 4, 8))
     make_pairs(store, Field(lambda t, x: x, (2, 4, 8)))
-    dataset = PairDataset(PairSource(store), 0, "training")
+    dataset = PairDataset(store, store.usable(), 0, "training")
     batch = torch.utils.data.default_collate([dataset[k, k] for k in range(6)])
     assert batch["knots"].shape == (6, 7, 2, 4, 8)
     t = torch.tensor([0.0, 0.11, 0.4, 0.63, 0.9, 1.0])
@@ -208,8 +208,9 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
     store = PairStore(tmp_path, options, exact.space.shape)
     make_pairs(store, exact)
     mean, std = exact.problem.mean, exact.problem.std
-    for index, pair in enumerate(PairSource(store)[k] for k in range(6)):
-        x_0, x_1 = pair["x_0"], pair["x_1"]
+    pairs = PairDataset(store, store.usable(), 0, "training")
+    for index in range(6):
+        x_0, x_1 = pairs[0, index]["x_0"], pairs[0, index]["x_1"]
         assert torch.equal(x_0, standard_normal(exact.noise_shape, 3, "pairs", index))
         expected = mean + std * x_0
         for j, t in ((1, 1 - (2 / 3) ** 5), (2, 1 - (1 / 3) ** 5)):  # where later steps on power:5 begin

@@ -15,7 +15,7 @@ from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset, Further, Item, MixedOrder, Mixture, Permutations, RunLoader, RunSampler
 from r2flow.data.opening import open_source
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
-from r2flow.data.pairs import PairDataset, PairSource, PairStore
+from r2flow.data.pairs import PairDataset, PairStore
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
@@ -52,8 +52,8 @@ class ScanDataModule(L.LightningDataModule):
         self.further: Further | None = None
         self.names: list[str] = []
         self.opened: Sequence[Mixture] = ()  # as found, before they are read
-        self.training_source: Mixture | PairSource | None = None
-        self.validation_source: Mixture | PairSource | None = None
+        self.training_source: Mixture | np.ndarray | None = None  # scans, or the numbers of pairs
+        self.validation_source: Mixture | np.ndarray | None = None
         self.scans: Mixture | None = None  # next to pairs
         self.pairs: PairOptions | None = None
         if self.options.name == PAIRS:
@@ -123,7 +123,7 @@ class ScanDataModule(L.LightningDataModule):
         reading = Reading.of({**options.chosen, **images, "sensor": (sensor or self.sensor).described()})
         return open_source(options, reading, self.seed, first_scene)
 
-    def _order(self, source: Mixture | PairSource) -> MixedOrder | Permutations:
+    def _order(self, source: Mixture | np.ndarray) -> MixedOrder | Permutations:
         weights = [part.weight for part in self.parts if part.weight is not None]
         if isinstance(source, Mixture) and len(weights) > 1:
             return MixedOrder([len(part) for part in source.parts], weights, self.seed)
@@ -181,17 +181,17 @@ class ScanDataModule(L.LightningDataModule):
         """Read the scans, and open the pairs, which are made after `setup`."""
         self.read()
         if self.pairs is not None and self.training_source is None:
-            pairs = PairSource(self.pair_store)
+            pairs = self.pair_store.usable()
             first, last = holdout_block(len(pairs), self.validation.share)
-            self.training_source = pairs.subset(first)
-            self.validation_source = pairs.subset([last[i] for i in spread(len(last), self.validation.scans)])
+            self.training_source = pairs[first]
+            self.validation_source = pairs[last][spread(len(last), self.validation.scans)]
 
-    def _dataset(self, source: Mixture | PairSource, purpose: str) -> Dataset[Item]:
-        if isinstance(source, PairSource):
-            if self.scans is None or purpose != "training":
-                return PairDataset(source, self.seed, purpose)
-            scans = FlowDataset(self.scans, self.encoding, self.seed, "beside", None, self.noise_shape)
-            return PairDataset(source, self.seed, purpose, scans)
+    def _dataset(self, source: Mixture | np.ndarray, purpose: str) -> Dataset[Item]:
+        if not isinstance(source, Mixture):
+            scans = None
+            if self.scans is not None and purpose == "training":
+                scans = FlowDataset(self.scans, self.encoding, self.seed, "beside", None, self.noise_shape)
+            return PairDataset(self.pair_store, source, self.seed, purpose, scans)
         augment = self.augment if purpose == "training" else None
         sensors = self.sensors if purpose == "training" or self.options.held_out is None else [self.sensor]
         return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further, sensors)

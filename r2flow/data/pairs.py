@@ -1,11 +1,9 @@
 """Reflow pairs (x_0, x_1): noise and the sample that a flow maps it to."""
 
-import copy
 import math
 import os
 import random
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +75,13 @@ class PairStore(Store):
 
     def missing_pairs(self) -> int:
         return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.options.batch_size
+
+    def usable(self) -> np.ndarray:
+        """The numbers of the usable pairs, from 0; refuses a folder that lacks pairs."""
+        lacking, num = self.missing_pairs(), self.options.num
+        check(not lacking, f"{self.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
+        flags = [flag for shard in self.shards for flag in self.head(shard)["usable"]]
+        return np.flatnonzero(flags[:num])
 
     def noise(self, index: int) -> Tensor:
         """x_0 of a pair, which is not stored: the noise of (seed, "pairs", index)."""
@@ -160,52 +165,30 @@ def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.n
     return {**tensors, "usable": usable}
 
 
-class PairSource:
-    """The usable pairs of a store, as tensors in model space.
-
-    x_0 and x_1, (C, H, W) float32; with knots also knots, (K, C, H, W), the inner states of the path, and times,
-    (K + 2,), the times of x_0, the knots and x_1.
-    """
-
-    def __init__(self, store: PairStore) -> None:
-        self.store = store
-        lacking, num = store.missing_pairs(), store.options.num
-        check(not lacking, f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
-        usable = [flag for shard in store.shards for flag in store.head(shard)["usable"]]
-        self.indices = np.flatnonzero(usable[: store.options.num])
-        self.times = {"times": store.sampler.knot_times(store.knots).float()} if store.knots else {}
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def subset(self, indices: Sequence[int]) -> "PairSource":
-        part = copy.copy(self)
-        part.indices = self.indices[np.asarray(indices, dtype=np.int64)]
-        return part
-
-    def __getitem__(self, index: int) -> Item:
-        store, number = self.store, int(self.indices[index])
-        shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
-        with safe_open(store.files(shard)[0], framework="pt") as file:
-            names = ("x_1", "knots") if store.knots else ("x_1",)
-            states = {name: file.get_slice(name)[offset].float() for name in names}
-        return {"x_0": store.noise(store.first + number), **states, **self.times}
-
-
 class PairDataset(Dataset[Item]):
-    """Pairs as training items, with the keys of `FlowDataset` and `PairSource`; u depends only on (seed, purpose, k).
+    """Some pairs of a store as training items; u depends only on (seed, purpose, k).
 
-    Further keys with `scans`: scan, (C, H, W), a scan in model space, and noise, (*noise_shape), independent of it.
+    The keys are those of `FlowDataset`; with stored knots also knots, (K, C, H, W), states of the path, and times,
+    (K + 2,), the times of x_0, the knots and x_1. Further keys with `scans`: scan, (C, H, W), a scan in model space,
+    and noise, (*noise_shape), independent of it.
     """
 
-    def __init__(self, source: PairSource, seed: int, purpose: str, scans: FlowDataset | None = None) -> None:
-        self.source, self.seed, self.purpose, self.scans = source, seed, purpose, scans
+    def __init__(
+        self, store: PairStore, numbers: np.ndarray, seed: int, purpose: str, scans: FlowDataset | None = None
+    ) -> None:
+        self.store, self.numbers, self.seed, self.purpose, self.scans = store, numbers, seed, purpose, scans
+        self.times = {"times": store.sampler.knot_times(store.knots).float()} if store.knots else {}
         self.order = Permutations(0 if scans is None else len(scans), seed)
 
     def __getitem__(self, key: tuple[int, int]) -> Item:
         k, index = key
+        store, number = self.store, int(self.numbers[index])
+        shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
+        with safe_open(store.files(shard)[0], framework="pt") as file:
+            names = ("x_1", "knots") if store.knots else ("x_1",)
+            states = {name: file.get_slice(name)[offset].float() for name in names}
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
-        item = {**self.source[index], "u": u, "k": torch.tensor(k)}
+        item = {"x_0": store.noise(store.first + number), **states, **self.times, "u": u, "k": torch.tensor(k)}
         if self.scans is not None:
             scan = self.scans[k, self.order[k]]
             item |= {"scan": scan["x_1"], "noise": scan["x_0"]}

@@ -12,7 +12,7 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive, Layout, SourceKind
 from r2flow.data.opening import SOURCES, open_scans, own_reading, reading_for
 from r2flow.data.options import PairOptions
-from r2flow.data.pairs import PairSource, PairStore, make_pairs
+from r2flow.data.pairs import PairDataset, PairStore, make_pairs
 from r2flow.data.reading import Reading
 from r2flow.data.resolving import resolve_reflectance
 from r2flow.data.sources import InMemory, made_here
@@ -274,7 +274,7 @@ def test_pairs_are_made_of_noise_of_their_own_shape(tmp_path: Path):
     store = PairStore(tmp_path, options, (2, 4, 8), (5,))
     assert torch.equal(store.noise(3), standard_normal((5,), 0, "pairs", 3))
     make_pairs(store, Field(lambda t, x: torch.zeros_like(x), (5,)))
-    pair = PairSource(store)[2]
+    pair = PairDataset(store, store.usable(), 0, "training")[0, 2]
     assert torch.equal(pair["x_1"], pair["x_0"].half().float())
     with pytest.raises(InputError, match="holds other pairs: noise_shape"):
         PairStore(tmp_path, options, (2, 4, 8))

@@ -14,7 +14,7 @@ import torch
 
 from r2flow.cli.train import pairs
 from r2flow.data.options import PairOptions
-from r2flow.data.pairs import PairDataset, PairSource, PairStore, default_folder, make_pairs
+from r2flow.data.pairs import PairDataset, PairStore, default_folder, make_pairs
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.models import find_model
@@ -47,10 +47,9 @@ grow = Field(lambda t, x: x, SHAPE)
 def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
     store = store_in(tmp_path)
     make_pairs(store, grow)
-    source = PairSource(store)
-    assert len(source) == 50
+    pairs = PairDataset(store, store.usable(), 0, "training")
     for index in (0, 17, 49):
-        x_0, x_1 = source[index]["x_0"], source[index]["x_1"]
+        x_0, x_1 = pairs[0, index]["x_0"], pairs[0, index]["x_1"]
         assert torch.equal(x_0, standard_normal(SHAPE, 0, "pairs", index))
         # Half precision keeps 11 bits.
         torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)
@@ -61,7 +60,7 @@ def test_more_pairs_later_by_another_process_are_those_of_one_command(tmp_path: 
     make_pairs(store_in(tmp_path / "one"), grow)
     for num, made in ((3, 4), (20, 20), (20, 0), (50, (13 - 3) * 4)):  # in batches of 4, and shards of 12
         assert len(make_pairs(store_in(tmp_path / "grown", num=num), grow)) == made
-        assert len(PairSource(store_in(tmp_path / "grown", num=num))) == num
+        assert len(store_in(tmp_path / "grown", num=num).usable()) == num
     assert files(tmp_path / "one") == files(tmp_path / "grown")
 
 
@@ -96,7 +95,7 @@ def test_whole_shards_of_other_pairs_are_never_taken_for_damaged_ones(tmp_path: 
     with pytest.raises(InputError, match="holds pairs of another recipe"):
         make_pairs(store_in(tmp_path, sampler={"name": "dopri5"}), grow)
     with pytest.raises(InputError, match="holds pairs of another recipe"):
-        PairSource(store_in(tmp_path, sampler={"name": "dopri5"}))
+        store_in(tmp_path, sampler={"name": "dopri5"}).usable()
     assert files(tmp_path) == before
 
 
@@ -130,23 +129,23 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
     ]
     assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
     assert begun.stat().st_size == 50  # batches, each by one of the two
-    assert len(PairSource(store_in(tmp_path / "pairs", num=200))) == 200
+    assert len(store_in(tmp_path / "pairs", num=200).usable()) == 200
     make_pairs(store_in(tmp_path / "one", num=200), grow)
     assert files(tmp_path / "pairs") == files(tmp_path / "one")
 
 
 def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
-    bad = store_in(tmp_path).noise(5)
+    store = store_in(tmp_path, num=8)
 
     def broken(t, x):
         # The fifth scene starts where no other does, and stays there until it breaks.
-        hit = (x - bad).abs().amax((1, 2, 3), keepdim=True) < 1e-6
+        hit = (x - store.noise(5)).abs().amax((1, 2, 3), keepdim=True) < 1e-6
         return torch.where(hit, torch.nan, 0.0) * x
 
-    assert make_pairs(store_in(tmp_path, num=8), Field(broken, SHAPE)).count(False) == 1
-    source = PairSource(store_in(tmp_path, num=8))
-    assert source.indices.tolist() == [0, 1, 2, 3, 4, 6, 7]
-    assert all(source[i]["x_1"].isfinite().all() for i in range(7))
+    assert make_pairs(store, Field(broken, SHAPE)).count(False) == 1
+    pairs = PairDataset(store, store.usable(), 0, "training")
+    assert pairs.numbers.tolist() == [0, 1, 2, 3, 4, 6, 7]
+    assert all(pairs[0, i]["x_1"].isfinite().all() for i in range(7))
 
 
 def test_a_flow_that_is_broken_is_said_to_be(tmp_path: Path):
@@ -157,13 +156,13 @@ def test_a_flow_that_is_broken_is_said_to_be(tmp_path: Path):
 def test_missing_pairs_are_named(tmp_path: Path):
     make_pairs(store_in(tmp_path, num=8), grow)
     with pytest.raises(InputError, match="lacks about 20 of 20 pairs"):
-        PairSource(store_in(tmp_path, num=20))
+        store_in(tmp_path, num=20).usable()
 
 
 def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
     store = store_in(tmp_path, num=12)
     make_pairs(store, grow)
-    dataset = PairDataset(PairSource(store), seed=3, purpose="training")
+    dataset = PairDataset(store, store.usable(), seed=3, purpose="training")
     item = dataset[(70, 11)]
     assert torch.equal(item["x_0"], store.noise(11))
     assert item["k"] == 70
@@ -229,7 +228,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     flow = load_checkpoint(path)
     options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
     chosen = PairOptions(**pairs_of(flow, options, weights_hash(flow)))
-    assert len(PairSource(PairStore(folder, chosen, flow.encoding.shape))) == 10
+    assert len(PairStore(folder, chosen, flow.encoding.shape).usable()) == 10
     assert "pairs/s" not in r2flow("pairs", path, *QUICK).said  # nothing was left to make
 
 
