@@ -1,5 +1,6 @@
 """A set of scans for commands and reports: numbered range images with their metadata."""
 
+import copy
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
@@ -17,31 +18,19 @@ from r2flow.signals import end_with_parent
 
 
 class ScanSet:
-    """Scans of a sensor; `label` is the user's name for them.
+    """Scans of a sensor; `label` is the user's name for them. `about`, `identity`, `drives` are as in `ScanSource`."""
 
-    `about`, `identity` and `drives` are as in `ScanSource`; None: those of the source.
-    """
-
-    def __init__(
-        self,
-        label: str,
-        source: ScanSource,
-        sensor: Sensor,
-        about: Mapping[str, Any] | None = None,
-        identity: Mapping[str, Any] | None = None,
-        drives: Mapping[str, Sequence[int]] | None = None,
-    ) -> None:
+    def __init__(self, label: str, source: ScanSource, sensor: Sensor) -> None:
         self.label, self.source, self.sensor = label, source, sensor
-        self._about, self._identity = about, identity
-        self.drives = source.drives if drives is None else drives
+        self.drives = source.drives
 
     @cached_property
     def about(self) -> Mapping[str, Any]:
-        return self.source.about() if self._about is None else self._about
+        return self.source.about()
 
     @cached_property
     def identity(self) -> Mapping[str, Any] | None:
-        return self.source.identity() if self._identity is None else self._identity
+        return self.source.identity()
 
     def __len__(self) -> int:
         return len(self.source)
@@ -53,14 +42,15 @@ class ScanSet:
 
     def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
         """Some of the scans, in the given order; `name` describes the selection."""
-        identity = self.identity
-        if identity is not None:  # a part of a part differs from the same numbers of the whole
-            chosen = str(identity.get("part", "")).encode() + np.asarray(numbers, dtype=np.int64).tobytes()
-            identity = {**identity, "part": hashlib.sha256(chosen).hexdigest()[:16]}
+        part = copy.copy(self)
+        part.source, part.about = self.source.subset(numbers), {**self.about, "part": name}
+        if self.identity is not None:  # a part of a part differs from the same numbers of the whole
+            chosen = str(self.identity.get("part", "")).encode() + np.asarray(numbers, dtype=np.int64).tobytes()
+            part.identity = {**self.identity, "part": hashlib.sha256(chosen).hexdigest()[:16]}
         place = {number: i for i, number in enumerate(numbers)}
         drives = {drive: [place[n] for n in members if n in place] for drive, members in self.drives.items()}
-        drives, about = {drive: kept for drive, kept in drives.items() if kept}, {**self.about, "part": name}
-        return ScanSet(self.label, self.source.subset(numbers), self.sensor, about, identity, drives)
+        part.drives = {drive: kept for drive, kept in drives.items() if kept}
+        return part
 
     def limited(self, most: int | None) -> "ScanSet":
         """At most `most` scans, by `fixed_choice`."""

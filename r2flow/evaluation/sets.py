@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from torch import Tensor
@@ -46,12 +46,7 @@ def sampled_set(
     """
     sampler = sampler or flow.generator.sampler
     sampler.check(flow.generator)
-    about = {
-        "kind": "sampled", "weights": weights_hash(flow), "step": flow.step, "num": num,
-        "sampler": sampler.asdict(), "precision": precision, "seed": seed, "noise": "evaluation",
-        "reflectance": flow.encoding.reflectance,
-    }  # fmt: skip
-    return ScanSet(label, SampledScans(flow, range(num), sampler, seed, precision), flow.sensor, about)
+    return ScanSet(label, SampledScans(flow, range(num), sampler, seed, precision), flow.sensor)
 
 
 class SampledScans(MadeScans):
@@ -66,6 +61,13 @@ class SampledScans(MadeScans):
         self.unsolved = 0  # samples so far that missed the tolerance
         self.evaluations: list[int] = []  # network evaluations per scan
         self.seconds: list[float] = []  # seconds per scan, for each batch
+
+    def about(self) -> dict[str, Any]:
+        return {
+            "kind": "sampled", "weights": weights_hash(self.flow), "step": self.flow.step, "num": len(self),
+            "sampler": self.sampler.asdict(), "precision": self.precision, "seed": self.seed, "noise": "evaluation",
+            "reflectance": self.flow.encoding.reflectance,
+        }  # fmt: skip
 
     def __getitem__(self, index: int) -> np.ndarray:
         return self.batch([index])[0].numpy()
