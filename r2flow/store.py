@@ -46,8 +46,6 @@ STALE = 3600  # seconds after which a temporary file counts as abandoned
 PATIENCE = 0.2  # seconds between polls of items that other processes make
 QUIET = 20.0  # seconds of waiting before a log message
 
-Advance = Callable[[int], None]  # called with the number of each finished item
-
 
 class Damaged(Exception):
     """A file does not have the content that was written."""
@@ -160,30 +158,28 @@ class Store:
         except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise Damaged(str(error)) from None
 
-    def mend(self, items: Iterable[int], advance: Advance = lambda item: None) -> None:
-        """Verify some items, and delete the damaged ones with a warning."""
-        for item in items:
-            try:
-                self.read(item)
-            except FileNotFoundError:
-                pass
-            except Damaged as error:
-                (path,) = self.files(item)
-                log.warning("%s is damaged (%s): it is made again.", path, error)
-                path.unlink(missing_ok=True)
-            advance(item)
+    def mend(self, item: int) -> None:
+        """Verify an item if it exists, and delete it with a warning if it is damaged."""
+        try:
+            self.read(item)
+        except FileNotFoundError:
+            pass
+        except Damaged as error:
+            (path,) = self.files(item)
+            log.warning("%s is damaged (%s): it is made again.", path, error)
+            path.unlink(missing_ok=True)
 
     def make(
         self,
         items: Iterable[int],
         work: Callable[[int], None],
         workers: int = 1,
-        advance: Advance = lambda item: None,
+        advance: Callable[[int], None] = lambda item: None,
         wait: bool = True,
     ) -> None:
         """Make items by `work`, which any process must be able to unpickle, in `workers` processes (1: this one).
 
-        `wait`: await items that other commands are making; else skip them.
+        `advance` is called with each finished item. `wait`: await items that other commands are making; else skip them.
         """
         left, since = list(items), time.monotonic()
         while left:

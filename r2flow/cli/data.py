@@ -75,7 +75,6 @@ def prepare(
     """
     from r2flow.data import prepared
     from r2flow.data.opening import SOURCES, parse
-    from r2flow.progress import Bar
 
     options, file = parse(scans)
     check(file is None, f"{scans} is one scan; give the folder of a data set.")
@@ -83,12 +82,10 @@ def prepare(
     drives_found = SOURCES[options.name].find_drives(options)
     check(out.resolve() != Path(options.folder).resolve(), f"{out} holds the scans: give another folder by --out.")
     store = prepared.plan_files(out, options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
+    left_out, made = prepared.prepare(store, on_bad_scan, workers or cores())
     shards, levels = len(store.shards), store.described["levels"]
-    left = store.missing(store.shards) if store.check() else store.shards
-    with Bar("checking", shards, "shards") as checked, Bar("preparing", len(left), "shards") as made:
-        left_out = prepared.prepare(store, on_bad_scan, workers or cores(), lambda _: checked(), lambda _: made())
     size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)
-    usable, there = len(store.names) - left_out, shards - round(made.tasks[0].completed)
+    usable, there = len(store.names) - left_out, shards - len(made)
     content = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"
     kept = f" ({there} there already)" if there else ""
     reflectance = "no reflectance in the scans" if levels is None else f"reflectance as n/{levels}"

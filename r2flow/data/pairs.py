@@ -107,7 +107,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
 
     def make_shard(shard: int) -> None:
         nonlocal evaluations, seconds
-        store.mend([shard])
+        store.mend(shard)
         batches = []
         for batch in store.batches_of(shard):
             if launcher not in (None, os.getppid()):  # killed: this process would draw all pairs and then fail
@@ -129,7 +129,8 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
     with Bar("drawing", store.missing_pairs(), "pairs", lines="WORLD_SIZE" in os.environ) as bar:
         store.begin()
         rank, ranks = place()  # of a run, whose processes verify a part each
-        store.mend(store.shards[rank::ranks])
+        for shard in store.shards[rank::ranks]:
+            store.mend(shard)
         missing = store.missing(store.shards)  # shuffled: processes rarely meet, also without common locks
         store.make(random.Random().sample(missing, len(missing)), make_shard, wait=wait)
     if usable:

@@ -28,7 +28,8 @@ from r2flow.data.reading import Reading, lacks_reflectance, read_image
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError, check
 from r2flow.files import telling
-from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, read_manifest
+from r2flow.progress import Bar, track
+from r2flow.store import MANIFEST, Damaged, Store, checksum, read_manifest
 
 log = logging.getLogger(__name__)
 
@@ -123,35 +124,27 @@ def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
     store.write(shard, tensors, {"left_out": left_out, "files": store.sources_of(shard)})
 
 
-def prepare(
-    store: PreparedStore,
-    on_bad_scan: str = "error",
-    workers: int = 1,
-    checked: Advance = lambda shard: None,
-    made: Advance = lambda shard: None,
-) -> int:
+def prepare(store: PreparedStore, on_bad_scan: str = "error", workers: int = 1) -> tuple[int, list[int]]:
     """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves out unusable scans.
 
     The headers of the shards have the numbers of the scans left out and a digest of the files: shards of files that
-    have changed since are refused. `checked` and `made` are called with each shard. The result is the number of scans
-    left out.
+    have changed since are refused. The result is the number of scans left out, and the shards that were made.
     """
     if not store.check() or store.missing(store.shards):  # else the folder may be read-only
         store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
-
-    def look(shard: int) -> None:
+    for shard in track(store.shards, "checking", "shards"):
+        store.mend(shard)
         file = store.files(shard)[0]
         check(
             not file.exists() or store.head(shard).get("files") == store.sources_of(shard),
             f"{file} holds scans of other files. Give another folder by {store.option}, or remove it to make it again.",
         )
-        checked(shard)
-
-    store.mend(store.shards, look)
-    store.make(store.missing(store.shards), partial(_make_shard, store, on_bad_scan == "skip"), workers, made)
+    missing = store.missing(store.shards)
+    with Bar("preparing", len(missing), "shards") as bar:
+        store.make(missing, partial(_make_shard, store, on_bad_scan == "skip"), workers, lambda shard: bar())
     left_out = sum(len(store.head(shard)["left_out"]) for shard in store.shards)
     check(left_out < len(store.names), f"all {left_out} scans were left out as unusable; remove {store.folder}.")
-    return left_out
+    return left_out, missing
 
 
 def read_prepared(folder: Path) -> PreparedStore:
