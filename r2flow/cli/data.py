@@ -80,7 +80,7 @@ def prepare(
     check(file is None, f"{scans} is one scan; give the folder of a data set.")
     options = replace(options, split=split, drives=[*drives.split(",")] if drives else None)
     drives_found = SOURCES[options.name].find_drives(options)
-    check(out.resolve() != Path(options.folder).resolve(), f"{out} holds the scans: give another folder by --out.")
+    check(out.resolve() != options.folder.resolve(), f"{out} holds the scans: give another folder by --out.")
     store = prepared.plan_files(out, options.name, options.folder, drives_found, reading.reading([scans]), shard_scans)
     left_out, made = prepared.prepare(store, on_bad_scan, workers or cores())
     shards, levels = len(store.shards), store.described["levels"]

@@ -86,7 +86,7 @@ class Layout(SourceKind):
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
         """The drives of the split and the names in `options`, without empty drives."""
-        name, split, root = options.name, options.split, Path(options.folder).expanduser()
+        name, split, root = options.name, options.split, options.folder
         self.chosen([], split, None)  # refuses an unknown split before any search
         found = root.is_dir()
         check(found, f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb {name}:FOLDER).")
@@ -114,9 +114,8 @@ class Layout(SourceKind):
             drives[drive.name] = range(len(paths), len(paths) + len(drive.scans))
             paths += drive.scans
         about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
-        root = Path(options.folder).expanduser()  # the prefix of all paths found in it
-        warn_of_other_sensor(paths, reading, root)
-        return ScanFiles(paths, reading, root, drives, about)
+        warn_of_other_sensor(paths, reading, options.folder)
+        return ScanFiles(paths, reading, options.folder, drives, about)
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         paths = (path for drive in self.find_drives(options) for path in drive.scans)

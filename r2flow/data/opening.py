@@ -49,7 +49,7 @@ class Prepared(SourceKind):
     """Shards of `r2flow prepare`."""
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        folder, split, drives = Path(options.folder).expanduser(), options.split, options.drives
+        folder, split, drives = options.folder, options.split, options.drives
         store = read_prepared(folder)
         refuse_other_images(store, reading)
         stored, layout = store.drives, store.described["layout"]
@@ -66,7 +66,7 @@ class Prepared(SourceKind):
         return f"the scans in {options.folder} have no reflectance" if self.levels_of(options) is None else None
 
     def levels_of(self, options: SourceOptions) -> int | None:
-        return read_prepared(Path(options.folder).expanduser()).described["levels"]
+        return read_prepared(options.folder).described["levels"]
 
 
 SOURCES: Registry[SourceKind] = Registry(
@@ -110,7 +110,7 @@ def open_scans(
     check(not split or (file is None and options.name != SIMULATED), f"{label} has no split: leave {split!r} out.")
     if file is None:
         options = replace(options, split=split, scenes=num or SCENES, reading={"columns": reading.columns})
-        seed = int(options.folder) if options.name == SIMULATED else 0
+        seed = int(options.root or 0) if options.name == SIMULATED else 0
         return ScanSet(label, open_source(options, reading, seed), reading.sensor).limited(num)
     image = read_range_image(file)
     if image is not None:  # points can be projected for any sensor
@@ -130,7 +130,7 @@ def open_source(options: SourceOptions, reading: Reading, seed: int = 0, first_s
     """Open the scans of some options by `SourceKind.open`, after resolving `reading.reflectance`."""
     kind = SOURCES[options.name]
     if options.name == FOLDER:
-        refuse_other_samples(Path(options.folder), reading.sensor)
+        refuse_other_samples(options.folder, reading.sensor)
         if made_here(options.folder):  # its reflectance is in [0, 1]
             reading = replace(reading, reflectance_scale=1.0)
     if reading.reflectance == AUTO:

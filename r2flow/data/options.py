@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from r2flow.errors import InputError, check
@@ -49,10 +50,10 @@ class SourceOptions:
         return {key: value for key, value in (self.reading or {}).items() if value is not None}
 
     @property
-    def folder(self) -> str:
-        """`root` as a string: YAML reads a folder name of digits as a number."""
+    def folder(self) -> Path:
+        """`root` as a path: YAML reads a folder name of digits as a number."""
         check(self.root is not None, f"data={self.name} needs the folder of its scans: data.root=FOLDER.")
-        return str(self.root)
+        return Path(str(self.root)).expanduser()
 
 
 @dataclass(frozen=True)

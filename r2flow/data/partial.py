@@ -77,7 +77,7 @@ def open_partial(
         else:
             paths = [Path(path) for drive in SOURCES[options.name].find_drives(options) for path in drive.scans]
             chosen = [points_beside(paths[number]) for number in spread(len(paths), most or len(paths))]
-            groups[Path(options.folder).expanduser(), str(spec)] = chosen
+            groups[options.folder, str(spec)] = chosen
     for (folder, spec), paths in groups.items():
         opened.append(_files(folder, paths, spec or str(paths[0]), reading, source, scale))
     scans = [scan for some, _ in opened for scan in some]

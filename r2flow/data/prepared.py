@@ -73,13 +73,12 @@ class PreparedStore(Store):
 def plan_files(
     folder: str | Path,
     layout: str,
-    root: str | Path,
+    root: Path,
     drives: Sequence[Drive],
     reading: Reading,
     shard_scans: int = 64,  # 13 MB at 64 x 1024, held in memory until written
 ) -> PreparedStore:
     """The store in `folder` of scan files in drives below a root; reads some scans for the levels of reflectance."""
-    root = Path(root).expanduser()
     paths = [path for drive in drives for path in drive.scans]
     named = [Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in drives]
     reading = replace(reading, on_bad_scan="error", within_limits=True)

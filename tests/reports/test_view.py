@@ -178,10 +178,11 @@ class TestTheVerb:
         assert r2flow("show", *(tmp_path / "in" / n for n in given), "--format", "npy", "-o", tmp_path / "out")[0] == 0
         assert [np.load(tmp_path / "out" / f"{name}.npy")[1].max() for name in "ab"] == pytest.approx([80 / 255, 0.8])
 
-    def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path):
+    def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path, monkeypatch):
+        monkeypatch.setenv("HOME", str(tmp_path))
         for name, image in zip("ab", images(2), strict=True):
             np.save(tmp_path / f"{name}.npy", image)
-        assert r2flow("view", tmp_path, "--sequence", "--out", tmp_path / "a.html")[0] == 0
+        assert r2flow("view", "folder:~", "--sequence", "--out", tmp_path / "a.html")[0] == 0
         data = Parsed((tmp_path / "a.html").read_text()).data
         assert [len(one["frames"]) for one in data["scans"]] == [2]
         assert data["frames"] == ["a.npy", "b.npy"]

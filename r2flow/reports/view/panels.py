@@ -37,7 +37,7 @@ def scans_of(path: Path, most: int) -> tuple[list[Path], int]:
 def one_scale(readings: Mapping[str, Reading], most: int) -> dict[str, Reading]:
     """Readings of sets shown together: those that do not know full reflectance take one estimate from all of them."""
     unknown = [spec for spec, reading in readings.items() if reading.reflectance_scale is None]
-    paths = [path for options, file in map(parse, unknown) for path in scans_of(file or Path(options.folder), most)[0]]
+    paths = [path for options, file in map(parse, unknown) for path in scans_of(file or options.folder, most)[0]]
     scale = estimated_scale(paths[0], readable(paths, readings[unknown[0]].columns)) if paths else None
     return {**readings, **{spec: replace(readings[spec], reflectance_scale=scale) for spec in unknown}}
 
@@ -51,7 +51,7 @@ def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -
     reading = replace(reading, on_bad_scan="error")
     options, file = parse(spec)
     if own_reading(spec) is None and options.name == FOLDER:
-        chosen, count = scans_of(file or Path(options.folder), most)
+        chosen, count = scans_of(file or options.folder, most)
         warn_of_other_sensor(chosen, reading, spec)
         views = [(path, open_scans(path, reading, own_size=True), 0) for path in chosen]
     else:
