@@ -11,15 +11,9 @@
 The same command again resumes from the run's last checkpoint. `--cfg job` shows every key, `--help` the choices.
 """
 
-import sys
 from pathlib import Path
 
-from r2flow.memory import prepare_process
-from r2flow.signals import heard_from_the_first_import
+from r2flow.cli import main
 
 if __name__ == "__main__":
-    prepare_process()
-    with heard_from_the_first_import():
-        from r2flow.runs.launch import main
-
-        sys.exit(main(sys.argv[1:], [sys.executable, str(Path(__file__).resolve())]))
+    main("train", command=[str(Path(__file__).resolve())])

@@ -1,13 +1,19 @@
 """Command line: r2flow VERB."""
 
+import sys
+from collections.abc import Sequence
+
 from r2flow.memory import prepare_process
 from r2flow.signals import heard_from_the_first_import
 
 
-def main() -> None:
-    """Run a verb; Ctrl-C, SIGTERM and SIGHUP stop it with a one-line message."""
+def main(*verb: str, command: Sequence[str] = ("-m", "r2flow", "train")) -> None:
+    """Run a verb; Ctrl-C, SIGTERM and SIGHUP stop it with a one-line message.
+
+    `verb` precedes the command line; Python with `command` trains a link of a chain or a job of a sweep.
+    """
     prepare_process()
     with heard_from_the_first_import():
         from r2flow.cli.verbs import run
 
-        run()
+        sys.exit(run([*verb, *sys.argv[1:]], [sys.executable, *command]))

@@ -1,7 +1,6 @@
 """`r2flow train` and `r2flow pairs`."""
 
 import os
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +20,7 @@ def train(context: typer.Context) -> int:
     """Train a model; set config keys as KEY=VALUE. --help lists the choices, --cfg job prints all keys."""
     from r2flow.runs.launch import main
 
-    return main(context.args, [sys.executable, "-m", "r2flow", "train"])
+    return main(context.args, *context.obj)
 
 
 @app.command(epilog="Example: torchrun --nproc-per-node 8 -m -- r2flow pairs runs/r2flow_1rf --num 1000000")

@@ -3,6 +3,7 @@
 import logging
 import re
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import typer
@@ -36,37 +37,35 @@ app.registered_commands.sort(key=lambda verb: list(GROUPS).index(str(verb.rich_h
 FULL = ("can't allocate memory", "not enough memory", "out of memory", "failed to map segment")  # errors of torch
 
 
-def run() -> None:
-    """Run a verb, with `--plugin MODULE` anywhere; user errors print one line and exit with code 2."""
-    try:
-        with listening(stop_at_once):
-            _run()
-    except Stopped as stop:
-        print(stop, file=sys.stderr)
-        sys.exit(stop.code)
-    except (KeyboardInterrupt, typer.Abort):  # Ctrl-C outside our handler, in a library's thread
-        print("stopped", file=sys.stderr)
-        sys.exit(130)
+def run(arguments: Sequence[str], command: Sequence[str]) -> int:
+    """Run a verb, with `--plugin MODULE` anywhere; the exit code is 2 for a user error, which prints one line.
 
-
-def _run() -> None:
+    `command` starts the processes of chains and sweeps.
+    """
     open_streams()
     handler = logging.StreamHandler()
     handler.setFormatter(PlainFormatter("%(levelname)s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     try:
-        check("" not in sys.argv, "an argument is empty; is a variable of the shell not set?")
-        arguments, plugins = take_plugins(sys.argv[1:])
-        load_plugins(plugins)
-        if arguments[:1] == ["train"]:  # it passes plug-ins to its processes
-            arguments += [f"--plugin={name}" for name in plugins]
-        if arguments[:1] == ["--version"]:
-            print(f"r2flow {__version__}")
-            sys.exit(0)
-        code = app(arguments, prog_name="r2flow", standalone_mode=False)
-        sys.stdout.flush()
-        if Unbroken.lost:
-            raise Unbroken.lost
+        with listening(stop_at_once):
+            check("" not in arguments, "an argument is empty; is a variable of the shell not set?")
+            arguments, plugins = take_plugins(arguments)
+            load_plugins(plugins)
+            if "--version" in arguments and arguments[0] in ("--version", "train"):
+                print(f"r2flow {__version__}")
+                return 0
+            code = app(arguments, prog_name="r2flow", standalone_mode=False, obj=(command, plugins))
+            sys.stdout.flush()
+            if Unbroken.lost:
+                raise Unbroken.lost
+            return code if isinstance(code, int) else 0
+    except Stopped as stop:
+        if str(stop):  # empty but on the first device
+            print(stop, file=sys.stderr)
+        return stop.code
+    except (KeyboardInterrupt, typer.Abort):  # Ctrl-C outside our handler, in a library's thread
+        print("stopped", file=sys.stderr)
+        return 130
     except (InputError, OSError) as error:
         message = explain_mistake(error)
     except (ImportError, MemoryError, RuntimeError) as error:
@@ -81,7 +80,5 @@ def _run() -> None:
     except USAGE_ERROR as error:
         text = one_line(error.format_message()).rstrip(".") or "no verb given"
         message = f"{text}{'.' * (not text.endswith('?'))} See --help."
-    else:
-        sys.exit(code if isinstance(code, int) else 0)
     print(f"error: {message}", file=sys.stderr)
-    sys.exit(2)
+    return 2

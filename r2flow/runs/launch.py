@@ -1,4 +1,4 @@
-"""Entry point of `train.py` and `r2flow train`: Hydra, sweeps, chains, exit codes, one-line error messages.
+"""`r2flow train`: Hydra, sweeps, chains, exit codes.
 
 Exit codes: 0 for a finished run, 2 for a user error, 75 if the same command resumes (`trainer.max_time`, SLURM's time
 limit), 129 after a hang-up, 130 after Ctrl-C, 143 after SIGTERM.
@@ -21,79 +21,58 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from r2flow import __version__
 from r2flow.config import key_of, override
-from r2flow.errors import InputError, explain_mistake, one_line, open_streams
-from r2flow.plugins import load_plugins, take_plugins
+from r2flow.errors import InputError, explain_mistake, one_line
+from r2flow.plugins import load_plugins
 from r2flow.registry import check_options
 from r2flow.runs.composing import CONF, WRONG, Keys, add_choices, as_hydra_takes, compose, explain, plain, with_choices
-from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, stop_at_once
+from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening
 
 
 class JobEnded(RuntimeError):
     """A job of a sweep ended before its run was finished; arguments: exit code and folder."""
 
 
-def main(arguments: Sequence[str], command: Sequence[str]) -> int:
+def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str] = ()) -> int:
     """Compose a command line's config and execute it: a run, a chain of runs or a sweep; return the exit code.
 
-    Arguments are Hydra's overrides and flags, and any number of `--plugin NAME`. `command` starts this program, for the
-    processes of sweeps and chains. Errors are printed in one line.
+    Arguments are Hydra's overrides and flags. `command` starts this program, for the processes of sweeps and chains.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself, over many lines, and exits with 1
     ended: list[tuple[int, str]] = []  # unfinished jobs of a sweep
-    open_streams()
+    # SLURM signals every process of a job: a run handles the signal, a chain waits for the run.
+    ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
     try:
-        # SLURM signals every process of a job: a run handles the signal, a chain waits for the run.
-        ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
-        with listening(stop_at_once), listening(signal.SIG_IGN, ignored):
-            if "--version" in arguments:
-                print(f"r2flow {__version__}")
-                return 0
-            arguments, plugins = _plugins_of(list(arguments) or ["experiment=demo"])
-            load_plugins(plugins)
-            if plugins:
-                add_choices()
-            arguments = _checked_arguments(arguments)
+        with listening(signal.SIG_IGN, ignored):
+            arguments = _checked_arguments(_with_plugins(arguments, plugins) or ["experiment=demo"])
             _run_hydra(arguments, functools.partial(_job, arguments, command, ended, os.getpid()))
             if ended:
                 raise JobEnded(*ended[0])
             return 0
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
-    except Stopped as stop:
-        if str(stop):  # empty but on the first device
-            print(stop, flush=True)
-        return stop.code
-    except KeyboardInterrupt:  # Ctrl-C without a handler: in a library's thread
-        print("stopped", flush=True)
-        return 130
     except JobEnded as error:
         jobs = ended or [error.args]  # a remote launcher raises the first only
         failed = [folder for code, folder in jobs if code != LATER]
         number, names = (len(failed or jobs) if ended else "some"), "; ".join(failed or [folder for _, folder in jobs])
-        if not failed:
-            print(f"{number} of the sweep's jobs resume with the same command: {names}")
-            return LATER
-        message = f"{number} of the sweep's jobs failed: {names}"
+        if failed:
+            raise InputError(f"{number} of the sweep's jobs failed: {names}") from None
+        print(f"{number} of the sweep's jobs resume with the same command: {names}")
+        return LATER
     except WRONG as error:
-        message = one_line(explain(error))
+        raise InputError(explain(error)) from None
     except RecursionError:
-        message = "a config contains itself, or is nested too deeply."
-    except (InputError, OSError) as error:
-        message = explain_mistake(error)
-    print(f"error: {message}", file=sys.stderr)
-    return 2
+        raise InputError("a config contains itself, or is nested too deeply.") from None
 
 
-def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Collect the plug-ins of a command line, in any form, into one `plugins=[...]`; returns the new line and them."""
-    others, names = take_plugins(arguments)
-    given = [text for text in others if text.lstrip("+").startswith("plugins=")]
-    for text in given:
-        names += [name.strip(" '\"") for name in text.partition("=")[2].strip("[]").split(",")]
-    names = list(dict.fromkeys(name for name in names if name))
-    return [*(text for text in others if text not in given), *([override("plugins", names)] if names else [])], names
+def _with_plugins(arguments: Sequence[str], plugins: Sequence[str]) -> list[str]:
+    """Load the plug-ins of a command line, in any form, and collect them into one `plugins=[...]`."""
+    given = [text for text in arguments if text.lstrip("+").startswith("plugins=")]
+    listed = [name.strip(" '\"") for text in given for name in text.partition("=")[2].strip("[]").split(",")]
+    others, names = [text for text in arguments if text not in given], list(filter(None, [*plugins, *listed]))
+    if not names:
+        return others
+    load_plugins(names)
+    add_choices()
+    return [*others, override("plugins", list(dict.fromkeys(names)))]
 
 
 def _checked_arguments(arguments: list[str]) -> list[str]:
@@ -170,8 +149,7 @@ def _job(
             code = 0 if fit(build(settings, given)).finished else LATER
     except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print more lines
         message = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
-        print(f"error: {message}", file=sys.stderr)
-        code = 2
+        raise Stopped(2, f"error: {message}") from None
     if code:
         raise SystemExit(code)
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from r2flow.cli.verbs import run as run_verb
 from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.runs.launch import main
 from r2flow.signals import LATER
 from r2flow.simulator import simulate
 from r2flow.training import build, compose, fit
@@ -82,7 +82,7 @@ def quickly(run: Callable[[], int | None]) -> Done:
 
 def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
     with contextlib.chdir(cwd):
-        done = quickly(lambda: main(arguments, COMMAND))
+        done = quickly(lambda: run_verb(["train", *arguments], COMMAND))
     if check and done.returncode:
         raise AssertionError(f"{' '.join(arguments)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
     return done

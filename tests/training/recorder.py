@@ -17,8 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from r2flow.callbacks import CALLBACKS, Entry
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.ema import averaged_weights
+from r2flow.cli import main
 from r2flow.data.loader import FlowDataset
-from r2flow.runs.launch import main
 
 FOLDER = Path(os.environ["R2FLOW_RECORD"])
 BROKEN = set(json.loads(os.environ["R2FLOW_BROKEN"]))  # images whose scan is NaN
@@ -68,4 +68,4 @@ FlowDataset.__getitem__ = item_broken
 CALLBACKS.add("recorder", Entry(Recorder))
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:], [sys.executable, __file__]))
+    main("train", command=[__file__])

@@ -217,7 +217,7 @@ def test_one_bad_scan_stops_the_run_or_is_left_out(train: Run, scans: Path, tmp_
 
 def test_a_misspelt_config_is_answered_without_loading_torch(tmp_path: Path):
     mistakes = ["bakcbone.base_channels=8", "backbone=hditt", "chain=[", "+experiment=reflo"]
-    script = f"for one in {mistakes}: print(main([one], []), 'torch' in sys.modules)"
-    command = [sys.executable, "-c", f"import sys; from r2flow.runs.launch import main\n{script}"]
+    script = f"for one in {mistakes}: print(run(['train', one], []), 'torch' in sys.modules)"
+    command = [sys.executable, "-c", f"import sys; from r2flow.cli.verbs import run\n{script}"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
     assert (done.stdout, len(done.stderr.splitlines())) == (4 * "2 False\n", 4), done.stderr
