@@ -4,19 +4,21 @@ Exit codes: 0 for a finished run, 2 for a user error, 75 if the same command res
 limit), 129 after a hang-up, 130 after Ctrl-C, 143 after SIGTERM.
 """
 
-import functools
 import hashlib
 import os
 import re
 import signal
-import sys
-from collections.abc import Callable, Sequence
+from argparse import Namespace
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-import hydra
+from hydra import version
+from hydra._internal.utils import _run_hydra as run_hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.main import _get_rerun_conf
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -44,8 +46,7 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
     ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
     try:
         with listening(signal.SIG_IGN, ignored):
-            arguments = _checked_arguments(_with_plugins(arguments, plugins) or ["experiment=demo"])
-            _run_hydra(arguments, functools.partial(_job, arguments, command, ended, os.getpid()))
+            _run_hydra(_parsed(_with_plugins(arguments, plugins) or ["experiment=demo"]), command, ended)
             if ended:
                 raise JobEnded(*ended[0])
             return 0
@@ -75,8 +76,8 @@ def _with_plugins(arguments: Sequence[str], plugins: Sequence[str]) -> list[str]
     return [*others, override("plugins", list(dict.fromkeys(names)))]
 
 
-def _checked_arguments(arguments: list[str]) -> list[str]:
-    """Order the command line: Hydra's flags, then its overrides. Refuses a single folder for all runs of a sweep."""
+def _parsed(arguments: Sequence[str]) -> Namespace:
+    """Hydra's flags and overrides. Refuses a single folder for all runs of a sweep."""
     parser = get_args_parser()
 
     def refuse(message: str) -> NoReturn:
@@ -84,83 +85,61 @@ def _checked_arguments(arguments: list[str]) -> list[str]:
 
     parser.error = refuse  # type: ignore[method-assign]  # the default prints all flags
     parsed = parser.parse_intermixed_args(arguments)  # flags may stand between them
-    overrides = parsed.overrides
     if sum(map(bool, (parsed.run, parsed.multirun, parsed.cfg, parsed.info))) > 1:
         raise InputError("give one of --run, --multirun, --cfg and --info.")
-    for text in overrides if parsed.multirun or "hydra.mode=MULTIRUN" in overrides else ():
+    for text in parsed.overrides if parsed.multirun or "hydra.mode=MULTIRUN" in parsed.overrides else ():
         # A sweep over several names is valid.
         if key_of(text) == "run_dir" or (key_of(text) == "name" and "," not in text):
             raise InputError(f"a sweep names its runs' folders: leave {text} out, or give hydra.sweep.dir=FOLDER.")
-    return [*(text for text in arguments if text not in overrides), *as_hydra_takes(overrides)]
+    parsed.overrides = as_hydra_takes(parsed.overrides)
+    return parsed
 
 
-def _run_hydra(arguments: Sequence[str], job: Callable[[DictConfig], None]) -> None:
-    """Run Hydra's main with these arguments; jobs see the process's original `sys.argv`."""
-    original = sys.argv
+def _run_hydra(parsed: Namespace, command: Sequence[str], ended: list[tuple[int, str]]) -> None:
+    """Run the command line's job, or the jobs of its sweep."""
+    folders = [os.path.abspath(parsed.config_dir)] if parsed.config_dir else []
+    command, launcher = [*command, *(part for folder in folders for part in ("--config-dir", folder))], os.getpid()
 
-    def task(config: DictConfig) -> None:
-        sys.argv = original  # Lightning starts the processes of other devices by it
-        job(config)
+    def job(config: DictConfig) -> None:
+        try:
+            given = list(HydraConfig.get().overrides.task)
+            # Check the command line, not the overrides: a config file can make a sweeper add overrides.
+            if config["plugins"] and not any(text.startswith("plugins=") for text in parsed.overrides):
+                named = " ".join(f"--plugin {name}" for name in config["plugins"])
+                raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                _sweep_job(command, given, ended)
+                if ended and os.getpid() != launcher:  # a remote launcher sees only exceptions, after all jobs
+                    raise JobEnded(*ended[-1])
+                return
+            settings = plain(config)
+            check_options("the config", Keys, settings)
+            if settings["chain"]:
+                code = _chain(settings, given, command, folders)
+            else:  # imported here, so that errors in the config are reported before torch is loaded
+                from r2flow.training import build, fit
 
-    decorated = hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(task)
-    OmegaConf.register_new_resolver("job_folder", functools.partial(job_folder, arguments), replace=True)
+                code = 0 if fit(build(settings, given)).finished else LATER
+        except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print more lines
+            message = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
+            raise Stopped(2, f"error: {message}") from None
+        if code:
+            raise SystemExit(code)  # Hydra catches only `Exception`
 
-    def composed() -> None:
-        sys.argv = [original[0], *arguments]
-        decorated()
-
-    try:
-        with_choices(composed)
-    finally:
-        sys.argv = original
+    version.setbase("1.3")
+    if parsed.experimental_rerun:
+        return job(_get_rerun_conf(parsed.experimental_rerun, parsed.overrides))
+    OmegaConf.register_new_resolver("job_folder", partial(job_folder, parsed.overrides), replace=True)
+    with_choices(partial(run_hydra, parsed, get_args_parser(), job, str(CONF), "train"))
 
 
-def job_folder(arguments: Sequence[str], overrides: str) -> str:
+def job_folder(given: Sequence[str], overrides: str) -> str:
     """Folder name of a sweep's job: the swept values, and a hash of all overrides."""
-    given = [argument.partition("=") for argument in arguments]
-    swept = {key.lstrip("+~") for key, _, value in given if "," in value and not re.fullmatch(r"\[[^][]*]", value)}
+    pairs = [text.partition("=") for text in given]
+    swept = {key.lstrip("+~") for key, _, value in pairs if "," in value and not re.fullmatch(r"\[[^][]*]", value)}
     parts = [part for part in overrides.split(",") if part.partition("=")[0].lstrip("+~") in swept]
     readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
     return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
-
-
-def _job(
-    arguments: Sequence[str], command: Sequence[str], ended: list[tuple[int, str]], launcher: int, config: DictConfig
-) -> None:
-    """The task that Hydra runs; SystemExit carries the exit code, since Hydra catches only `Exception`."""
-    try:
-        given = list(HydraConfig.get().overrides.task)
-        # Check the command line, not the overrides: a config file can make a sweeper add overrides.
-        if config["plugins"] and not any(text.startswith("plugins=") for text in arguments):
-            named = " ".join(f"--plugin {name}" for name in config["plugins"])
-            raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            _sweep_job(command, given, ended)
-            if ended and os.getpid() != launcher:  # a remote launcher sees only exceptions, after all jobs
-                raise JobEnded(*ended[-1])
-            return
-        settings = plain(config)
-        check_options("the config", Keys, settings)
-        if settings["chain"]:
-            code = _chain(settings, given, command)
-        else:  # imported here, so that errors in the config are reported before torch is loaded
-            from r2flow.training import build, fit
-
-            code = 0 if fit(build(settings, given)).finished else LATER
-    except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print more lines
-        message = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
-        raise Stopped(2, f"error: {message}") from None
-    if code:
-        raise SystemExit(code)
-
-
-def _config_folders() -> list[str]:
-    """Folders given by `--config-dir`, for child processes."""
-    return [source.path for source in HydraConfig.get().runtime.config_sources if source.provider == "command-line"]
-
-
-def _restart(command: Sequence[str]) -> list[str]:
-    return [*command, *(part for folder in _config_folders() for part in ("--config-dir", folder))]
 
 
 def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[int, str]]) -> None:
@@ -168,22 +147,22 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
     from r2flow.runs.chain import run_process
 
     run_dir = HydraConfig.get().runtime.output_dir
-    code = run_process([*_restart(command), *given, override("run_dir", str(run_dir))])
+    code = run_process([*command, *given, override("run_dir", str(run_dir))])
     if code in map(code_of, STOPPING):
         raise Stopped(code, "the sweep stopped; the same command resumes there")
     if code:
         ended.append((code, str(run_dir)))
 
 
-def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str]) -> int:
+def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str], folders: Sequence[str]) -> int:
     from r2flow.runs.chain import is_finished, is_noted, links_of, note, run_chain
 
     if settings["trainer"]["fast_dev_run"]:
         raise InputError("a chain's links start from earlier runs, and trainer.fast_dev_run leaves none.")
     folder = Path(settings["run_dir"])
-    links = links_of(settings["chain"], folder, given, _config_folders())
+    links = links_of(settings["chain"], folder, given, folders)
     if not all(map(is_finished, links)):
-        _check_links(links)
+        _check_links(links, folders)
     if model := settings["preview"]:  # scans of a trained model, while the chain trains
         from r2flow.model.checkpoint import load_checkpoint
         from r2flow.models import find_model
@@ -193,7 +172,7 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
         if not picture.is_file():
             write_samples(load_checkpoint(find_model(model)), picture.parent, num=4, seed=0)
         print(f"preview: scans of the model {model} in {picture}, point clouds next to it", flush=True)
-    code, ran = run_chain(links, _restart(command))
+    code, ran = run_chain(links, command)
     if code:
         return code
     out = folder / "report"
@@ -212,13 +191,13 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     return 0
 
 
-def _check_links(links: Sequence[Any]) -> None:
+def _check_links(links: Sequence[Any], folders: Sequence[str]) -> None:
     """Compose and build every link before the first one runs, so that errors are reported early."""
     from r2flow.model.checkpoint import FOLDER
     from r2flow.runs.lineage import Parent
     from r2flow.training import check
 
-    folders, configs = _config_folders(), dict[str, Any]()
+    configs = dict[str, Any]()
     for link in links:
         config, parent = compose(link.overrides, folders), None
         if link.parent is not None:
