@@ -18,7 +18,7 @@ from r2flow.files import read_json, write_file
 from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import read_config
-from r2flow.signals import LATER, code_of, listening
+from r2flow.signals import code_of, listening
 from r2flow.stages import STAGES
 
 RECORD = "link.json"
@@ -72,28 +72,6 @@ def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], confi
         run_dir = Path(folder, name)
         links.append(Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent))
     return links
-
-
-def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]:
-    """Run the links that are not finished, each in its own process, by `command` and the link's overrides.
-
-    The result is the exit code of the first link that does not finish, or 0, and whether any link was run.
-    """
-    skipping = True
-    for number, link in enumerate(links, 1):
-        # After a link that had to run, later links check by themselves whether they still match it.
-        if skipping and is_finished(link):
-            print(f"[{number}/{len(links)}] {link.name}: finished before, {link.run_dir}", flush=True)
-            continue
-        skipping = False
-        print(f"[{number}/{len(links)}] {link.name}: {link.run_dir}", flush=True)
-        code = run_process([*command, *link.overrides]) or (0 if has_ended(link.run_dir) else LATER)
-        if code:
-            if code != 2:  # a user error, already printed
-                print(f"the chain stopped in {link.name}; the same command resumes there", file=sys.stderr, flush=True)
-            return code, True
-        note(link.run_dir, link)
-    return 0, not skipping
 
 
 def has_ended(run: Path) -> bool:

@@ -8,6 +8,7 @@ import hashlib
 import os
 import re
 import signal
+import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -155,7 +156,7 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
 
 
 def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str], folders: Sequence[str]) -> int:
-    from r2flow.runs.chain import is_finished, is_noted, links_of, note, run_chain
+    from r2flow.runs.chain import has_ended, is_finished, is_noted, links_of, note, run_process
 
     if settings["trainer"]["fast_dev_run"]:
         raise InputError("a chain's links start from earlier runs, and trainer.fast_dev_run leaves none.")
@@ -172,11 +173,20 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
         if not picture.is_file():
             write_samples(load_checkpoint(find_model(model)), picture.parent, num=4, seed=0)
         print(f"preview: scans of the model {model} in {picture}, point clouds next to it", flush=True)
-    code, ran = run_chain(links, command)
-    if code:
-        return code
+    unchanged = True
+    for number, link in enumerate(links, 1):
+        # After a link that had to run, later links check by themselves whether they still match it.
+        unchanged = unchanged and is_finished(link)
+        print(f"[{number}/{len(links)}] {link.name}: {'finished before, ' * unchanged}{link.run_dir}", flush=True)
+        if unchanged:
+            continue
+        if code := run_process([*command, *link.overrides]) or (0 if has_ended(link.run_dir) else LATER):
+            if code != 2:  # a user error, already printed
+                print(f"the chain stopped in {link.name}; the same command resumes there", file=sys.stderr, flush=True)
+            return code
+        note(link.run_dir, link)
     out = folder / "report"
-    if not ran and is_noted(out, *links):
+    if unchanged and is_noted(out, *links):
         print(f"report: finished before, {out / 'chain.md'}")
         return 0
     import torch
