@@ -62,7 +62,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     else:
         keys = [key_of(text) for text in asked]
         for group in [key for key in RULES if "." not in key and rule(key).inherited in ("always", "with_pairs")]:
-            config[group] = _chosen(group, parent.config.get(group), config.get(group), keys, config, parent)
+            config[group] = _of_parent(group, config, keys, parent)
         stage = (parent.config.get("stage") or {}).get("name", "rectify")
         config["parent"] = {"path": str(parent.path), "weights": parent.weights, "step": parent.step, "stage": stage}
     if parent and data["name"] == "pairs":
@@ -86,28 +86,27 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     return {**config, "data": resolve(data, config["sensor"].get("reflectance_scale"), reading)}
 
 
-ABSENT = object()
-
-
-def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapping[str, Any], parent: Parent) -> Any:
-    """The parent's value of a key, or ours if given and it may differ; refuses values that its weights do not fit."""
-    group, may_differ = key.partition(".")[0], inherited(key, config) == "unless_given"
-    if key == group and (ours is None or not isinstance(theirs, Mapping) or (may_differ and key in asked)):
-        return ours if isinstance(theirs, Mapping) and may_differ and key in asked else theirs
-    if isinstance(theirs, Mapping) and isinstance(ours, Mapping):
-        values = {name: _chosen(f"{key}.{name}", theirs.get(name, ABSENT), value, asked, config, parent)
-                  for name, value in ours.items()}  # fmt: skip
-        return {**theirs, **{name: value for name, value in values.items() if value is not ABSENT}}
-    named = any(given != group and f"{key}.".startswith(f"{given}.") for given in asked)
-    if may_differ:
-        return ours if named else theirs
-    differs = key in asked if theirs is ABSENT else ours != theirs
-    if differs and (named or group in asked) and not (key == "encoding.reflectance" and ours == AUTO):
-        raise InputError(
-            f"{key} is {ours} here, but {'not known' if theirs is ABSENT else theirs} in {parent.path}, whose weights "
-            f"this run starts from. Leave it out: the {group} is the parent's."
-        )
-    return theirs
+def _of_parent(group: str, config: Mapping[str, Any], asked: Sequence[str], parent: Parent) -> Any:
+    """The parent's values of a group, or ours if given and they may differ; refuses values that do not fit weights."""
+    theirs, ours = parent.config.get(group), config.get(group)
+    if not isinstance(theirs, Mapping):
+        return theirs
+    if inherited(group, config) == "unless_given" and group in asked:
+        return ours
+    values = dict(theirs)
+    for name, value in (ours or {}).items():
+        key = f"{group}.{name}"
+        given = any(f"{text}.".startswith(f"{key}.") for text in asked)
+        if inherited(key, config) == "unless_given":
+            values |= {name: value} if given else {}
+        elif given or group in asked:
+            differs = value != theirs[name] if name in theirs else given
+            if differs and not (key == "encoding.reflectance" and value == AUTO):
+                raise InputError(
+                    f"{key} is {value} here, but {theirs.get(name, 'not known')} in {parent.path}, whose weights this "
+                    f"run starts from. Leave it out: the {group} is the parent's."
+                )
+    return values
 
 
 def drawn_by(config: Mapping[str, Any]) -> str | None:
