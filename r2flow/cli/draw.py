@@ -32,40 +32,16 @@ if TYPE_CHECKING:
     from r2flow.model.checkpoint import Checkpoint
 
 
-@dataclass(frozen=True)
-class RegionOptions:
-    """Part of the scan to generate."""
-
-    sector: Annotated[
-        str | None, typer.Option(help="Generate only these azimuths, in degrees: -45,45 is the quarter ahead.")
-    ] = None
-    rows: Annotated[str | None, typer.Option(help="Image rows, such as 0-31 for the upper half of 64.")] = None
-
-    def region(self, checkpoint: "Checkpoint") -> "Region | None":
-        """Region of --sector and --rows; prints the part that the generator evaluates."""
-        from r2flow.lidar.region import MARGIN, region
-        from r2flow.model.sampling import evaluated_region
-
-        if self.sector is None and self.rows is None:
-            return None
-        angles = limits = None
-        if self.sector:
-            angles = parsed("--sector", self.sector, "two azimuths in degrees, such as -45,45", ",", float, 2)
-        if self.rows:
-            limits = parsed("--rows", self.rows, "the first and the last row, such as 0-31", "-", int, 2)
-        requested = region(checkpoint.sensor.shape, angles, limits, MARGIN if angles else 0.0)
-        evaluated = evaluated_region(checkpoint.generator, requested)
-        print(f"generating {evaluated}, for {requested}: {evaluated.share:.0%} of the image")
-        return requested
-
-
 @app.command(epilog="Example: r2flow sample street --num 16 --steps 64 --out scans")
 @grouped
 def sample(
     out: OutOption,
     draw: DrawOptions,
     how: SamplerOptions,
-    part: RegionOptions,
+    sector: Annotated[
+        str | None, typer.Option(help="Generate only these azimuths, in degrees: -45,45 is the quarter ahead.")
+    ] = None,
+    rows: Annotated[str | None, typer.Option(help="Image rows, such as 0-31 for the upper half of 64.")] = None,
     model: Annotated[str | None, typer.Argument(help="A model, a run folder or a checkpoint file.")] = None,
     precision: PrecisionOption = "32-true",
     format: Annotated[str | None, typer.Option(help="Formats, of ply,bin,npy. Default: all possible.")] = None,
@@ -84,12 +60,26 @@ def sample(
     loaded = load_checkpoint(model or find_model(DEFAULT), device=choose_device(draw.device))
     sampler = loaded.generator.choose(**how.given)
     chosen = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else None
-    region = part.region(loaded)
+    region = _region(loaded, sector, rows) if sector or rows else None
     formats = write_samples(
         loaded, out, draw.num, draw.seed, sampler, chosen, pictures, draw.batch_size, region, precision=precision
     )
     pages = f", pictures in {out / 'samples.png'}, in 3-D in {out / 'samples.html'}" if pictures else ""
     print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{pages}")
+
+
+def _region(checkpoint: "Checkpoint", sector: str | None, rows: str | None) -> "Region":
+    """Region of --sector and --rows; prints the part that the generator evaluates."""
+    from r2flow.lidar.region import MARGIN, region
+    from r2flow.model.sampling import evaluated_region
+
+    form = "two azimuths in degrees, such as -45,45"
+    angles = parsed("--sector", sector, form, ",", float, 2) if sector else None
+    limits = parsed("--rows", rows, "the first and the last row, such as 0-31", "-", int, 2) if rows else None
+    requested = region(checkpoint.sensor.shape, angles, limits, MARGIN if angles else 0.0)
+    evaluated = evaluated_region(checkpoint.generator, requested)
+    print(f"generating {evaluated}, for {requested}: {evaluated.share:.0%} of the image")
+    return requested
 
 
 @app.command(epilog="Example: r2flow interpolate 0000000100.bin 0000000250.bin -c runs/NAME --frames 6 --out between")
