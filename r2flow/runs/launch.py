@@ -22,10 +22,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.main import _get_rerun_conf
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from r2flow.config import key_of, override
-from r2flow.errors import InputError, explain_mistake, one_line
+from r2flow.errors import InputError
 from r2flow.plugins import load_plugins
 from r2flow.registry import check_options
 from r2flow.runs.composing import CONF, WRONG, Keys, add_choices, as_hydra_takes, compose, explain, plain, with_choices
@@ -42,19 +41,20 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
     Arguments are Hydra's overrides and flags. `command` starts this program, for the processes of sweeps and chains.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself, over many lines, and exits with 1
-    ended: list[tuple[int, str]] = []  # unfinished jobs of a sweep
+    codes, errors = list[int](), list[Exception]()  # of jobs
     # SLURM signals every process of a job: a run handles the signal, a chain waits for the run.
     ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
     try:
         with listening(signal.SIG_IGN, ignored):
-            _run_hydra(_parsed(_with_plugins(arguments, plugins) or ["experiment=demo"]), command, ended)
-            if ended:
-                raise JobEnded(*ended[0])
-            return 0
+            _run_hydra(_parsed(_with_plugins(arguments, plugins) or ["experiment=demo"]), command, codes, errors)
+            if errors:
+                raise errors[0]
+            return max(codes, default=0)
     except JobEnded as error:
-        jobs = ended or [error.args]  # a remote launcher raises the first only
+        # A remote launcher raises the first only.
+        jobs = [job.args for job in errors or [error] if isinstance(job, JobEnded)]
         failed = [folder for code, folder in jobs if code != LATER]
-        number, names = (len(failed or jobs) if ended else "some"), "; ".join(failed or [folder for _, folder in jobs])
+        number, names = (len(failed or jobs) if errors else "some"), "; ".join(failed or [folder for _, folder in jobs])
         if failed:
             raise InputError(f"{number} of the sweep's jobs failed: {names}") from None
         print(f"{number} of the sweep's jobs resume with the same command: {names}")
@@ -96,8 +96,8 @@ def _parsed(arguments: Sequence[str]) -> Namespace:
     return parsed
 
 
-def _run_hydra(parsed: Namespace, command: Sequence[str], ended: list[tuple[int, str]]) -> None:
-    """Run the command line's job, or the jobs of its sweep."""
+def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], errors: list[Exception]) -> None:
+    """Run the command line's job, or those of its sweep; collects exit codes, and errors, which Hydra would print."""
     folders = [os.path.abspath(parsed.config_dir)] if parsed.config_dir else []
     command, launcher = [*command, *(part for folder in folders for part in ("--config-dir", folder))], os.getpid()
 
@@ -109,23 +109,19 @@ def _run_hydra(parsed: Namespace, command: Sequence[str], ended: list[tuple[int,
                 named = " ".join(f"--plugin {name}" for name in config["plugins"])
                 raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                _sweep_job(command, given, ended)
-                if ended and os.getpid() != launcher:  # a remote launcher sees only exceptions, after all jobs
-                    raise JobEnded(*ended[-1])
-                return
+                return _sweep_job(command, given)
             settings = plain(config)
             check_options("the config", Keys, settings)
             if settings["chain"]:
-                code = _chain(settings, given, command, folders)
+                codes.append(_chain(settings, given, command, folders))
             else:  # imported here, so that errors in the config are reported before torch is loaded
                 from r2flow.training import build, fit
 
-                code = 0 if fit(build(settings, given)).finished else LATER
-        except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print more lines
-            message = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
-            raise Stopped(2, f"error: {message}") from None
-        if code:
-            raise SystemExit(code)  # Hydra catches only `Exception`
+                codes.append(0 if fit(build(settings, given)).finished else LATER)
+        except Exception as error:
+            if os.getpid() != launcher:  # a remote launcher sees only exceptions, after all jobs
+                raise
+            errors.append(error)
 
     version.setbase("1.3")
     if parsed.experimental_rerun:
@@ -143,7 +139,7 @@ def job_folder(given: Sequence[str], overrides: str) -> str:
     return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
 
 
-def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[int, str]]) -> None:
+def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
     """Run a job of a sweep in its own process, so that its failure or DDP relaunch does not affect other jobs."""
     from r2flow.runs.chain import run_process
 
@@ -152,7 +148,7 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
     if code in map(code_of, STOPPING):
         raise Stopped(code, "the sweep stopped; the same command resumes there")
     if code:
-        ended.append((code, str(run_dir)))
+        raise JobEnded(code, str(run_dir))
 
 
 def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str], folders: Sequence[str]) -> int:
