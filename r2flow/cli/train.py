@@ -47,8 +47,7 @@ def pairs(
     """
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import PairStore, default_folder, make_pairs
-    from r2flow.model.checkpoint import load_checkpoint, weights_hash
-    from r2flow.runs.lineage import check_finished, pairs_of
+    from r2flow.runs.lineage import find_parent, pairs_of
 
     where = choose_device(device)
     if where == "cuda":
@@ -56,13 +55,14 @@ def pairs(
 
         local = int(os.environ.get("LOCAL_RANK") or os.environ.get("SLURM_LOCALID", "0"))
         where = f"cuda:{local % torch.cuda.device_count()}"  # SLURM may expose one GPU per task
-    flow = load_checkpoint(model)
-    check_finished(Path(model), flow)
+    parent = find_parent(model)
+    assert parent is not None and parent.checkpoint is not None  # noqa: PT018
+    flow = parent.checkpoint
     options = {
         "sampler": {"name": "adams3", **how.given}, "precision": precision, "num": num, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed, "knots": knots,
     }  # fmt: skip
-    chosen = PairOptions(**pairs_of(flow, options, weights_hash(flow)))
+    chosen = PairOptions(**pairs_of(parent, options))
     store = PairStore(out or default_folder(flow.path), chosen, flow.encoding.shape, flow.generator.noise_shape)
     make_pairs(store, flow.generator.to(where), wait=False)
     if missing := store.missing_pairs():

@@ -30,15 +30,15 @@ class Parent:
 
 
 def find_parent(init: str | Path | None) -> Parent | None:
-    """The parent that a config's `stage.init` names, if any."""
+    """The parent that `stage.init` names, if any: a run folder must be finished, a checkpoint may be of any step."""
     if init is None:
         return None
     checkpoint = load_checkpoint(str(init))
-    check_finished(Path(str(init)), checkpoint)
-    if "published" in checkpoint.config and checkpoint.config["data"]["reading"]["projection"] == "unfolding":
+    wanted = checkpoint.config.get("trainer", {}).get("max_steps", 0)
+    if Path(init).expanduser().is_dir() and name_of(checkpoint.path) is None and checkpoint.step < wanted:
         raise InputError(
-            f"{init} was trained on unfolded scans, whose rings a new run's sensor does not have; "
-            "start from a flow trained on spherical images."
+            f"{init} has stopped at step {checkpoint.step} of {wanted}: finish it, or name the checkpoint to start "
+            f"from, {checkpoint.path}."
         )
     return Parent(checkpoint.config, checkpoint.path, checkpoint.step, weights_hash(checkpoint), checkpoint)
 
@@ -60,6 +60,11 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
             what = f"stage={stage} starts from" if needs else "data=pairs are drawn by"
             raise InputError(f"{what} a trained run: give stage.init=RUN.")
     else:
+        if "published" in parent.config and parent.config["data"]["reading"]["projection"] == "unfolding":
+            raise InputError(
+                f"{parent.path} was trained on unfolded scans, whose rings a new run's sensor does not have; "
+                "start from a flow trained on spherical images."
+            )
         keys = [key_of(text) for text in asked]
         for group in [key for key in RULES if "." not in key and rule(key).inherited in ("always", "with_pairs")]:
             config[group] = _of_parent(group, config, keys, parent)
@@ -75,7 +80,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
                     f"out, or start from a flow with the same {group}."
                 )
         data["root"] = data["root"] or str(default_folder(drawer.path))
-        data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
+        data["pairs"] = pairs_of(drawer, data["pairs"] or {})
         theirs = drawer.config.get("data", {}).get("reading") or {}
         for key, value in chosen.items():
             if value != theirs.get(key) and {"data.reading", f"data.reading.{key}"} & {*keys}:
@@ -136,21 +141,11 @@ def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, 
     return {"name": chosen, **{key: value for key, value in parental.items() if key in shared}}
 
 
-def pairs_of(parent: Checkpoint | Parent, options: Mapping[str, Any], weights: str | None) -> dict[str, Any]:
-    """`data.pairs` for a parent of this `weights_hash`, with noise numbers that the parent was not trained on."""
+def pairs_of(parent: Parent, options: Mapping[str, Any]) -> dict[str, Any]:
+    """`data.pairs` for a parent, with noise numbers that the parent was not trained on."""
     check_options("data.pairs", PairOptions, options)
     first = options.get("first")
     if first is None:
         data = parent.config.get("data", {})
         first = data["pairs"]["first"] + data["pairs"]["num"] if data.get("name") == "pairs" else 0
-    return {**options, "parent": weights, "first": first}
-
-
-def check_finished(init: Path, parent: Checkpoint) -> None:
-    """Require that a run folder given as `init` is finished; a checkpoint file may be of any step."""
-    wanted = parent.config.get("trainer", {}).get("max_steps", 0)
-    if init.expanduser().is_dir() and name_of(parent.path) is None and parent.step < wanted:
-        raise InputError(
-            f"{init} has stopped at step {parent.step} of {wanted}: finish it, or name the checkpoint to start from, "
-            f"{parent.path}."
-        )
+    return {**options, "parent": parent.weights, "first": first}

@@ -16,10 +16,9 @@ from r2flow.cli.train import pairs
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairStore, default_folder, make_pairs
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.models import find_model
 from r2flow.noise import standard_normal
-from r2flow.runs.lineage import pairs_of
+from r2flow.runs.lineage import find_parent, pairs_of
 from r2flow.samplers import build_sampler
 from r2flow.signals import LATER, Stopped
 from r2flow.store import Store
@@ -225,10 +224,10 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     assert default_folder(find_model("street")) == Path("runs/street-pairs")  # not in the package
     for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
         assert words in said
-    flow = load_checkpoint(path)
+    parent = find_parent(path)
     options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
-    chosen = PairOptions(**pairs_of(flow, options, weights_hash(flow)))
-    assert len(PairStore(folder, chosen, flow.encoding.shape).usable()) == 10
+    chosen = PairOptions(**pairs_of(parent, options))
+    assert len(PairStore(folder, chosen, parent.checkpoint.encoding.shape).usable()) == 10
     assert "pairs/s" not in r2flow("pairs", path, *QUICK).said  # nothing was left to make
 
 
