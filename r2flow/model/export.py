@@ -189,8 +189,9 @@ def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[
 
 
 def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> tuple[bytes, bool]:
-    module, inputs = (flow.backbone, _network_inputs(flow, (2,))) if how is None else (Scans(flow, how), _noise(flow))
-    program, any_batch = _traced(module, inputs)
+    noise = torch.zeros(2, *flow.noise_shape)
+    module, inputs = (flow.backbone, _network_inputs(flow, (2,))) if how is None else (Scans(flow, how), [noise])
+    program, any_batch = _traced(module, *inputs)
     file = io.BytesIO()
     torch.export.save(program, file, extra_files={NOTES: json.dumps(notes)})
     return file.getvalue(), any_batch
@@ -199,10 +200,10 @@ def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) 
 def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> tuple[bytes, bool]:
     from r2flow.model.onnx_graphs import sampler_graph, to_onnx
 
-    program, any_batch = _traced(flow.backbone, _network_inputs(flow, (2,) if how is None else ()))
+    program, any_batch = _traced(flow.backbone, *_network_inputs(flow, (2,) if how is None else ()))
     network = to_onnx(program, ["t", "x", "s"][: 2 + flow.backbone.second_time], ["v"])
     if how is not None:
-        decoded, any_too = _traced(Decoded(flow.space), _noise(flow))
+        decoded, any_too = _traced(Decoded(flow.space), torch.zeros(2, *flow.noise_shape))
         any_batch = any_batch and any_too
         ends = to_onnx(decoded, ["x_1"], ["scan", "points"])
         network = sampler_graph(network, ends, how.times, how.second, how.states.numpy())
@@ -214,24 +215,20 @@ def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any])
 FORMATS = Registry("export format", pt2=_write_pt2, onnx=_write_onnx)
 
 
-def _noise(flow: RectifiedFlow) -> dict[str, Tensor]:
-    return {"noise": torch.zeros(2, *flow.noise_shape)}
-
-
-def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> dict[str, Tensor]:
-    """Example inputs of v(t, x), t of shape () or (2,)."""
+def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> list[Tensor]:
+    """Example inputs t, x and, for a flow map, s of the network, with times of shape () or (2,)."""
     network = flow.backbone
-    inputs = {"t": torch.full(shape, 0.25), "x": torch.zeros(2, network.in_channels, *network.coords.shape[2:])}
-    return {**inputs, "s": torch.full(shape, 0.5)} if network.second_time else inputs  # t, s: distinct tensors
+    inputs = [torch.full(shape, 0.25), torch.zeros(2, network.in_channels, *network.coords.shape[2:])]
+    return [*inputs, torch.full(shape, 0.5)] if network.second_time else inputs  # t, s: distinct tensors
 
 
-def _traced(module: nn.Module, inputs: dict[str, Tensor]) -> tuple[torch.export.ExportedProgram, bool]:
+def _traced(module: nn.Module, *inputs: Tensor) -> tuple[torch.export.ExportedProgram, bool]:
     """Export the module for a free batch size; if torch cannot, for one scan."""
     batch = torch.export.Dim("batch")
     module = module.cpu().eval()
     problem = ""
     for any_batch in (True, False):
-        examples = tuple(value if any_batch else value[:1] for value in inputs.values())
+        examples = tuple(value if any_batch else value[:1] for value in inputs)
         dynamic_shapes = tuple({0: batch} if value.ndim and any_batch else {} for value in examples)
         try:
             with torch.no_grad():
