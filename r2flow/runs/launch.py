@@ -15,11 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-from hydra import version
-from hydra._internal.utils import _run_hydra as run_hydra
+import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.main import _get_rerun_conf
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
@@ -92,6 +90,7 @@ def _parsed(arguments: Sequence[str]) -> Namespace:
         # A sweep over several names is valid.
         if key_of(text) == "run_dir" or (key_of(text) == "name" and "," not in text):
             raise InputError(f"a sweep names its runs' folders: leave {text} out, or give hydra.sweep.dir=FOLDER.")
+    parsed.flags = [text for text in arguments if text not in parsed.overrides]
     parsed.overrides = as_hydra_takes(parsed.overrides)
     return parsed
 
@@ -100,8 +99,10 @@ def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], erro
     """Run the command line's job, or those of its sweep; collects exit codes, and errors, which Hydra would print."""
     folders = [os.path.abspath(parsed.config_dir)] if parsed.config_dir else []
     command, launcher = [*command, *(part for folder in folders for part in ("--config-dir", folder))], os.getpid()
+    original = sys.argv
 
     def job(config: DictConfig) -> None:
+        sys.argv = original  # Lightning starts the processes of other devices by it
         try:
             given = list(HydraConfig.get().overrides.task)
             # Check the command line, not the overrides: a config file can make a sweeper add overrides.
@@ -123,11 +124,15 @@ def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], erro
                 raise
             errors.append(error)
 
-    version.setbase("1.3")
-    if parsed.experimental_rerun:
-        return job(_get_rerun_conf(parsed.experimental_rerun, parsed.overrides))
+    def composed() -> None:
+        sys.argv = [original[0], *parsed.flags, *parsed.overrides]
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(job)()
+
     OmegaConf.register_new_resolver("job_folder", partial(job_folder, parsed.overrides), replace=True)
-    with_choices(partial(run_hydra, parsed, get_args_parser(), job, str(CONF), "train"))
+    try:
+        with_choices(composed)
+    finally:
+        sys.argv = original
 
 
 def job_folder(given: Sequence[str], overrides: str) -> str:
