@@ -62,10 +62,7 @@ class Draws:
 
     def step(self, shape: tuple[int, ...], j: int) -> Tensor:
         """Noise of each scan in step j, (B, *shape) float32 on the CPU; step 0 is the start."""
-        noise = torch.empty(len(self.numbers), *shape)
-        for row, number in zip(noise, self.numbers, strict=True):
-            row.copy_(standard_normal(shape, self.seed, self.purpose, number, j))
-        return noise
+        return torch.stack([standard_normal(shape, self.seed, self.purpose, number, j) for number in self.numbers])
 
 
 def seed_torch(seed: int, purpose: str, index: int = 0) -> None:

@@ -71,7 +71,6 @@ class Trap:
 
 
 def write_checkpoint(path: Path, config: dict[str, Any]) -> Path:
-    """A checkpoint of a config, with random weights."""
     state = build_stage(config, build_generator(config)).state_dict()
     content = {"state_dict": state, "current_model_state": state, "config": config, "global_step": 7}
     AtomicCheckpointIO().save_checkpoint(content, path)

@@ -43,6 +43,16 @@ def test_a_published_checkpoint_computes_what_its_authors_did(shared):
     assert (output - case["output"]).norm() / case["output"].norm() < 5e-5
 
 
+def test_torch_s_default_type_and_modes_change_nothing(saved, request):
+    request.addfinalizer(lambda: torch.set_default_dtype(torch.float32))
+    expected = load_checkpoint(saved[0]).sample(2, steps=1)
+    torch.set_default_dtype(torch.bfloat16)
+    with torch.inference_mode():
+        flow = load_checkpoint(saved[0])
+    assert torch.equal(flow.sample(2, steps=1), expected)
+    assert not any(weight.is_inference() for weight in flow.generator.parameters())
+
+
 def test_a_run_goes_on_without_the_gpu_that_it_began_on(saved, monkeypatch):
     path, averaged = saved
     content = torch.load(path, weights_only=True)

@@ -26,7 +26,6 @@ SHORT = build_sampler("adams3", steps=3, grid="power:1.5", finish=1 / 32)
 
 
 def flow(name: str, generator: str = "rectified_flow") -> Checkpoint:
-    """A small flow whose weights are not zero."""
     config = {
         "sensor": {"name": "hdl64e", "rows": 16, "columns": 64},
         "encoding": {"format": "logscale", "reflectance": True},

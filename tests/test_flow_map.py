@@ -25,7 +25,6 @@ from tests.test_sampling import network
 
 @pytest.fixture(scope="module")
 def parent() -> RectifiedFlow:
-    """A flow whose velocity is not zero."""
     return network(**CONFIG).generator
 
 

@@ -165,7 +165,6 @@ USUAL = {"", "-", "c", "o", "x", "a", "1", "0", "3", "name", "run", "out", "scan
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Scans, a run, and files that are none of these."""
     place = tmp_path_factory.mktemp("place")
     sensor = SENSORS["hdl64e"].resized(16, 128)
     for number in range(3):

@@ -7,6 +7,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -239,6 +240,7 @@ def _refuse_unpacking(file: IO[bytes], name: object) -> None:
     file.seek(0)
 
 
+@torch.inference_mode(False)  # `mmps` needs gradients later
 def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averaged: bool = True) -> Checkpoint:
     """Load a generator from a checkpoint file (of r2flow or published), a run folder, or by a model's name.
 
@@ -279,8 +281,10 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
             f"{path} is a torch file but is not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor a published layout ({systems}); found {found}."
         )
-    # First weights are drawn and replaced: neither the caller's random numbers nor the default device matter.
-    with made_with(config, str(path)), torch.random.fork_rng(devices=[]), torch.device("cpu"):
+    # First weights are drawn and replaced: neither the caller's random numbers nor torch's defaults matter.
+    with made_with(config, str(path)), torch.random.fork_rng(devices=[]), torch.device("cpu"), ExitStack() as stack:
+        stack.callback(torch.set_default_dtype, torch.get_default_dtype())
+        torch.set_default_dtype(torch.float32)
         generator = build_generator(config)
         check_weights(generator, weights)
         generator.load_state_dict(weights)

@@ -53,7 +53,6 @@ def sample(
     """Draw scans 0 to num - 1 of a seed, batch by batch, and warn of those that are not solved.
 
     Args:
-        source: A checkpoint or its generator.
         sampler: Sampler or its name; None: the generator's default.
         batch_size: Scans per batch. It does not change a fixed-step result beyond rounding.
         condition: Condition of the scans, each tensor (num, ...).

@@ -28,7 +28,6 @@ def write_figures(run: Path) -> None:
 
 
 def log_all(run: Path, name: str, loss: float, step: int) -> None:
-    """What a run logs from its start to its end."""
     loggers = [logger := LOGGERS[name](run)]
     log_config(loggers, {"seed": step, "stage": {"name": "rectify"}})
     logger.log_metrics({"train/loss": loss}, step)

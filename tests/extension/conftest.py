@@ -85,7 +85,6 @@ def train(run: Path, family: Family, *more: str) -> Done:
 
 @pytest.fixture(scope="session", params=ALL, ids=str)
 def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Family, Path]:
-    """Each family with its run, which nobody disturbed."""
     return request.param, run_of(request.param, tmp_path_factory)
 
 

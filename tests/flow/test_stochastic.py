@@ -26,7 +26,6 @@ def times(steps: int, grid: str = "power:2") -> Tensor:
 
 
 def estimate(t: Tensor, x: Tensor) -> Tensor:
-    """E[x_1 | x_t] of the Gaussian."""
     return t * STD**2 / (t**2 * STD**2 + (1 - t) ** 2) * x
 
 

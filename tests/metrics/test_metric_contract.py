@@ -188,7 +188,6 @@ def test_a_metric_must_give_a_row_for_each_scan(rows, sets, monkeypatch):
 
 
 def told(metric, sets, size=4):
-    """Both sets as tensors, in batches that nobody numbers."""
     for side, scans in sets.items():
         for batch in scans.images.split(size):
             metric.update(batch, real=side == "real")

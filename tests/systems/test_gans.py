@@ -41,7 +41,6 @@ def space(rows: int, columns: int, channels: int = 1) -> Any:
 
 
 def generator_of(cfg: Mapping[str, Any]) -> nn.Module:
-    """The network of a published `cfg.model.generator`."""
     synthesis, mapping = cfg["synthesis_kwargs"], cfg["mapping_kwargs"]
     out = {one["name"]: one for one in synthesis["out_ch"]}
     given = space(*synthesis["resolution"], out["image"]["ch"])

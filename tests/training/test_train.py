@@ -84,7 +84,6 @@ def test_a_run_from_weights_begins_with_their_validation_loss(train: Run, alone:
 
 
 def lines_of(said: str) -> list[str]:
-    """What a run says beside its progress and its log."""
     return [line for line in said.splitlines() if not line.startswith(("INFO", "WARNING", "step "))]
 
 
