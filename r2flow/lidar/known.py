@@ -40,7 +40,7 @@ def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
     state = torch.where(returned, int(Ray.RETURN), int(Ray.EMPTY)).to(torch.uint8)
     if measured is not None:
         check(measured.shape[-2:] == images.shape[2:], f"measured is {(*measured.shape,)}, images {(*images.shape,)}.")
-        state[~measured.to(images.device).expand_as(returned)] = int(Ray.UNKNOWN)
+        state[~measured.to(images.device, torch.bool).expand_as(returned)] = int(Ray.UNKNOWN)
     return state
 
 

@@ -24,7 +24,7 @@ def draws(seed: int = 0) -> np.random.Generator:
 
 def test_a_ray_is_never_empty_because_it_was_not_measured():
     images = torch.tensor([5.0, 0, 0, 0, 0, 0, 0, 0]).reshape(1, 2, 2, 2)
-    measured = torch.tensor([[True, True], [False, True]])
+    measured = torch.tensor([[1, 1], [0, 1]])  # of any type
     with pytest.raises(InputError, match=r"measured is \(1, 2\), images \(1, 2, 2, 2\)"):
         ray_states(images, measured[:1])  # which would be repeated
     assert ray_states(images, measured).tolist() == [[[Ray.RETURN, Ray.EMPTY], [Ray.UNKNOWN, Ray.EMPTY]]]
