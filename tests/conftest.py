@@ -121,7 +121,6 @@ def refused(*words: object) -> Iterator[None]:
 
 
 def quiet_trainer(folder: Path, **options: Any) -> L.Trainer:
-    """On the CPU; it writes and shows nothing unless asked."""
     quiet = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
     given = {**dict.fromkeys(quiet, False), "max_epochs": -1, **options}
     return L.Trainer(accelerator="cpu", default_root_dir=folder, **given)

@@ -48,7 +48,6 @@ def complete(r2flow, run, tmp_path):
 
 
 def assert_refused(answer: Done, message: str, out: Path) -> None:
-    """With nothing written."""
     assert message in answer.refusal
     assert not out.exists()
 

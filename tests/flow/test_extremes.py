@@ -88,6 +88,7 @@ def test_an_empty_interval_or_batch_returns_the_start_without_evaluations(method
 def test_numbers_out_of_range_are_refused():
     for wrong, message in [
         ({"steps": 0}, "step"),
+        ({"steps": 2.5}, "step"),
         ({"tolerance": math.nan}, "tolerance"),
         ({"max_evaluations": 0}, "evaluation"),
         ({"max_step": 0.0}, "max_step"),

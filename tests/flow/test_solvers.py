@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -117,7 +118,7 @@ def test_the_global_error_is_estimated_and_its_cost_counted(method):
 
 
 def test_an_unknown_or_wrong_grid_is_refused():
-    assert torch.equal(solve(logistic, X_0, grid=[0, 0.5, 1]).x, solve(logistic, X_0, steps=2).x)
+    assert torch.equal(solve(logistic, X_0, np.float32(0), grid=[0, 0.5, 1]).x, solve(logistic, X_0, steps=2).x)
     for grid in ("power", "power:0.5", "power:nan", "power:11", "start-power:2"):
         with pytest.raises(InputError, match=f"P from 1 to 10; found '{grid}'"):
             solve(logistic, X_0, grid=grid)

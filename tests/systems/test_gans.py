@@ -36,7 +36,6 @@ PUBLISHED = ["vanilla", "dusty1", "dusty2"]
 
 
 def space(rows: int, columns: int, channels: int = 1) -> Any:
-    """What a GAN reads of a model space."""
     return SimpleNamespace(shape=(channels, rows, columns), rays=torch.zeros(2, rows, columns))
 
 

@@ -82,7 +82,7 @@ def solve(
     """
     solver = method_of(method)
     check(math.isfinite(t_1 - t_0), f"a solution needs two times, found {t_0} and {t_1}.")
-    check(steps >= 1, f"a solver needs at least 1 step, found {steps}.")
+    check(hasattr(steps, "__index__") and steps >= 1, f"a solver needs at least 1 whole step, found {steps!r}.")
     check(0 < tolerance < math.inf, f"a solver's tolerance must be positive and finite, found {tolerance:g}.")
     check(max_evaluations >= 1, f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}.")
     check(0 < max_step <= 1, f"max_step is a share of the interval, above 0 and at most 1; found {max_step}.")

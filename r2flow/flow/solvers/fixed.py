@@ -47,7 +47,7 @@ def build_grid(grid: str | Sequence[float] | Tensor, t_0: float, t_1: float, ste
     if not one_way or max(abs(times[0] - t_0), abs(times[-1] - t_1)) > 1e-6:
         given = grid if not isinstance(grid, str) else f"{steps} steps on {grid}, too short for float64"
         raise InputError(f"a time grid must be (N + 1,) times one way from {t_0:g} to {t_1:g}, found {given}.")
-    times[0], times[-1] = t_0, t_1  # undo rounding by float32 or powers
+    times[0], times[-1] = float(t_0), float(t_1)  # undo rounding by float32 or powers
     return times
 
 
