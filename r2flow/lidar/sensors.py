@@ -38,12 +38,14 @@ class Sensor:
     reflectance_scale: float | None = None  # value of full reflectance in its scan files; None if unknown
 
     def __post_init__(self) -> None:
+        for key in ("elevations",) if self.firing is None else ("elevations", "firing"):  # lists have no hash
+            object.__setattr__(self, key, tuple(np.asarray(getattr(self, key)).tolist()))
         e, near, far, scale = self.elevations, self.min_range, self.max_range, self.reflectance_scale
         rows = [*range(len(e))]
         odd = next((pair for pair in pairwise(e) if not 90 > pair[0] > pair[1] > -90), None if len(e) > 1 else e)
         for holds, rule, value in (
             (odd is None, "elevations must be two or more, fall from the top row down, within (-90, 90) degrees", odd),
-            (self.columns >= 1, "columns must be at least 1", self.columns),
+            (hasattr(self.columns, "__index__") and self.columns >= 1, "columns: a whole number from 1", self.columns),
             (len(e) * self.columns <= MOST_PIXELS, f"at most {MOST_PIXELS:,} pixels", f"{len(e)} x {self.columns}"),
             (0 < near < far < math.inf, "needs 0 < min_range < max_range in metres", f"{near} and {far}"),
             (0 < self.height < math.inf, "height must be metres above the ground", self.height),

@@ -58,7 +58,6 @@ def sample(
         condition: Condition of the scans, each tensor (num, ...).
         region: Region of the image to generate. The network sees `evaluated_region` only, with the same noise as in the
             whole image.
-        precision: Precision of the network, see `Generator.forward`.
         progress: Called after every network evaluation of a batch.
         changes: Fields of the sampler: steps, tolerance, grid, ...
 

@@ -116,6 +116,8 @@ def test_every_sensor_has_a_config_and_every_config_builds():
     ],
 )
 def test_an_impossible_sensor_of_a_user_is_refused(options, words):
+    with refused("columns", "found 64.0"):
+        SENSORS["vlp16"].resized(8, 64.0)
     with refused(words):
         build_space({"sensor": {"name": "mine", **options}, "encoding": {}})
 
@@ -126,9 +128,10 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_a_written_sensor_is_read_back(sensor, tmp_path):
-    mine = Sensor(**{**vars(sensor), "name": "mine", "elevations": tuple(np.array(sensor.elevations))})
+    firing = sensor.firing and list(sensor.firing)
+    mine = Sensor(**{**vars(sensor), "name": "mine", "elevations": np.array(sensor.elevations), "firing": firing})
     write_sensor(mine, tmp_path / "mine.yaml", "two\nlines")
-    assert read_sensor(tmp_path / "mine.yaml") == mine
+    assert read_sensor(tmp_path / "mine.yaml") in {mine}  # equal, with a hash
     assert read_sensor(tmp_path / "mine.yaml", 8, 64) == mine.resized(8, 64)
 
 

@@ -38,7 +38,6 @@ def part(scans, numbers):
 
 
 def give(metric, sets, size=4, order=1):
-    """Both sets in batches of `size`, forwards or backwards."""
     for side, scans in sets.items():
         for first in range(0, len(scans), size)[::order]:
             numbers = range(len(scans))[first : first + size]

@@ -30,7 +30,6 @@ def share(counts, images: np.ndarray) -> np.ndarray:
 
 
 def inner(r: np.ndarray) -> np.ndarray:
-    """Pixels with all they need around them."""
     seen = r > 0
     for by, axis in ((1, 0), (-1, 0), (2, 1), (-2, 1)):
         seen = seen & np.roll(r > 0, by, axis)
