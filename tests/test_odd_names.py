@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from r2flow.errors import InputError, explain_mistake
@@ -52,19 +53,18 @@ def test_models_of_any_name_sample(r2flow, saved, tmp_path, monkeypatch, name):
 
 def test_a_dollar_in_a_text_is_drawn_as_one():
     def drawn(text: str, parsed: bool) -> np.ndarray:
-        figure = blank_figure(4, 1)
-        figure.text(0.1, 0.5, text, parse_math=parsed)
-        return figure_pixels(figure)
+        with rc_context({"text.usetex": parsed}):  # as a matplotlibrc of an author of papers
+            figure = blank_figure(4, 1)
+            figure.text(0.1, 0.5, text, parse_math=parsed)
+            return figure_pixels(figure)
 
     np.testing.assert_array_equal(drawn("a$b$c", True), drawn("a$b$c", False))
-    axes = blank_figure(4, 3).subplots()
-    axes.set(xscale="log", xlim=(1, 1e4))
-    as_usual = blank_figure(4, 3)
-    as_usual.subplots().set(xscale="log", xlim=(1, 1e4))
-    canvas = FigureCanvasAgg(as_usual)
+    ours, usual = figures = [blank_figure(4, 3) for _ in range(2)]
+    for figure in figures:
+        figure.subplots().set(xscale="log", xlim=(1, 1e4))
+    canvas = FigureCanvasAgg(usual)
     canvas.draw()
-    before = np.asarray(canvas.buffer_rgba())[..., :3]
-    np.testing.assert_array_equal(figure_pixels(axes.figure, int(axes.figure.dpi)), before)
+    np.testing.assert_array_equal(figure_pixels(ours, int(ours.dpi)), np.asarray(canvas.buffer_rgba())[..., :3])
 
 
 def test_a_full_disk_is_one_line_that_names_the_file(tmp_path: Path):

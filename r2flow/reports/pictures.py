@@ -204,12 +204,11 @@ def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
 
 
 def take_names_as_they_are(figure: Figure) -> None:
-    """Show dollar signs in file names literally: only tick labels parse formulas."""
+    """Show characters of file names literally, whatever a matplotlibrc says: only tick labels parse formulas."""
     warnings.filterwarnings("ignore", "Glyph .* missing from font")  # no font has all characters of file names
-    for text in figure.findobj(Text):
-        if isinstance(text, Text) and not text.get_text().isascii():
-            text.set_text(printable(text.get_text()))
-        if isinstance(text, Text) and "$" in text.get_text() and not text.get_text().startswith(r"$\mathdefault"):
+    for text in (artist for artist in figure.findobj() if isinstance(artist, Text)):
+        text.set(text=printable(text.get_text()), usetex=False)
+        if "$" in text.get_text() and not text.get_text().startswith(r"$\mathdefault"):
             text.set_parse_math(False)
 
 
@@ -219,7 +218,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 300, title: str = "
     notes = {"Subject": about, "CreationDate": None} if path.suffix == ".pdf" else {"Description": about}
     take_names_as_they_are(figure)
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # else 100 lines for a PDF where INFO is shown
-    with atomic_write(path) as file, rc_context({"pdf.fonttype": 42}):  # TrueType: publishers refuse Type 3
+    with atomic_write(path) as file, rc_context({"pdf.fonttype": 42, "text.usetex": False}):  # publishers refuse Type 3
         figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata={"Title": title, **notes})
     return path
 
