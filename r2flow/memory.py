@@ -9,12 +9,12 @@ LARGEST, KEPT = 1 << 30, 2**31 - 1  # bytes
 
 
 def prepare_process() -> None:
-    """Keep freed memory, let waiting threads sleep earlier; call before importing torch.
+    """Keep freed memory, let waiting threads sleep earlier, draw into files alone; call before importing torch.
 
     By default glibc returns each freed block of 32 MiB or more, and the kernel clears new pages for the next one. Here
-    blocks of up to 1 GiB come from the heap, which keeps up to 2 GiB. Settings of the user (MALLOC_MMAP_...,
-    MALLOC_TRIM_..., GOMP_SPINCOUNT) take precedence.
+    blocks of up to 1 GiB come from the heap, which keeps up to 2 GiB. Settings of the user take precedence.
     """
+    os.environ["MPLBACKEND"] = "agg"  # a notebook's shell has the notebook's, which may not be installed here
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # 1.4 to 2.5 times faster next to other programs
     if sys.platform != "linux" or any(name.startswith(("MALLOC_MMAP_", "MALLOC_TRIM_")) for name in os.environ):
         return

@@ -111,8 +111,8 @@ def start(
 ) -> subprocess.Popen[str]:
     """`train.py ARGUMENTS` or another command from a folder, as a process group of its own."""
     return subprocess.Popen(
-        [*command, *map(str, arguments)], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
-        start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        [*command, *map(str, arguments)], start_new_session=True, cwd=cwd, text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, env={**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "another", **environment},
         # A shell's background job is started with Ctrl-C ignored, nohup's with SIGHUP, and hands that on.
         preexec_fn=lambda: [signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)],
     )  # fmt: skip
