@@ -47,7 +47,7 @@ def check_folder(folder: Path) -> None:
 # System errors that a user can fix; others (a lost connection, a broken pipe) keep their traceback.
 MENDABLE = {
     errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
-    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP,
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP, errno.ESTALE, errno.EIO,
 }  # fmt: skip
 
 

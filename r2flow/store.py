@@ -338,9 +338,9 @@ def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
             raise Foreign(f"{path} is damaged, or not of r2flow: give another folder.")
         format_name, _ = content["format"], content["recipe"]
         damaged = content.pop("checksum") != checksum(content)
-    except (FileNotFoundError, NotADirectoryError, Foreign):
+    except (OSError, Foreign):
         raise
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+    except (ValueError, LookupError, TypeError, AttributeError):
         damaged = True
     check(not damaged, f"{path} is damaged. If r2flow wrote {folder}, remove it and make it again.")
     if kind is not None and format_name != f"r2flow {kind}":

@@ -41,8 +41,7 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     printed = " ".join(r2flow("sensor", scans, "--out", out).quiet.split())
     for words in ("beams 8:", "128 steps a turn", "scale=255", "lie 0.00 from", "1.50 m above", "ring after ring"):
         assert words in printed
-    options = yaml.safe_load(out.read_text())
-    np.testing.assert_allclose(options["elevations"], MINE.elevations, atol=1e-3)
+    np.testing.assert_allclose(yaml.safe_load(out.read_text())["elevations"], MINE.elevations, atol=1e-3)
     assert sorted(path.name for path in out.parent.iterdir()) == ["mine.yaml"]
 
     npy, image = ("--format", "npy", "-o", tmp_path / "image"), tmp_path / "image" / "000000.npy"

@@ -77,7 +77,7 @@ def test_a_full_disk_is_one_line_that_names_the_file(tmp_path: Path):
 
 def test_a_newline_in_a_name_does_not_eat_the_line():
     assert explain_mistake(InputError("a\nb.bin is empty.")) == r"a\nb.bin is empty."
-    assert explain_mistake(FileNotFoundError(2, "No such file", "a\nb")) == r"a\nb: No such file"
+    assert explain_mistake(OSError(5, "Input/output error", "a\nb")) == r"a\nb: Input/output error"
     assert explain_mistake(InputError("a\033[31mb")) == r"a\x1b[31mb"  # nor does it control the terminal
     of_a_worker = "Caught InputError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n"
     of_a_worker += '  File "x", line 1\nr2flow.errors.InputError: a\nb.bin is empty.\n'

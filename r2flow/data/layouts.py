@@ -187,9 +187,9 @@ def folder(root: Path) -> list[Drive]:
 def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
     """All folders from a root down with their files, following links, each folder once."""
     seen: set[str] = set()
-    for place, folders, names in os.walk(root, followlinks=True):
-        real = os.path.realpath(place)
-        if real in seen:
+    walk = os.walk(root, onerror=lambda e: warn_odd(Path(e.filename), "left out, not readable"), followlinks=True)
+    for place, folders, names in walk:
+        if (real := os.path.realpath(place)) in seen:
             folders.clear()
             continue
         seen.add(real)

@@ -87,13 +87,13 @@ class ScanSource(ABC):
 
 def made_here(root: str | Path) -> bool:
     """Whether r2flow wrote the samples or simulated scans in a folder, in all folders in it, or next to a file."""
-    folder = Path(root).expanduser()
-    if folder.is_file():
-        folder = folder.parent
+    given = Path(root).expanduser()
+    folder = given.parent if given.is_file() else given
     if not folder.is_dir() or manifest_of(folder):
         return folder.is_dir()
     with os.scandir(folder) as entries:  # knows folders without a system call per file; fails at a loop of links
-        below = [e.path for e in entries if scan_ending(e.name) or (os.path.isdir(e) if e.is_symlink() else e.is_dir())]
+        listed = [e for e in entries if scan_ending(e.name) or (os.path.isdir(e) if e.is_symlink() else e.is_dir())]
+    below = [e.path for e in listed if scan_ending(e.name) or os.access(e, os.X_OK)]  # not a disk's lost+found
     return bool(below) and all(map(manifest_of, below))
 
 

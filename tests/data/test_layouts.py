@@ -1,10 +1,14 @@
+import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from r2flow.data.layouts import Layout
 from r2flow.data.opening import SOURCES, find_drives
+from r2flow.data.sources import made_here
 from r2flow.errors import InputError
+from r2flow.store import Store
 from tests.conftest import write_scan
 
 
@@ -67,6 +71,18 @@ def test_a_missing_or_empty_root_says_what_was_looked_for(layout: str, tmp_path:
         find_drives(layout, tmp_path / "missing")
     with pytest.raises(InputError, match=rf"holds no scan\. Looked for \({layout}\)"):
         find_drives(layout, tmp_path)
+
+
+def test_a_folder_that_may_not_be_entered_is_left_out_with_its_name(tmp_path: Path, monkeypatch, caplog):
+    Store(tmp_path / "day", "samples", {}).begin()
+    for place in ("day", "lost+found"):  # of a disk, for root alone
+        write_scan(tmp_path / place / "0.bin", 1)
+    scandir, closed = os.scandir, Mock(side_effect=PermissionError(13, "Permission denied", tmp_path / "lost+found"))
+    monkeypatch.setattr(os, "access", lambda path, mode: "lost" not in str(path))
+    monkeypatch.setattr(os, "scandir", lambda path: (closed if "lost" in str(path) else scandir)(path))
+    assert made_here(tmp_path)
+    assert names(find_drives("folder", tmp_path)) == ["day"]
+    assert "lost+found: left out, not readable" in caplog.text
 
 
 def test_a_split_that_holds_nothing_says_what_there_is_and_how_to_take_it(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -87,12 +88,15 @@ class TestSamples:
             open_scans(tmp_path).source[0]
         assert open_scans(tmp_path / "000000.npy", own_size=True).sensor.shape == (8, 32)
 
-    def test_a_damaged_note_is_one_line(self, tmp_path: Path):
+    def test_a_damaged_or_unreadable_note_is_one_line(self, tmp_path: Path, monkeypatch):
         self.samples(tmp_path)
         for content in ("{", "1", '{"checksum": ""}', '{"checksum": "", "recipe": {"reading": {"sensor": {}}}}'):
             (tmp_path / "manifest.json").write_text(content)
             with pytest.raises(InputError, match=r"\A.*manifest.json is damaged.*\Z"):  # one line
                 open_scans(tmp_path)
+        monkeypatch.setattr("r2flow.store.read_json", Mock(side_effect=OSError(5, "Input/output error")))
+        with pytest.raises(OSError, match="Input/output error"):  # a working one is not to be removed
+            open_scans(tmp_path)
 
 
 class TestWhatR2FlowWrote:

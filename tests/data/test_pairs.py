@@ -188,8 +188,7 @@ def test_who_waits_says_for_whom_and_who_does_not_leaves_the_rest(tmp_path: Path
         lambda: store.attempt(1, lambda item: (os.write(write, b"1"), os.kill(os.getpid(), signal.SIGSTOP)))
     )
     os.read(read, 1)
-    made = make_pairs(store, grow, wait=False)
-    assert (len(made), store.missing(store.shards)) == (10 * 4, [1])
+    assert (len(make_pairs(store, grow, wait=False)), store.missing(store.shards)) == (10 * 4, [1])
     timer = threading.Timer(1, os.kill, (child, signal.SIGKILL))
     timer.start()
     assert len(make_pairs(store, grow)) == 3 * 4

@@ -25,8 +25,7 @@ def test_s_is_that_of_the_exact_path(problem):
     # Euler's path is off by O(1/n); halving the step halves the difference.
     assert off[1] < 5e-3
     assert math.log2(off[0] / off[1]) == pytest.approx(1, abs=0.1)
-    lengths = chord.square().flatten(1).sum(1)
-    torch.testing.assert_close(found.squared_length, lengths, rtol=1e-2, atol=0)
+    torch.testing.assert_close(found.squared_length, chord.square().flatten(1).sum(1), rtol=1e-2, atol=0)
 
 
 def test_a_small_variance_survives_float32():
@@ -47,8 +46,7 @@ def test_a_path_that_is_not_finite_is_not_the_most_curved():
 def test_a_network_that_can_learn_is_followed_too():
     """Nothing is kept for a gradient."""
     layer = torch.nn.Linear(8, 8, dtype=torch.float64)
-    found = straightness(lambda t, x: layer(x), X_0, 4, most_curved=1)
-    assert not any(part.requires_grad for part in found)
+    assert not any(part.requires_grad for part in straightness(lambda t, x: layer(x), X_0, 4, most_curved=1))
 
 
 def test_a_network_may_give_its_velocities_in_one_buffer():

@@ -57,8 +57,7 @@ def test_points_on_the_edges_of_pixels_go_to_the_lower_row_and_the_later_column(
     coarse = HDL64E.resized(32, 256)
     image, expected = random_image(coarse), np.zeros((2, 64, 1024), np.float32)
     expected[:, 1::2, 2::4] = image
-    made = project(*image_to_points(image, coarse), HDL64E)
-    np.testing.assert_allclose(made, expected, rtol=1e-6)
+    np.testing.assert_allclose(project(*image_to_points(image, coarse), HDL64E), expected, rtol=1e-6)
 
 
 def test_a_return_too_near_does_not_hide_what_is_behind_it():

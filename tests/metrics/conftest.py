@@ -33,8 +33,7 @@ class Summary(Extractor):
         r = scans.images[:, 0]
         quarters = r.unflatten(2, (4, -1)).mean((1, 3))
         both = torch.stack([r.amax((1, 2)), scans.returned.float().mean((1, 2, 3))], 1)
-        features = torch.cat([quarters, both], 1)
-        return torch.where(scans.returned.flatten(1).any(1)[:, None], features, torch.nan)
+        return torch.where(scans.returned.flatten(1).any(1)[:, None], torch.cat([quarters, both], 1), torch.nan)
 
 
 def untrained(network: type[Extractor], seed: int = 0) -> Extractor:

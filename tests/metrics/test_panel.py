@@ -117,8 +117,7 @@ def test_a_turn_changes_no_run_of_returns():
     images[0, 0, 0, 4:17], images[0, 0, 1, 30:], images[0, 0, 1, :5], images[1, 0, 2] = 9, 9, 9, 9
     expected = np.histogram([13, 15, 40], RUNS, weights=[13, 15, 40])[0]
     for by in (0, 7, 20):
-        turned = np.roll(images, by, -1)
-        counts = sum(PANEL["run lengths"].counts(scan_of(image)) for image in turned)
+        counts = sum(PANEL["run lengths"].counts(scan_of(image)) for image in np.roll(images, by, -1))
         np.testing.assert_array_equal(counts, expected)
 
 

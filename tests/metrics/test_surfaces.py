@@ -67,8 +67,7 @@ def test_edges_have_no_normal():
 
 def test_gaps_are_bridged_by_the_mean_of_their_ends_around_the_ring():
     x = np.array([[1.0, 0, 0, 4, 5, 0, 0, 0]])
-    found = bridged(x, x > 0, gap=2)
-    np.testing.assert_array_equal(found, [[1, 2.5, 2.5, 4, 5, np.nan, np.nan, np.nan]])
+    np.testing.assert_array_equal(bridged(x, x > 0, gap=2), [[1, 2.5, 2.5, 4, 5, np.nan, np.nan, np.nan]])
     np.testing.assert_array_equal(bridged(x, x > 0, gap=3)[0, 5:], [3, 3, 3])  # between 5 and, around, 1
     for width in (2, 8, 16, 25):  # of narrow images too
         x = np.zeros((1, width))
@@ -82,8 +81,7 @@ def test_the_drop_rate_is_the_share_that_a_mask_takes():
     near, far = 5.0, 50.0
     r = np.where(np.arange(512) < 256, near, far) * np.ones((4, *SENSOR.shape))
     lost = rng.random(r.shape) < np.where(r == near, 0.05, 0.25)
-    images = np.where(lost, 0, r)[:, None].astype(np.float32)
-    rate = share(drop_range, images)
+    rate = share(drop_range, np.where(lost, 0, r)[:, None].astype(np.float32))
     bin_of = np.searchsorted(np.geomspace(3, 80, 13), [near, far]) - 1
     assert rate[bin_of] == pytest.approx([0.05, 0.25], abs=0.01)  # deviations of 32,768 draws: 0.0012 and 0.0024
     # between them there are but gaps across the edge, at 27.5 m: nothing that is not lost

@@ -32,8 +32,7 @@ def test_draws_have_the_moments_of_their_distribution(draw, mean, deviation, fou
 
 
 def test_the_smooth_step_rises_from_0_to_1_like_a_logistic():
-    x = np.array([-3.0, 0.0, 3.0])
-    np.testing.assert_array_equal(logistic(x), [0, 0.5, 1])
+    np.testing.assert_array_equal(logistic(np.array([-3.0, 0.0, 3.0])), [0, 0.5, 1])
     assert ((logistic(np.array([1e-4])) - logistic(np.array([-1e-4]))) / 2e-4)[0] == pytest.approx(0.25, abs=1e-6)
 
 

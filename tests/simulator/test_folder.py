@@ -33,8 +33,7 @@ def test_files_hold_what_the_simulator_draws(tmp_path):
     labels = np.fromfile(folder.folder / "000006.label", "<u4")
     assert len(labels) == len(points.xyz) == (scan.image[0] > 0).sum()
     np.testing.assert_allclose(project(points.xyz, points.reflectance, SMALL), scan.image, atol=1e-5)
-    back = project(points.xyz, labels.astype(np.float32), SMALL)[1]
-    np.testing.assert_array_equal(back, scan.labels)
+    np.testing.assert_array_equal(project(points.xyz, labels.astype(np.float32), SMALL)[1], scan.labels)
 
 
 def test_a_folder_of_another_seed_or_sensor_is_refused(tmp_path):

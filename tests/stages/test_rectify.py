@@ -114,8 +114,7 @@ def test_the_paper_s_loss_and_times_are_the_defaults():
     stage = Reflow(affine())
     # Most of the U-shaped density lies at the ends: e^(4t) + e^(4(1 - t)) puts 2 e^2 sinh(1) / (e^4 - 1) = 0.324 inside
     # (1/4, 3/4), where a uniform one has 0.5.
-    u = torch.linspace(0, 1, 20001)[:-1]
-    t = stage.time(u)
+    t = stage.time(torch.linspace(0, 1, 20001)[:-1])
     assert ((t > 0.25) & (t < 0.75)).float().mean().item() == pytest.approx(0.324, abs=2e-3)
     r = torch.full((256, 1, 2, 2), 0.3)
     c = 0.00054 * 4**0.5
