@@ -112,6 +112,7 @@ class Generator(nn.Module):
 
         Args:
             noise: (B, *noise_shape).
+            sampler: Sampler; None: the default.
             draws: Source of the noise of stochastic samplers: `draws.step(shape, j)` at step j = 1, 2, ...
             precision: `bf16-mixed` runs the network's matrix products in bfloat16; states and steps keep their type.
             progress: Called after every network evaluation.

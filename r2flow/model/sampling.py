@@ -53,11 +53,13 @@ def sample(
     """Draw scans 0 to num - 1 of a seed, batch by batch, and warn of those that are not solved.
 
     Args:
+        source: A checkpoint or its generator.
         sampler: Sampler or its name; None: the generator's default.
         batch_size: Scans per batch. It does not change a fixed-step result beyond rounding.
         condition: Condition of the scans, each tensor (num, ...).
         region: Region of the image to generate. The network sees `evaluated_region` only, with the same noise as in the
             whole image.
+        precision: Precision of the network, see `Generator.forward`.
         progress: Called after every network evaluation of a batch.
         changes: Fields of the sampler: steps, tolerance, grid, ...
 
