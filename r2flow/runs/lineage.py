@@ -35,7 +35,7 @@ def find_parent(init: str | Path | None) -> Parent | None:
         return None
     checkpoint = load_checkpoint(str(init))
     wanted = checkpoint.config.get("trainer", {}).get("max_steps", 0)
-    if Path(init).expanduser().is_dir() and name_of(checkpoint.path) is None and checkpoint.step < wanted:
+    if Path(str(init)).expanduser().is_dir() and name_of(checkpoint.path) is None and checkpoint.step < wanted:
         raise InputError(
             f"{init} has stopped at step {checkpoint.step} of {wanted}: finish it, or name the checkpoint to start "
             f"from, {checkpoint.path}."

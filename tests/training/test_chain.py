@@ -127,12 +127,12 @@ def test_a_child_that_cannot_be_is_refused_in_one_line(chained, tmp_path, overri
 
 
 def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple[Path, str], tmp_path: Path):
-    parent = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "parent"))
+    parent = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "2011"))
     shutil.rmtree(parent / "pairs")
     last, before = checkpoints_of(parent)
     last.unlink()
     options = ["experiment=reflow", "data.pairs.num=4", "data.pairs.batch_size=4", "trainer.max_steps=2"]
-    done = in_process(tmp_path, of_a_child(*options, f"stage.init={parent}"), check=False)
+    done = in_process(tmp_path, of_a_child(*options, "stage.init=2011"), check=False)
     assert "has stopped at step 6 of 8: finish it, or name the checkpoint" in done.refusal
     in_process(tmp_path, of_a_child(*options, f"stage.init={before}"))
     assert (parent / "pairs" / "manifest.json").is_file()
