@@ -48,6 +48,10 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
             if errors:
                 raise errors[0]
             return max(codes, default=0)
+    except SystemExit as end:
+        if end.code:
+            raise
+        return 0  # of Hydra after --help
     except JobEnded as error:
         # A remote launcher raises the first only.
         jobs = [job.args for job in errors or [error] if isinstance(job, JobEnded)]
