@@ -45,8 +45,8 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
     try:
         with listening(signal.SIG_IGN, ignored):
             _run_hydra(_parsed(_with_plugins(arguments, plugins) or ["experiment=demo"]), command, codes, errors)
-            if errors:
-                raise errors[0]
+            if errors:  # jobs have printed theirs
+                raise next((error for error in errors if not isinstance(error, JobEnded)), errors[0])
             return max(codes, default=0)
     except SystemExit as end:
         if end.code:
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
         return 0  # of Hydra after --help
     except JobEnded as error:
         # A remote launcher raises the first only.
-        jobs = [job.args for job in errors or [error] if isinstance(job, JobEnded)]
+        jobs = [job.args for job in errors or [error]]
         failed = [folder for code, folder in jobs if code != LATER]
         number, names = (len(failed or jobs) if errors else "some"), "; ".join(failed or [folder for _, folder in jobs])
         if failed:

@@ -27,7 +27,6 @@ def qkv(rows: int, columns: int, batch: int = 2, heads: int = 2, channels: int =
 
 
 def by_loops(q: Tensor, k: Tensor, v: Tensor, window: tuple[int, int], wrap: bool) -> Tensor:
-    """The definition, one token at a time."""
     _, rows, columns, _, _ = q.shape
     height, width = min(window[0], rows), window[1] if wrap else min(window[1], columns)
     out = torch.empty_like(q)

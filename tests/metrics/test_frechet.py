@@ -14,7 +14,6 @@ from tests.metrics.conftest import Summary, measured, scans_of
 
 
 def positive(d, seed, rank=None):
-    """A random symmetric matrix without negative eigenvalues."""
     a = torch.randn(d, rank or d, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return a @ a.T / d
 

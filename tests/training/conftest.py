@@ -69,7 +69,6 @@ def tiny(scans: Path, *overrides: str) -> list[str]:
 
 
 def quickly(run: Callable[[], int | None]) -> Done:
-    """A command in this process; its pictures are drawn quickly."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the processes of `start`, which are to end with the same bits
     try:

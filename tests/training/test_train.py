@@ -8,6 +8,7 @@ import shutil
 import signal
 import warnings
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -189,7 +190,7 @@ def test_a_sweep_runs_every_job_and_reports_the_failed(train: Run, tmp_path: Pat
     assert "mse" in finished.parent.name
 
 
-def test_a_sweep_whose_jobs_reach_their_time_goes_on_with_the_same_command(train: Run, tmp_path: Path):
+def test_a_sweep_whose_jobs_reach_their_time_goes_on_with_the_same_command(train: Run, tmp_path: Path, monkeypatch):
     job = "seed=1,2", "trainer.max_time=00:00:00:00", "trainer.max_steps=3", "samples.num=0"
     done = train(*job, check=False, flags=("-m",))
     assert done.returncode == LATER
@@ -199,6 +200,8 @@ def test_a_sweep_whose_jobs_reach_their_time_goes_on_with_the_same_command(train
     mixed = train(*job, "stage.loss=mse,nonsense", check=False, flags=("-m",))
     assert mixed.returncode == 2
     assert "2 of the sweep's jobs failed" in mixed.stderr
+    monkeypatch.setattr("r2flow.runs.chain.run_process", Mock(side_effect=[LATER, MemoryError]))
+    assert "the memory has no room" in in_process(tmp_path, ["-m", "seed=1,2"], check=False).refusal
 
 
 @pytest.mark.parametrize("option", ["run_dir=here", "run_dir=a,b", "name=here"])
