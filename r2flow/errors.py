@@ -44,7 +44,7 @@ def check_folder(folder: Path) -> None:
     check(usable, f"{there} is not a folder that can be written to; give another one.")
 
 
-# System errors that a user can fix; others (a lost connection, a broken pipe) keep their traceback.
+# System errors of files and disks, for the user to act on; others (a lost connection) keep their traceback.
 MENDABLE = {
     errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP, errno.ESTALE, errno.EIO,

@@ -12,7 +12,8 @@ def prepare_process() -> None:
     """Keep freed memory, let waiting threads sleep earlier, draw into files alone; call before importing torch.
 
     By default glibc returns each freed block of 32 MiB or more, and the kernel clears new pages for the next one. Here
-    blocks of up to 1 GiB come from the heap, which keeps up to 2 GiB. Settings of the user take precedence.
+    blocks of up to 1 GiB come from the heap, which keeps up to 2 GiB. The user's settings (MALLOC_MMAP_...,
+    MALLOC_TRIM_..., GOMP_SPINCOUNT) take precedence.
     """
     os.environ["MPLBACKEND"] = "agg"  # a notebook's shell has the notebook's, which may not be installed here
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # 1.4 to 2.5 times faster next to other programs
