@@ -64,6 +64,8 @@ interpolate scans/000000.bin bad.bin -c run -o out
 interpolate scans scans -c run -o out # scan
 show file.txt -o out
 show scans -o out.png
+show scans/000000.bin -o scans --format npy # in the folder of the scans
+show scans -o scans/images --format npy # in the folder of the scans
 show scans -o out --projection unfolding
 show run -o out # a run without samples
 show street -o out # sample it first: r2flow sample street --out scans

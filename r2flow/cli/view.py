@@ -32,11 +32,16 @@ def show(
     ] = "png",
 ) -> None:
     """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write range images."""
+    from r2flow.data.opening import FOLDER, parse
     from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure
     from r2flow.reports.view.panels import one_scale, scan_panels
 
     check(out.suffix.lower() not in (".png", ".pdf", ".npy"), f"--out is a folder, for a file per scan; found {out}.")
+    for options, file in map(parse, scans) if format == "npy" else ():
+        given, folder = options.folder.resolve(), out.resolve()
+        inside = folder == given or (file is None and given in folder.parents)  # whose scans include all below
+        check(not inside or options.name != FOLDER, f"{out} is in the folder of the scans; give another --out.")
     names: list[str] = []
     readings = one_scale({spec: how.reading([spec], estimate_scale=True) for spec in scans}, most)
     panels = (panel for spec in scans for panel in scan_panels(spec, readings[spec], most, labelled=False))

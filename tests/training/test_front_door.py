@@ -62,7 +62,6 @@ REFUSED = {
     "=3": "names no key",
     "--foo": "unrecognized arguments: --foo; see --help",
     "seed=1,2": "seed=1,2 is several values: for a sweep add -m, for a list give seed=[1,2].",
-    # What would be passed over.
     "data=folder & data.root=. & data.scenes=5": "no simulated scenes: leave data.scenes out",
     "data=mixed & data.parts=[{name: simulated}] & data.split=train": "has its own: leave data.split",
     "data.pairs.num=5": "data.pairs.num are of data=pairs, found data=simulated",
