@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock
 from scipy.spatial import cKDTree
 
 from r2flow import noise
@@ -30,7 +31,7 @@ from r2flow.progress import Bar, track
 from r2flow.reports.outputs import recipe_of
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import Panel, write_page
-from r2flow.store import Store, read_manifest
+from r2flow.store import Store, manifest_of, read_manifest
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,10 @@ def write_completed(
                 precision=job.precision, progress=bar.evaluated,
             )  # fmt: skip
             if not done:  # the first answer shows that the settings are valid
-                store.write_manifest(inputs={**before, **inputs})
+                out.mkdir(parents=True, exist_ok=True)
+                with FileLock(out / ".answers.lock") as lock:  # commands for other scans add theirs at the same time
+                    store.write_manifest(inputs={**manifest_of(out).get("inputs", {}), **inputs})
+                    Path(lock.lock_file).unlink(missing_ok=True)
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed, whole if job.mask else None)
             _write(checkpoint, scan, out, files[scan.name], given, completed)

@@ -57,7 +57,6 @@ def test_a_scene_that_has_arrived_is_not_evaluated():
     solution = solve(Watched([Straight()] * 3 + [TwoModes()]), noise(4), method="dopri5", tolerance=1e-4)
     assert seen[0] == 4
     assert seen[-1] == 1
-    # Rows seen by the network are what is counted, and nothing else is.
     assert sum(seen) == solution.evaluations.sum().item()
 
 

@@ -70,7 +70,6 @@ REFUSED = {
     "preview=street": "preview is of a chain of runs",
     "trainer.limit_test_batches=3": "no key 'trainer.limit_test_batches'",
     "+stage.batch_size=9": "stage.batch_size is the run's: leave it out, and give data.batch_size",
-    # What a name, a size or a number does not fit; several words apart.
     "bakcbone.base_channels=8": "no key 'bakcbone.base_channels' | Did you mean 'backbone.base_channels'?",
     "backbone=hditt": "no backbone config named 'hditt' | Did you mean 'hdit'?",
     "expriment=r2dm": "no key 'expriment' | Did you mean 'experiment'?",
