@@ -44,7 +44,6 @@ def test_a_path_that_is_not_finite_is_not_the_most_curved():
 
 
 def test_a_network_that_can_learn_is_followed_too():
-    """Nothing is kept for a gradient."""
     layer = torch.nn.Linear(8, 8, dtype=torch.float64)
     assert not any(part.requires_grad for part in straightness(lambda t, x: layer(x), X_0, 4, most_curved=1))
 
