@@ -174,7 +174,7 @@ class TestReflectance:
 
 
 def test_a_broken_link_is_not_suggested_for_itself(tmp_path: Path):
-    (tmp_path / "b.bin").symlink_to("/nonexistent")
+    (tmp_path / "b.bin").symlink_to(tmp_path / "gone")
     (tmp_path / "loop").symlink_to("loop")
     assert not made_here(tmp_path)
     with pytest.raises(InputError, match=r"b\.bin is a broken link\. Give a scan file.* or a run\.$"):
