@@ -39,8 +39,8 @@ def show(
 
     check(out.suffix.lower() not in (".png", ".pdf", ".npy"), f"--out is a folder, for a file per scan; found {out}.")
     for options, file in map(parse, scans) if format == "npy" else ():
-        given, folder = options.folder.resolve(), out.resolve()
-        inside = folder == given or (file is None and given in folder.parents)  # whose scans include all below
+        source, target = options.folder.resolve(), out.resolve()
+        inside = source == target or (file is None and source in target.parents)  # a set includes all folders below
         check(not inside or options.name != FOLDER, f"{out} is in the folder of the scans; give another --out.")
     names: list[str] = []
     readings = one_scale({spec: how.reading([spec], estimate_scale=True) for spec in scans}, most)

@@ -39,7 +39,7 @@ def hypotenuse(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @cache
 def _normal_quantiles() -> np.ndarray:
-    return np.array([NormalDist().inv_cdf((k + 0.5) / _ENTRIES) for k in range(_ENTRIES)], np.float32)
+    return np.array([*map(NormalDist().inv_cdf, ((np.arange(_ENTRIES) + 0.5) / _ENTRIES).tolist())], np.float32)
 
 
 @cache
