@@ -83,11 +83,11 @@ class Sampler(ABC):
 
     def check(self, generator: Any) -> None:
         """Refuse a generator that the sampler cannot run."""
+        drawn, kind = getattr(generator, "draws", True), type(generator).__name__
         if getattr(generator, self.needs, None) is None:
-            kind = type(generator).__name__
-            drawn = getattr(generator, "draws", True) or generator.told
-            check(drawn, f"a {kind} draws no scans: give a model that draws its latents, such as a latent diffusion.")
+            check(drawn or generator.told, f"a {kind} draws no scans: give a model of its latents, a latent diffusion.")
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}; a {kind} has none.")
+        check(drawn or not self.draws, f"{self.name} adds noise of N(0, 1), a {kind} starts from other: give jump.")
         if getattr(generator, "fixed", False) and self != generator.sampler:
             raise InputError(f"this model is distilled for {generator.sampler} alone: leave sampler and steps out.")
 

@@ -40,9 +40,6 @@ def numbered(shape: tuple[int, ...]):
     return lambda j: randn(*shape, seed=100 + j)
 
 
-# What is measured
-
-
 def test_the_linear_system_is_solved_by_conjugate_gradients():
     """Against their definition: of all x in the directions, the least of x S x / 2 - r x."""
     spread = ring() + 0.1 * torch.eye(WIDTH).double()

@@ -60,7 +60,7 @@ def answered(flow: TransferFlow, images: torch.Tensor, state: torch.Tensor, samp
     return flow(draws.start(flow.noise_shape), condition, sampler=build_sampler(sampler), draws=draws, **how)
 
 
-@pytest.mark.parametrize("sampler", ["jump:steps=1", "jump:steps=4", "euler:steps=3", "sde:steps=3"])
+@pytest.mark.parametrize("sampler", ["jump:steps=1", "jump:steps=4", "euler:steps=3", "sde:steps=3:churn=0"])
 @pytest.mark.parametrize("mask", ["rows:4", "points:0.3"])
 def test_known_rays_come_back_to_the_bit_and_the_others_within_the_sensor(flow, scans, sampler, mask):
     state = measured(scans, mask)
@@ -383,5 +383,8 @@ def test_a_stage_that_tells_nothing_refuses_it(other):
 def test_it_draws_nothing_from_noise_alone_and_needs_a_backbone_for_any_size(flow):
     with pytest.raises(InputError, match="completes scans"):
         flow(torch.zeros(1, 2, 8, 32))
+    for sampler in ("sde", "renoise", "refine"):  # their noise has deviation 1, that of x_0 is sigma
+        with pytest.raises(InputError, match=r"N\(0, 1\).*give jump"):
+            build_sampler(sampler).check(flow)
     with pytest.raises(InputError, match="backbone=local"):
         built(backbone=tiny_options("hdit"))
