@@ -164,7 +164,7 @@ def rows_at_once(x: Tensor) -> int:
     batch, rows, columns = x.shape[:3]
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or not x.is_cpu:
         return rows
-    return min(rows, max(1, BAND // (batch * columns)))
+    return min(rows, max(1, BAND // max(batch * columns, 1)))
 
 
 def in_bands(f: Callable[..., tuple[Tensor, ...]], *maps: Tensor) -> tuple[Tensor, ...]:

@@ -89,9 +89,6 @@ def test_behind_a_direction_that_is_not_positive_nothing_is_searched():
         torch.testing.assert_close(later, found[first - 1])
 
 
-# The velocities given a measurement
-
-
 @pytest.mark.parametrize("t", [0.2, 0.9])
 def test_mmps_has_the_posterior_s_own_velocity_on_any_gaussian(t):
     prior, case = gaussian(), Case(ROWS)
