@@ -129,7 +129,7 @@ class Repaint(Posterior):
 class MMPS(Posterior):
     """Moment matching posterior sampling (Rozet et al. 2024): posterior mean by the flow's covariance.
 
-    Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J with J = d x_1hat / d x_t, the second-order Tweedie formula, so that
+    Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J with J = d x_1hat / d x_t, the second-order Tweedie formula of a 1-RF: then
     E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T)^-1 (y - A x_1hat), which is exact if x_1 is Gaussian given x_t. Conjugate
     gradients (`_solved`) solve the linear system with one product with J per iteration; they stop at a direction in
     which C is not positive, which a network does not exclude. `sde` takes the steps with this mean.

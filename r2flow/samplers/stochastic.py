@@ -7,7 +7,7 @@ A flow's state is a mean and noise, x_t = t x_1hat + (1 - t) x_0hat, with
 The ODE keeps its noise; the SDE replaces a part of it. A step from t to s keeps the share e^(-c h) of x_0hat, with the
 log-SNR lambda = 2 log(t / (1 - t)) and h = (lambda_s - lambda_t) / 2 (Song et al. 2021, score-based generative modeling
 through stochastic differential equations; c = tau^2 in Xue et al. 2023, SA-Solver). c = 0 is the ODE, c = 1 the
-reverse-time SDE. For the exact v the distribution of the scans does not depend on c.
+reverse-time SDE. For the exact v of independent x_0 and x_1 (a 1-RF's), the distribution does not depend on c.
 """
 
 import math
