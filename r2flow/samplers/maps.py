@@ -64,7 +64,7 @@ class Chord(Jump):
 class Renoise(Chord):
     """x_s = (1 - s) e + s X_{t->1}(x_t) with fresh noise e (Song et al. 2023, consistency models, algorithm 1).
 
-    If the map is exact and a 1-RF's, not a 2-RF's, x_1 has the right distribution, but is not the end of x_0's path.
+    For the exact map of a 1-RF (not of a 2-RF), x_1 has the right distribution, but is not the end of the path of x_0.
     Without a grid, 1 - t_j is log-spaced from 1 / 2 to 1 / 64 (`late`): fresh noise lets early jumps be corrected.
     """
 
