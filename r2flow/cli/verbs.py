@@ -4,6 +4,7 @@ import logging
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -40,7 +41,7 @@ FULL = ("can't allocate memory", "not enough memory", "out of memory", "failed t
 def run(arguments: Sequence[str], command: Sequence[str]) -> int:
     """Run a verb, with `--plugin MODULE` anywhere; the exit code is 2 for a user error, which prints one line.
 
-    `command` starts the processes of chains and sweeps.
+    `command` starts the processes of chains and sweeps. Shells leave the ~ of --out=~/scans, which is expanded here.
     """
     open_streams()
     handler = logging.StreamHandler()
@@ -49,6 +50,7 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
     try:
         with listening(stop_at_once):
             check("" not in arguments, "an argument is empty; is a variable of the shell not set?")
+            arguments = [re.sub("(?<![^=])~(?=/)", lambda _: str(Path.home()), one) for one in arguments]
             arguments, plugins = take_plugins(arguments)
             load_plugins(plugins)
             if "--version" in arguments and arguments[0] in ("--version", "train"):

@@ -1,8 +1,4 @@
-"""Scans of any sensor as partially measured images of a model's sensor, for `r2flow complete`.
-
-scans, lines = open_partial(["scans"], reading_for([], flow))
-scans[0].read()         image, state, xyz
-"""
+"""Scans of any sensor as partially measured images of a model's sensor, for `r2flow complete`."""
 
 import hashlib
 from collections import Counter

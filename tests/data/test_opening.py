@@ -194,9 +194,6 @@ def test_values_out_of_the_sensor_s_limits_are_dropped_for_a_model_alone(tmp_pat
     assert np.array_equal(seen[1] > 0, seen[0] > 0)
 
 
-# Kinds of scans from outside
-
-
 @pytest.fixture
 def own_table(monkeypatch) -> None:
     monkeypatch.setattr(SOURCES, "_entries", dict(SOURCES._entries))
