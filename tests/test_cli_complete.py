@@ -96,7 +96,7 @@ def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, end
 
 
 def test_a_sparser_sensor_is_found_and_its_points_come_back(complete, tmp_path):
-    xyz = sparse_scan(tmp_path / "in" / "room.pcd")
+    xyz = sparse_scan(tmp_path / "in" / "room.PCD")
     said = complete(tmp_path / "in", "--num", 2).said
     for words in ("vlp16 with 16 beams from +15.1 to -14.9", "6 of the 8 rows", "7 of its 16 beams look past"):
         assert words in said

@@ -126,7 +126,7 @@ def _files(
     def opened(path: Path) -> PartialScan:
         ending = scan_ending(path.name) or path.suffix
         below = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
-        name = str(below.with_name(below.name.removesuffix(ending)))
+        name = str(below)[: len(str(below)) - len(ending)]
         read = partial(read_image if path in images else by_points, path)
         return PartialScan(name, ending, read, path.read_bytes, path, path in images)
 
