@@ -81,7 +81,7 @@ class Store:
                     f"{at_most_three(other)}. Give the same settings, or another folder by {self.option}."
                 )
             return True
-        scan = next((path.name for path in self.folder.glob("*") if path.name.endswith(FIRM_ENDINGS)), None)
+        scan = next((path.name for path in self.folder.glob("*") if path.name.lower().endswith(FIRM_ENDINGS)), None)
         check(not scan, f"{self.folder} holds scans ({scan}) and no {MANIFEST}: give another folder by {self.option}.")
         return False
 

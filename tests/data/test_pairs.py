@@ -172,10 +172,10 @@ def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
 
 
 def test_pairs_are_not_kept_among_scans_or_in_another_store(tmp_path: Path):
-    (tmp_path / "000000.bin").touch()
-    with pytest.raises(InputError, match=r"holds scans \(000000.bin\)"):
+    (tmp_path / "000000.BIN").touch()
+    with pytest.raises(InputError, match=r"holds scans \(000000.BIN\)"):
         store_in(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["000000.bin"]
+    assert [path.name for path in tmp_path.iterdir()] == ["000000.BIN"]
     Store(tmp_path / "prepared", "scans", {}).begin()
     with pytest.raises(InputError, match="holds scans, not pairs"):
         store_in(tmp_path / "prepared")
