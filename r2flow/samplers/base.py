@@ -87,7 +87,7 @@ class Sampler(ABC):
         if getattr(generator, self.needs, None) is None:
             check(drawn or generator.told, f"a {kind} draws no scans: give a model of its latents, a latent diffusion.")
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}; a {kind} has none.")
-        check(drawn or not self.draws, f"{self.name} adds noise of N(0, 1); a {kind} starts from other noise: give jump.")
+        check(drawn or not self.draws, f"{self.name} adds noise of N(0, 1); a {kind} starts from other: give jump.")
         if getattr(generator, "fixed", False) and self != generator.sampler:
             raise InputError(f"this model is distilled for {generator.sampler} alone: leave sampler and steps out.")
 
