@@ -105,7 +105,7 @@ class Refine(Renoise):
             return super().start(generator, noise, condition, progress)
         field, times = generator.field(condition), self.times()[: steps + 1]
         end = solve(field, noise, 0.0, float(times[-1]), method="adams3", steps=steps, grid=times, progress=progress)
-        return steps, end.x, end.converged
+        return steps, end.x, end.converged.to(end.x.device)
 
 
 @dataclass(frozen=True)
