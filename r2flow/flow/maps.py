@@ -152,11 +152,11 @@ def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor
     Zhang et al. 2025, alpha-Flow). rho = 1 is k-TD's regression; rho -> 0 gives MeanFlow.
     """
     x_t, v = interpolate(paths.states[:, 0], paths.states[:, -1], t)
-    target, learned = v.clone(), rho < 1
-    if bool(learned.any()):
+    target, learned = v.clone(), (rho < 1).nonzero()[:, 0]  # the only device synchronisation
+    if len(learned):
         t, s, rho, v = t[learned], s[learned], rho[learned], v[learned]
         ahead, share = rho * (s - t), expand_time(rho, v)
-        u = selected(u, learned.nonzero()[:, 0])
+        u = selected(u, learned)
         with torch.no_grad():
             later = u(t + ahead, x_t[learned] + expand_time(ahead, v) * v, s)
         target[learned] = share * v + (1 - share) * later
