@@ -73,7 +73,7 @@ def sde(estimate: Estimate, x: Tensor, times: Tensor, c: float, noise: Noise | N
     previous: tuple[float, Tensor] | None = None
     for j, (t, s) in enumerate(pairwise(times.tolist()), start=1):
         step = sde_step(t, s, c, None if previous is None else previous[0])
-        x_1 = estimate(torch.tensor(t, dtype=torch.float64).to(x), x)
+        x_1 = estimate(x.new_full((), t), x)
         x = step.keep * x + step.now * x_1
         if previous is not None and step.before:
             x = x + step.before * previous[1]

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, ClassVar
 
 import torch
@@ -76,10 +75,10 @@ class FixedStep:
 
         knots = limits.knots
         alive, inner_states, interval = finite(x), [], (len(times) - 1) // (knots + 1)
-        for n, (t, following) in enumerate(pairwise(times)):
+        for n, (t, h) in enumerate(zip(times[:-1].to(x), times.diff().to(x), strict=True)):  # moved once, not per step
             if knots and n and n % interval == 0:
                 inner_states.append(x)
-            x, alive = stepped(x, step(inside, t.to(x), (following - t).to(x), x), alive)
+            x, alive = stepped(x, step(inside, t, h, x), alive)
         v.accepted[:], v.converged[:] = len(times) - 1, alive.cpu()
         return v.solution(x, torch.stack(inner_states, 1) if knots else None)
 
