@@ -202,9 +202,8 @@ def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_
 
 
 def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, tmp_path: Path):
-    options = PairOptions(
-        sampler={"name": "renoise", "steps": 3, "grid": "power:5"}, num=6, batch_size=2, seed=3, parent="a"
-    )
+    sampler = {"name": "renoise", "steps": 3, "grid": "power:5"}
+    options = PairOptions(sampler=sampler, num=6, batch_size=2, seed=3, parent="a")
     store = PairStore(tmp_path, options, exact.space.shape)
     make_pairs(store, exact)
     mean, std = exact.problem.mean, exact.problem.std
@@ -234,8 +233,7 @@ def test_a_flow_map_learns_a_map_that_it_can_know(objective, monkeypatch):
     torch.manual_seed(0)
     monkeypatch.setattr(LearnFlowMap, "log", lambda *_, **__: None)
     learned = stage(objective=objective)
-    trainer = type("Trainer", (), {"max_steps": 60, "global_step": 30})()
-    monkeypatch.setattr(LearnFlowMap, "trainer", trainer, raising=False)
+    monkeypatch.setattr(LearnFlowMap, "trainer", type("Trainer", (), {"max_steps": 60, "global_step": 30}))
     monkeypatch.setattr(LearnFlowMap, "global_step", 30, raising=False)
     optimizer = torch.optim.AdamW(learned.parameters(), 1e-2)
     learned.train()

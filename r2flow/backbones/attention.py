@@ -126,8 +126,10 @@ def _tile_sees(axis: _Axis, tile: int, keys: Tensor) -> Tensor:
 
 @functools.cache
 def _compiled_flex() -> Callable[..., Tensor]:
+    from torch._functorch import config as functorch
     from torch.nn.attention.flex_attention import flex_attention
 
+    functorch.donated_buffer = False  # else backward passes may not keep the graph, which `mmps` runs twice
     # A graph per level, dtype and mode; beyond the limit, the eager implementation would store all scores.
     config = torch._dynamo.config
     limit = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # name in torch 2.6
@@ -165,8 +167,7 @@ def _flex(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tenso
             f"the window's {columns.span}: use 'auto' or 'tiles'."
         )
     q, k, v = (x.flatten(1, 2).transpose(1, 2) for x in (q, k, v))
-    mask = _flex_mask(rows, columns, q.device)
-    out = _compiled_flex()(q, k, v, block_mask=mask, scale=1.0)
+    out = _compiled_flex()(q, k, v, block_mask=_flex_mask(rows, columns, q.device), scale=1.0)
     return out.transpose(1, 2).unflatten(1, (rows.size, columns.size))
 
 

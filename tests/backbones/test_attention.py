@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.backbones.attention import _Axis, _flex_mask, neighbourhood_attention
+from r2flow.backbones.attention import _Axis, _compiled_flex, _flex_mask, neighbourhood_attention
 from r2flow.errors import InputError
 
 # (rows, columns, window): tiled evenly or not, rings narrower than the window, fewer rows than the window
@@ -56,10 +56,14 @@ def test_tiles_are_the_definition_in_value_and_gradient(rows, columns, window, w
     assert_defined([x.requires_grad_() for x in qkv(rows, columns)], window, wrap, "auto", 1e-12)
 
 
-def test_a_mask_made_while_sampling_serves_training():
+def test_a_mask_made_while_sampling_serves_training_and_a_graph_two_backward_passes():
     with torch.inference_mode():
         mask = _flex_mask(_Axis(6, 3, wrap=False), _Axis(12, 5, wrap=True), torch.device("cpu"))
     assert not mask.kv_indices.is_inference()
+    _compiled_flex()  # its kernels need CUDA, torch's rule for compiled backward passes does not
+    x = torch.rand(3, requires_grad=True)
+    y = torch.compile(lambda x: x.exp().sin(), backend="aot_eager", dynamic=True)(x).sum()
+    assert torch.equal(*(torch.autograd.grad(y, x, retain_graph=True)[0] for _ in range(2)))  # as in `mmps`
 
 
 def test_a_backend_that_cannot_be_had_says_why():
@@ -76,10 +80,9 @@ def test_the_mask_for_flex_shows_what_tiles_see(rows, columns, window, wrap):
     each = torch.eye(count).view(1, rows, columns, 1, count)
     seen = neighbourhood_attention(same, same, each, window, wrap).reshape(count, count) > 0
     tokens = torch.arange(count)
-    zero = torch.zeros((), dtype=torch.long)
     axes = _Axis(rows, window[0], wrap=False), _Axis(columns, window[1], wrap=wrap)
     sees = _flex_mask(*axes, torch.device("cpu")).mask_mod
-    assert torch.equal(sees(zero, zero, tokens[:, None], tokens[None]), seen)
+    assert torch.equal(sees(None, None, tokens[:, None], tokens[None]), seen)
 
 
 @pytest.mark.gpu
