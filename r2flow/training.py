@@ -340,7 +340,7 @@ def _result(run: Run, step: int, finished: bool) -> Result:
 @contextmanager
 def _quiet(repeated: bool = True) -> Iterator[None]:
     """Suppress Lightning's messages, its warnings about intended choices, and logs that further devices repeat."""
-    levels = dict.fromkeys(("lightning.pytorch.utilities.rank_zero", "lightning.fabric"), logging.WARNING)
+    levels = dict.fromkeys(("lightning.pytorch", "lightning.fabric"), logging.WARNING)
     if getattr(rank_zero_only, "rank", 0) and repeated:
         levels["r2flow"] = logging.ERROR
     before = {name: logging.getLogger(name).level for name in levels}
