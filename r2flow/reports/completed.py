@@ -169,7 +169,7 @@ def print_completed(done: Mapping[str, np.ndarray | None], out: Path, scans: int
     if errors := [error for error in done.values() if error is not None]:
         (mae, linear), (wrong, wrong_linear) = np.ma.masked_invalid(errors).mean(0).filled(np.nan)
         off = f"MAE {mae:.2f} m ({linear:.2f}) where all return" if np.isfinite(mae) else "no ray returns in all"
-        print(f"on hidden rays of {len(errors)} scan{'s' * (len(errors) > 1)} (linear interpolation in brackets):")
+        print(f"on hidden rays of {len(errors)} scan{'s' * (len(errors) > 1)} (interpolation of 1/range in brackets):")
         print(f"{off}, {wrong:.1%} ({wrong_linear:.1%}) wrong in ray-drop")
 
 
@@ -206,7 +206,7 @@ def _draw(
     write_page(out / f"{scan.name}.html", [Panel(name, image[None], rays) for name, image in named], scan.name)
     spread = completed.spread.numpy() if len(completed.images) > 1 else None
     unknown = given.state == Ray.UNKNOWN
-    linear = [("linear interpolation", interpolated(given.image, ~unknown))] if truth else []
+    linear = [("interpolation of 1/range", interpolated(given.image, ~unknown))] if truth else []
     true = (truth.image, truth.state == Ray.UNKNOWN) if truth else None
     figure = completed_figure([first, *answers[:2], *linear], unknown, rays, scan.name, spread, true)
     save_figure(figure, out / f"{scan.name}.png")
