@@ -37,15 +37,15 @@ class Things(SumMetric):
     - `right angles`: mean of |mean of exp(4 i theta)| over scans with at least 10 square metres of wall, with theta the
       direction of the straightest segment through each wall return, weighted as before. 1 for parallel and
       perpendicular walls; about 0.9 / sqrt(n) for n independent directions.
-    - `poles` per scan: returns above the ground within 20, each less than 0.4 from the next along a ring, as are first
-      and last, are thin if the next return on either side is 1 farther or 1 aside. Such runs, less than 0.4 and up to
-      two rings apart, form a pole (or trunk) if less than 0.6 wide and at least 1 tall, from the edges of rings.
+    - `poles` per scan: returns above the ground within 20, each less than 0.4 in space from the next along a ring, ends
+      less than 0.4 apart, are thin if the next return on either side is 1 farther or 1 aside. Such runs, less than 0.4
+      and up to two rings apart, form a pole if less than 0.6 wide and at least 1 tall, from the edges of rings.
     - `cars` per scan: clusters of returns above the ground, linked to the next return in ring or column if less than
-      0.7 plus a column's width apart. A cluster is car-like if its nearest return is within 20, it starts less than 0.5
-      and ends 1.0 to 2.2 above the ground, at least 1.5 degrees below the image's upper edge, its columns are at least
-      1.2 wide in total, and its bounding rectangle from above is up to 5.5 by 2.4. The rectangle's direction, of 30, is
-      that whose two sides towards the sensor are closest to the returns; half of the returns must be within 0.3. One
-      visible side is enough.
+      0.7 plus a column's width apart in space. A cluster is car-like if its nearest return is within 20, it starts less
+      than 0.5 and ends 1.0 to 2.2 above the ground, at least 1.5 degrees below the image's upper edge, its columns are
+      at least 1.2 wide in total, and its bounding rectangle from above is up to 5.5 by 2.4. The rectangle's direction,
+      of 30, is that whose two sides towards the sensor are closest to the returns; half of the returns must be within
+      0.3. One visible side is enough.
     """
 
     name = "things"
