@@ -16,8 +16,8 @@ Rule = Literal["nearest", "linear", "inverse"]  # inverse: linear in 1 / range
 def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse") -> np.ndarray:
     """Fill the unknown rays of an image, (2 or 1, H, W) float32; an image without known rays is 0.
 
-    Along a column on a plane, such as the ground, 1 / range is nearly linear in elevation. `measured` marks known rays,
-    (H, W) bool. The rule is that of ranges; reflectance is nearest or linear.
+    1 / range is nearly linear in elevation along a column on a plane, such as the ground, and so in the row for even
+    beams. `measured` marks known rays, (H, W) bool. The rule is that of ranges; reflectance is nearest or linear.
     """
     if measured.all() or not measured.any():
         return image * measured
