@@ -239,7 +239,7 @@ def explain(error: Exception) -> str:
     if missing := re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL):
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."
     if "'hydra/launcher/submitit" in text:
-        return "this launcher needs an extra of the project: python -m pip install -e '.[slurm]'"
+        return "this launcher needs an extra of the project: python -m pip install 'r2flow[slurm]'."
     if choice := re.search(r"Could not find '((?:hydra/)?[^/']+)/([^']+)'", text):
         group, name, names = *choice.groups(), choices(choice[1])
         hint = f" For your own configs, also files in a sweep, give --config-dir FOLDER, with FOLDER/{group}/NAME.yaml."

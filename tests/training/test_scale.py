@@ -229,7 +229,7 @@ def test_what_is_queued_again_is_named_as_scontrol_names_it(variables: dict[str,
 
 def test_a_launcher_that_is_not_installed_says_how_to_get_it(tmp_path: Path):
     done = in_process(tmp_path, ["-m", "hydra/launcher=submitit_of_tomorrow", "seed=1,2"], check=False)
-    assert "pip install -e '.[slurm]'" in done.refusal
+    assert "pip install 'r2flow[slurm]'." in done.refusal
 
 
 @pytest.mark.slow
