@@ -1,9 +1,11 @@
 """The returns that a sensor reports: noise, lost pulses, reflectance, the image."""
 
+import math
 from functools import cache
 
 import numpy as np
 
+from r2flow.lidar.projection import nearest, scatter
 from r2flow.lidar.sensors import Sensor
 from r2flow.simulator.draws import exponentials, logistic, normals
 from r2flow.simulator.lasers import Rays, hidden, rows_of
@@ -101,14 +103,9 @@ def _nearest(
     sensor: Sensor, row: np.ndarray, seen: np.ndarray, r: np.ndarray, reading: np.ndarray, label: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The image of the returns seen, in the rows of their apparent elevations; a pixel keeps the nearest."""
-    h, w = sensor.shape
-    kept = np.flatnonzero(seen & (row >= 0))
-    pixel = (row * w + np.arange(w)).ravel()[kept]
+    kept = np.flatnonzero(seen & (row >= 0))[::-1]  # of equal ranges, the last
+    pixel = (row * sensor.columns + np.arange(sensor.columns)).ravel()[kept]
     r, reading, label = (q.ravel()[kept] for q in (r, reading, label))
-    nearest = np.full(h * w, np.inf, np.float32)
-    np.minimum.at(nearest, pixel, r)
-    first = r == nearest[pixel]
-    pixel = pixel[first]
-    image, labels = np.zeros((2, h * w), np.float32), np.zeros(h * w, np.uint16)
-    image[0, pixel], image[1, pixel], labels[pixel] = r[first], reading[first], label[first]
-    return image.reshape(2, h, w), labels.reshape(h, w)
+    hit, chosen = nearest(pixel, r, math.prod(sensor.shape))
+    image = scatter(sensor, hit, [q[chosen] for q in (r, reading, label)])  # ids are exact in float32
+    return image[:2], image[2].astype(np.uint16)
