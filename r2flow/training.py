@@ -46,7 +46,7 @@ from r2flow.runs.composing import Keys, compose
 from r2flow.runs.folder import check_run, open_run, read_config, run_lock
 from r2flow.runs.lineage import Parent, find_parent, inherit
 from r2flow.signals import LATER, STOPPING, Stopped, listening
-from r2flow.stages import build_stage, check_roll
+from r2flow.stages import build_stage
 from r2flow.stages.base import Stage
 
 __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
@@ -209,7 +209,6 @@ def _assembled(config: dict[str, Any], generator: Generator, asked: Sequence[str
             raise InputError(f"generator {config['generator']['name']} has its own network: leave {wrong[0]} out.")
         config["backbone"] = None
     data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
-    check_roll(data.augment, generator)
     stage = build_stage(config, generator)
     data.further = stage.further
     trainer = _build_trainer(config, stage)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError, check
 from r2flow.generators import Generator
 from r2flow.registry import Registry, lazy
@@ -28,16 +27,6 @@ STAGES: Registry[type[Stage]] = Registry(
 )
 
 
-def check_roll(augment: Augmentation, generator: Generator) -> None:
-    """Refuse rotation augmentation for a generator that learns one vector per direction."""
-    if augment.roll and generator.learns_directions:
-        raise InputError(
-            "data.augment.roll makes all directions alike, but backbone.position=learnable (the paper's APE) learns "
-            "one vector per direction; give backbone.position=none, whose attention sees only differences in azimuth, "
-            "or leave roll out."
-        )
-
-
 def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     """Build the LightningModule of a config's `stage` around a generator; its checkpoints store the config.
 
@@ -53,6 +42,12 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     if not stage.several_sensors and any(part.get("sensor") for part in config["data"].get("parts") or ()):
         raise InputError(f"stage={options['name']} learns from scans of one sensor: leave sensor out of data.parts.")
     stage.check_data(options["name"], config["data"])
+    if (config["data"].get("augment") or {}).get("roll") and generator.learns_directions:
+        raise InputError(
+            "data.augment.roll makes all directions alike, but backbone.position=learnable (the paper's APE) learns "
+            "one vector per direction; give backbone.position=none, whose attention sees only differences in azimuth, "
+            "or leave roll out."
+        )
     sampler, few = generator.choose(**dict(config.get("sampler") or {})), config.get("few")
     if sampler.completes:
         raise InputError(f"sampler.name={sampler.name} completes scans: give it to r2flow complete by --sampler.")
