@@ -4,13 +4,12 @@ An unknown ray is interpolated between known rays of its column or, without know
 is periodic. It returns if the nearest known ray does; its range is interpolated between known returns.
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import Literal
 
 import numpy as np
 
 Rule = Literal["nearest", "linear", "inverse"]  # inverse: linear in 1 / range
+INTERPOLATIONS: dict[str, Rule] = {"nearest": "nearest", "linear": "linear", "linear, 1/r": "inverse"}  # in reports
 
 
 def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse") -> np.ndarray:
@@ -30,13 +29,6 @@ def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse"
         rows = np.flatnonzero(~empty)  # a row without known rays takes the nearest filled row
         filled[:, empty] = filled[:, rows[np.abs(np.flatnonzero(empty)[:, None] - rows).argmin(1)]]
     return filled.astype(np.float32)
-
-
-INTERPOLATIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
-    "nearest": partial(interpolated, rule="nearest"),
-    "linear": partial(interpolated, rule="linear"),
-    "linear, 1/r": interpolated,
-}
 
 
 def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = False) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from r2flow import noise
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
 from r2flow.generators.base import Progress
-from r2flow.lidar.interpolation import INTERPOLATIONS
+from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
 from r2flow.lidar.known import parse_mask, ray_states
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.completion import UNITS, common_mae, errors, spread_errors
@@ -61,8 +61,8 @@ def completion_rows(
         state = ray_states(torch.from_numpy(np.stack(truths)), torch.from_numpy(np.stack(masks)))
         answers: dict[str, list[np.ndarray]] = {}
         cost: dict[str, tuple[float, float]] = {}
-        for name, fill in INTERPOLATIONS.items():
-            answers[name] = [fill(image, mask)[None] for image, mask in zip(given, masks, strict=True)]
+        for name, rule in INTERPOLATIONS.items():
+            answers[name] = [interpolated(image, mask, rule)[None] for image, mask in zip(given, masks, strict=True)]
         for name, (checkpoint, sampler) in ways.items():
             how: Any = {"sampler": sampler, "batch_size": batch_size, "progress": progress}
             results = list(complete(checkpoint, images, state, num, seed, **how))
