@@ -50,7 +50,7 @@ class Boxes(NamedTuple):
     top: Column
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
-        return _upright(self, rays, *_box_spans(self, rays))
+        return _upright(self, rays, *_box_spans(self, rays)[:4])
 
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
         return Frusta(*self, *[np.zeros_like(self.x)] * 3).normal(k, x, y, z)  # upright
@@ -82,12 +82,10 @@ class Frusta(NamedTuple):
 
     def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
         """Each ray in a solid's bounding box is clipped by the solid's leaning sides, top and bottom."""
-        k, w, near, far = _box_spans(self, rays)
+        k, _, near, far, *_ = spans = _box_spans(self, rays)
         n, b = row_windows(rays, near, far, self.bottom[k], self.top[k])
-        k, w, near, far = k[n], w[n], near[n], far[n]
+        k, w, near, far, u, v, du, dv = (q[n] for q in spans)
         slope, rise = rays.slope[b], rays.height[b] - self.bottom[k]
-        u, v, c, s = _into(self, k, np.float32(0), np.float32(0))
-        du, dv = rays.cos[w] * c + rays.sin[w] * s, rays.sin[w] * c - rays.cos[w] * s
         for a, bb, lean, reach in self._planes(k):
             near, far = _clip(near, far, a * du + bb * dv + lean * slope, reach - a * u - bb * v - lean * rise)
         near, far = _clip(near, far, slope, self.top[k] - self.bottom[k] - rise)
@@ -198,7 +196,7 @@ def _into(solids: "Boxes | Frusta", k: np.ndarray, x: Column, y: Column) -> tupl
 
 
 def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
-    """Distances at which columns w enter and leave the footprints of solids k: k, w, near < far in metres."""
+    """Columns w in footprints of solids k: k, w, near < far in metres; origin and direction in the solid's frame."""
     k, w = _crossed(solids, hypotenuse(solids.length, solids.width) / 2, rays)
     u, v, c, s = _into(solids, k, np.float32(0), np.float32(0))
     a, b = solids.length[k] / 2, solids.width[k] / 2
@@ -209,7 +207,7 @@ def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
         low, high = (-reach - position) / direction, (reach - position) / direction
         near, far = np.maximum(near, np.minimum(low, high)), np.minimum(far, np.maximum(low, high))
     met = near < far
-    return k[met], w[met], near[met], far[met]
+    return tuple(q[met] for q in (k, w, near, far, u, v, du, dv))
 
 
 def _crossed(solids: Shape, radius: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
