@@ -51,9 +51,8 @@ class Reading:
     @classmethod
     def of(cls, described: Mapping[str, Any]) -> "Reading":
         """The reading of a manifest; missing fields have their defaults."""
-        plain: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in described["sensor"].items()}
         columns = described.get("columns")
-        return cls(**{**described, "sensor": Sensor(**plain), "columns": columns and tuple(columns)})
+        return cls(**{**described, "sensor": Sensor(**described["sensor"]), "columns": columns and tuple(columns)})
 
     @classmethod
     def stored(cls, folder: str | Path) -> "Reading | None":

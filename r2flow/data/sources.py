@@ -10,7 +10,6 @@ import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -184,7 +183,7 @@ class ScanFiles(ScanSource):
         return {**self.described, "files": self._digest[:12], "reflectance": bool(self.reading.reflectance)}
 
     def identity(self) -> dict[str, Any]:
-        return {"files": self._digest, **asdict(self.reading), "sensor": self.reading.sensor.described()}
+        return {"files": self._digest, **self.reading.described()}
 
     @cached_property
     def _digest(self) -> str:
