@@ -4,14 +4,12 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Literal, get_args
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError, check
 from r2flow.flow.solvers.solution import wide
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Ray
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
@@ -27,8 +25,7 @@ IMAGE, KNOWN = "image", "known"  # keys of the condition of a partial scan
 def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
     """Condition of partial scans: `image` and `known`, each (B, C, H, W) in model space.
 
-    `known` is 1 for measured values. Elsewhere `image` is interpolated (`r2flow.lidar.interpolation.interpolated`), or
-    0 if the scan has no measured ray.
+    `known` is 1 for measured values; `image` is 0 for rays that were not measured.
 
     Args:
         images: Range in metres and optionally reflectance, (B, 2 or 1, H, W); 0 without a return. Without the
@@ -48,13 +45,11 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
                          "and Ray.UNKNOWN for a ray that was not measured.")  # fmt: skip
     encoding = space.encoding
     without_reflectance = encoding.reflectance and images.shape[1] == 1
-    guesses = np.stack([interpolated(x, m) for x, m in zip(images.cpu().numpy(), measured.cpu().numpy(), strict=True)])
-    filled = torch.where(measured[:, None], images, torch.from_numpy(guesses).to(images))
-    image = encoding.encode(torch.cat([filled, torch.zeros_like(filled)], 1) if without_reflectance else filled)
+    image = encoding.encode(torch.cat([images, torch.zeros_like(images)], 1) if without_reflectance else images)
     known = measured[:, None].expand_as(image).to(image)
     if without_reflectance:
         known[:, -1] *= ~returned
-    return {IMAGE: image * measured.flatten(1).any(1)[:, None, None, None], KNOWN: known}
+    return {IMAGE: torch.where(measured[:, None], image, 0), KNOWN: known}
 
 
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[Any]:
