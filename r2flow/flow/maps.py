@@ -40,13 +40,11 @@ class Paths:
 
     def at(self, t: Tensor) -> Tensor:
         """x_t, (B, ...), at times t, (B,)."""
-        first, weights, _ = self._weights(t)
-        return self._sum(first, weights)
+        return self._coefficient(0, t)
 
     def velocity(self, t: Tensor) -> Tensor:
         """dx_t / dt, (B, ...)."""
-        first, _, slopes = self._weights(t)
-        return self._sum(first, slopes)
+        return self._coefficient(1, t)
 
     def mean_velocity(self, t: Tensor, s: Tensor) -> Tensor:
         """(x_s - x_t) / (s - t), (B, ...); the velocity where s = t."""
@@ -55,30 +53,15 @@ class Paths:
         mean = between / expand_time(torch.where(differ, s - t, 1), between)
         return mean if bool(differ.all()) else torch.where(expand_time(differ, mean), mean, self.velocity(t))
 
-    def _weights(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Index of the first of n nearest knots, (B,), and the knots' weights in x_t and in dx_t / dt, (B, n) each."""
-        times, n = self.times, min(NEAREST, len(self.times))
-        t = t.double()
+    def _coefficient(self, power: int, t: Tensor) -> Tensor:
+        """Coefficient of (t' - t)^power, (B, ...), of the polynomials in t' through the n knots nearest to t, (B,)."""
+        times, n, t = self.times, min(NEAREST, len(self.times)), t.double()
         interval = torch.searchsorted(times[1:-1].contiguous(), t.contiguous(), right=True)
         first = (interval - (n // 2 - 1)).clamp(0, len(times) - n)
-        nodes = times[first[:, None] + torch.arange(n, device=t.device)]
-        values, slopes = [], []
-        for i in range(n):
-            others = [j for j in range(n) if j != i]
-            scale = torch.stack([nodes[:, i] - nodes[:, j] for j in others]).prod(0)
-            factors = torch.stack([t - nodes[:, j] for j in others])
-            values.append(factors.prod(0) / scale)
-            without = [torch.cat([factors[:j], factors[j + 1 :]]).prod(0) for j in range(len(others))]
-            slopes.append(torch.stack(without).sum(0) / scale)
-        return first, torch.stack(values, 1), torch.stack(slopes, 1)
-
-    def _sum(self, first: Tensor, weights: Tensor) -> Tensor:
-        rows = torch.arange(len(first), device=first.device)
-        total = torch.zeros_like(self.states[:, 0])
-        for i in range(weights.shape[1]):
-            state = self.states[rows, first + i]
-            total = total + expand_time(weights[:, i].to(state), state) * state
-        return total
+        near = first[:, None] + torch.arange(n, device=t.device)
+        weights = torch.linalg.inv(torch.linalg.vander(times[near] - t[:, None]))[:, power].to(self.states)
+        states = self.states[torch.arange(len(t), device=t.device)[:, None], near]
+        return (weights.reshape(*near.shape, *[1] * (states.ndim - 2)) * states).sum(1)
 
 
 class JumpTimes:
