@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -139,14 +140,7 @@ class Adams3:
 
 
 def weights(nodes: Sequence[float], start: float, end: float) -> list[float]:
-    """w such that sum w_i f_i is the integral from start to end of the polynomial through (nodes_i, f_i).
-
-    Valid for up to 4 nodes: two-point Gauss-Legendre quadrature is exact for cubic polynomials.
-    """
-    middle, half = (start + end) / 2, (end - start) / 2
-    points = (middle - half / math.sqrt(3), middle + half / math.sqrt(3))
-
-    def basis(i: int, t: float) -> float:
-        return math.prod((t - other) / (nodes[i] - other) for j, other in enumerate(nodes) if j != i)
-
-    return [half * sum(basis(i, t) for t in points) for i in range(len(nodes))]
+    """w such that sum w_i f_i is the integral from start to end of the polynomial through (nodes_i, f_i)."""
+    powers = np.arange(1, len(nodes) + 1)
+    basis = np.vander(np.subtract(nodes, start), increasing=True)
+    return np.linalg.solve(basis.T, (end - start) ** powers / powers).tolist()
