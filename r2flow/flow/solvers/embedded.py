@@ -1,6 +1,5 @@
 """Tableaus of embedded Runge-Kutta methods."""
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -44,12 +43,10 @@ class EmbeddedMethod:
     @property
     def third_difference(self) -> tuple[float, ...]:
         """Weights of the stages that annihilate quadratic functions of t, normalised to a largest weight of 1."""
-        times = [(0.0, *self.nodes)[i] for i in self.rough]
-        weights = [1 / math.prod(c - other for other in times if other != c) for c in times]
-        result = [0.0] * (len(self.nodes) + 1)
-        for i, weight in zip(self.rough, weights, strict=True):
-            result[i] = weight / max(map(abs, weights))
-        return tuple(result)
+        times, rough = np.array((0.0, *self.nodes)), list(self.rough)
+        weights = np.zeros_like(times)
+        weights[rough] = np.linalg.inv(np.vander(times[rough], increasing=True))[-1]
+        return tuple((weights / np.abs(weights).max()).tolist())
 
     def interpolant(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """w_i and dw_i / dtheta of x + h sum_i w_i(theta) k_i, each (stages + 1, B).

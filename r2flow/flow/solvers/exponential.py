@@ -204,8 +204,7 @@ class _Krylov:
         augmented = torch.zeros(m + order, m + order, dtype=torch.float64)
         augmented[:m, :m] = h * torch.from_numpy(self.matrix[:m, :m])
         augmented[0, m] = 1
-        for i in range(m, m + order - 1):
-            augmented[i, i + 1] = 1
+        augmented[m:-1, m + 1 :] = torch.eye(order - 1)
         return torch.linalg.matrix_exp(augmented)[:m, -1].numpy()
 
     def combination(self, order: int, h: float) -> np.ndarray:
