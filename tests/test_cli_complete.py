@@ -224,7 +224,7 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
     full_scan(tmp_path / "b" / f"two{ending}", 0)
     (tmp_path / "b" / f"one{ending}").unlink()
     assert "1 scan written" in complete(tmp_path / "b", *asked)[1]
-    answer, both = completed.complete, tmp_path / "both"
+    answer, both, last = completed.complete, tmp_path / "both", tmp_path / "last"
     other = [lambda: complete(tmp_path / "b", *asked, out=both)]  # a command that begins and ends meanwhile
     monkeypatch.setattr(completed, "complete", lambda *a, **how: (other and other.pop()(), answer(*a, **how))[1])
     assert [complete(tmp_path / drive, *asked, out=both)[0] for drive in "aab"] == [0, 0, 0]
@@ -233,6 +233,8 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
 def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path, monkeypatch):
     monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))  # no pause
     for place, number in enumerate([0, 1, 0, 1]):
+    other = [lambda: complete(tmp_path / "b", *asked, out=last)]
+    assert "holds other answers: seed" in complete(tmp_path / "a", *asked, "--seed", 1, out=last).refusal
         full_scan(tmp_path / "scans" / f"{place}.npy", number)
     given = prepare_folder(tmp_path / "scans", tmp_path / "prep", SENSOR)
     asked = given, "--mask", "rows:2", "--scans"

@@ -31,7 +31,7 @@ from r2flow.progress import Bar, track
 from r2flow.reports.outputs import recipe_of
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import Panel, write_page
-from r2flow.store import Store, manifest_of, read_manifest
+from r2flow.store import Store, manifest_of
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,11 @@ def write_completed(
             raise InputError(f"{out} is the folder of the scans; give another --out.")
     settings = {"num": job.num, "fill_gaps": job.fill_gaps, **about, "precision": job.precision}
     store = Store(out, "answers", recipe_of(checkpoint, job.seed, sampler, completion=settings))
-    before: dict[str, str] = read_manifest(out, store.kind)["inputs"] if store.check() else {}
+    store.check()
+    before = manifest_of(out)
     inputs = {scan.name: scan.identity() for scan in track(scans, "hashing", "scans")}
     for name, paths in files.items():
-        if before.get(name) != inputs[name] and any(path.exists() for path in paths):
+        if before.get("inputs", {}).get(name) != inputs[name] and any(path.exists() for path in paths):
             raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, np.ndarray | None] = {}
@@ -93,7 +94,9 @@ def write_completed(
             if not done:  # the first answer shows that the settings are valid
                 out.mkdir(parents=True, exist_ok=True)
                 with FileLock(out / ".answers.lock") as lock:  # commands for other scans add theirs at the same time
-                    store.write_manifest(inputs={**manifest_of(out).get("inputs", {}), **inputs})
+                    if (now := manifest_of(out)) != before:
+                        store.check()  # one with other settings may have begun meanwhile
+                    store.write_manifest(inputs={**now.get("inputs", {}), **inputs})
                     Path(lock.lock_file).unlink(missing_ok=True)
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed, whole if job.mask else None)
