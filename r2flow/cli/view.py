@@ -89,8 +89,9 @@ def view(
     """
     from r2flow.data.opening import own_reading
     from r2flow.evaluation.sets import is_checkpoint
+    from r2flow.files import write_file
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.reports.view import Panel, write_page
+    from r2flow.reports.view import Panel, page
     from r2flow.reports.view.panels import in_turn, one_scale, sample_panels, scan_panels, way_panels
 
     check(out is None or out.suffix.lower() in (".html", ".htm"), f"--out is a file that ends in .html; found {out}.")
@@ -118,8 +119,9 @@ def view(
         else:
             new = sample_panels(loaded[spec], spec, num or SAMPLES, seed, counts)
         panels += new
-    title = ", ".join(Path(spec).name or spec for spec in what)
-    path = write_page(out or Path(mkdtemp(prefix="r2flow-"), "view.html"), panels, title)
+    content = page(panels, ", ".join(Path(spec).name or spec for spec in what))  # may be refused or stopped
+    path = out or Path(mkdtemp(prefix="r2flow-"), "view.html")
+    write_file(path, content)
     print(path)
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or not sys.platform.startswith("linux")
     if out is None and display:  # without one, a text browser would block the terminal

@@ -223,6 +223,10 @@ class TestTheVerb:
         monkeypatch.setenv("DISPLAY", ":0") if screen else monkeypatch.delenv("DISPLAY", raising=False)
         said = r2flow("view", tmp_path / "a.npy").said
         assert opened == ([f"file://{said.strip()}"] if screen else [])
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+        monkeypatch.setattr("r2flow.reports.view.MOST", 1)
+        assert "Take fewer scans" in r2flow("view", tmp_path / "a.npy").refusal
+        assert [path.name for path in tmp_path.iterdir()] == ["a.npy"]
 
 
 def test_the_way_of_a_model_that_draws_noise_is_that_of_its_ode(r2flow, tmp_path):
