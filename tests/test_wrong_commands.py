@@ -33,6 +33,8 @@ VERBS = """
 nope # No such command 'nope'
 sampel -c run -o out # Did you mean 'sample'?
 sample empty -o out
+sample nowhere -o file.txt # file.txt is not a folder that can be written to
+complete nowhere -o file.txt # file.txt is not a folder that can be written to
 info ~nouser/run # ~ stands for nothing
 sample run -o out --sampler dopri5 --steps 50 # steps
 sample run -o out --seed 18446744073709551616 # 2^64

@@ -55,6 +55,7 @@ def sample(
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.outputs import write_samples
 
+    check_folder(out)
     if model is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     loaded = load_checkpoint(model or find_model(DEFAULT), device=choose_device(draw.device))
@@ -187,6 +188,7 @@ def complete(
     from r2flow.models import DEFAULT, DENSIFY, MODELS
     from r2flow.reports.completed import Job, lack_sectors, print_completed, write_completed
 
+    check_folder(out)
     mask = parse_mask(given.mask) if given.mask else None
     job = Job(num, seed, mask, given.fill_gaps, batch_size, pictures, precision)
     name = str(checkpoint or (DENSIFY if how.given.get("name", "jump") in ("jump", "transport") else DEFAULT))
