@@ -35,7 +35,7 @@ from r2flow.data.opening import SOURCES, Layout, Prepared
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.resolving import reflectance_levels, resolve, resolve_reflectance
-from r2flow.errors import InputError, check_folder
+from r2flow.errors import InputError, check_folder, naming
 from r2flow.generators import Generator, build_generator
 from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.noise import seed_torch
@@ -213,6 +213,10 @@ def _assembled(config: dict[str, Any], generator: Generator, asked: Sequence[str
     data.further = stage.further
     trainer = _build_trainer(config, stage)
     data.check_run(trainer.world_size, trainer.accumulate_grad_batches)
+    steps = (config["callbacks"].get("pictures") or {}).get("steps")
+    if steps and generator.draws and not generator.fixed:
+        with naming("callbacks.pictures"):
+            generator.choose(steps=steps)
     return Run(config, stage, data, trainer)
 
 

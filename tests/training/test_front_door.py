@@ -29,6 +29,7 @@ REFUSED = {
     "callbacks.ema={evry: 3}": "no key 'callbacks.ema.evry'. Did you mean 'callbacks.ema.every'?",
     "+callbacks.emaa={}": "Did you mean 'ema'?",
     "callbacks.ema.decay=2": "decay must be a finite number in [0, 1)",
+    "sampler={name: dopri5} & callbacks.pictures.steps=3": "callbacks.pictures: sampler 'dopri5' has no option 'steps'",
     "callbacks.ema=3": "callbacks.ema must be a group of keys, found 3",
     "sampler=3": "sampler must be a group of keys or null, found 3",
     "samples=null": "samples must be a group of keys, found None",
