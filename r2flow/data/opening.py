@@ -155,9 +155,10 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
         return SourceOptions(FOLDER, str(path.parent)), path
     if not path.exists():
         check(text not in MODELS, f"{text} is a model; sample it first: r2flow sample {text} --out scans.")
+        if path.is_symlink():
+            raise InputError(f"{path} is a broken link to {path.readlink()}.")
         hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
-        problem = "is a broken link" if path.is_symlink() else "does not exist"
-        raise InputError(f"{path} {problem}. Give a scan file, a folder, NAME:FOLDER, simulated:SEED or a run.{hint}")
+        raise InputError(f"{path} does not exist. Give a scan, a folder, NAME:FOLDER, simulated:SEED or a run.{hint}")
     if manifest_of(path).get("format") == "r2flow scans":
         return SourceOptions(PREPARED, str(path)), None
     if (path / "config.yaml").is_file() or (path / "checkpoints").is_dir():
