@@ -360,6 +360,8 @@ def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path,
             r2flow.load(run).complete(given)
     with pytest.raises(InputError, match="^points in memory: .*, in Python by sensor: .*beams cannot be told apart"):
         r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
+    coarse = torch.from_numpy(cloud).bfloat16()
+    assert torch.equal(*(r2flow.load(run).complete(points, sensor="vlp16") for points in (coarse, coarse.double())))
 
 
 def test_the_errors_of_hidden_rays_stand_next_to_those_of_interpolation():

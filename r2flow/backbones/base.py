@@ -74,6 +74,8 @@ class Backbone(ExactBuffers):
         expected = self.in_channels, *(x.shape[2:] if self.any_size else self.coords.shape[2:])
         if x.shape[1:] != expected:
             raise InputError(f"this backbone was built for images of {expected}, found {tuple(x.shape[1:])}.")
+        if not x.is_floating_point():  # v would be rounded
+            raise InputError(f"images in model space are floating-point numbers, found {x.dtype}.")
         assert s is None or self.second_time, "this backbone was built for one time and takes no s"
         t, s = _times("t", t, x), _times("s", t if s is None else s, x)
         if self.data_std is None:

@@ -112,7 +112,7 @@ class Checkpoint:
                 images = torch.from_numpy(np.array(images, images.dtype.newbyteorder("=")))
         if isinstance(images, Tensor) and images.ndim == 2:
             with TemporaryDirectory(prefix=f"{IN_MEMORY} ") as folder:
-                np.save(file := Path(folder, "points.npy"), images.detach().cpu())
+                np.save(file := Path(folder, "points.npy"), images.detach().float().cpu())
                 try:
                     return self.complete(file, state, num, seed, sensor=sensor, **how)
                 except InputError as error:

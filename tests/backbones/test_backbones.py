@@ -169,6 +169,8 @@ def test_an_image_of_another_shape_is_refused(name):
     model = tiny(name)
     with pytest.raises(InputError, match=r"built for images of \(2, 16, 64\), found \(3, 16, 64\)"):
         model(0.5, torch.randn(1, 3, ROWS, COLUMNS))
+    with pytest.raises(InputError, match="floating-point numbers, found torch.int64"):
+        model(0.5, torch.ones(1, 2, ROWS, COLUMNS, dtype=torch.int64))
     wide = torch.randn(1, 2, ROWS, 2 * COLUMNS)
     if model.any_size:
         assert model(0.5, wide).shape == wide.shape
