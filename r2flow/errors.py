@@ -129,7 +129,9 @@ class Unbroken(io.FileIO):
 
 
 def open_streams() -> None:
-    """Make standard output and error accept any file name, outlive their reader, and exist in a daemon."""
+    """Make standard output and error accept any file name, outlive their reader, exist in a daemon and have a width."""
+    if os.environ.get("COLUMNS") == "0":  # rich would print nothing
+        del os.environ["COLUMNS"]
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:

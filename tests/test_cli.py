@@ -65,7 +65,8 @@ def verbs() -> list[str]:
 
 
 @pytest.mark.parametrize("verb", verbs())
-def test_every_verb_has_help_with_an_example(r2flow, verb):
+def test_every_verb_has_help_with_an_example(r2flow, verb, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "0")  # as some shells say of no terminal
     example = " ".join(r2flow(*verb.split(), "--help").said.split()).partition("Example: ")[2]
     assert f" {verb} " in example  # torchrun too takes it: --num is a prefix of its --numa-binding
     assert not example.startswith("torchrun ") or torch.distributed.run.parse_args(example.split()[1:])
