@@ -171,6 +171,8 @@ def folder(root: Path) -> list[Drive]:
     image, else the last by its ending. Folders that r2flow wrote below a folder of other scans are left out: answers
     would be taken for measurements.
     """
+    if (root / "samples" / "LIDAR_TOP").is_dir():
+        warn_odd(root / "samples", "of nuScenes? data=nuscenes, in a verb nuscenes:FOLDER, reads its lidar alone")
     below = sorted(Path(place) for place, _ in _walk(root))
     made = {place for place in below if place != root and manifest_of(place)}
     own = [place for place in below if made.isdisjoint((place, *place.parents))]

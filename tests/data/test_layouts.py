@@ -49,7 +49,7 @@ def test_kitti_object(tmp_path: Path):
     assert names(find_drives("object", tmp_path, "test")) == ["testing"]
 
 
-def test_nuscenes_is_read_log_by_log_in_the_order_of_time(tmp_path: Path):
+def test_nuscenes_is_read_log_by_log_in_the_order_of_time(tmp_path: Path, caplog):
     log, other = "n015-2018-07-24-11-22-45+0800", "n008-2018-08-01-15-16-36-0400"
     files = [f"samples/LIDAR_TOP/{log}__LIDAR_TOP__1532402927647951.pcd.bin",
              f"sweeps/LIDAR_TOP/{log}__LIDAR_TOP__1532402927597000.pcd.bin",
@@ -63,6 +63,9 @@ def test_nuscenes_is_read_log_by_log_in_the_order_of_time(tmp_path: Path):
     assert drives[1].scans == tuple(str(tmp_path / files[i]) for i in (1, 0, 2))
     assert [drive.name for drive in find_drives("nuscenes", tmp_path / "samples/LIDAR_TOP")] == [log]
     assert find_drives("nuscenes", tmp_path, drives=[log]) == drives[1:]
+    assert not caplog.messages
+    assert find_drives("folder", tmp_path)
+    assert "nuscenes:FOLDER, reads its lidar alone" in caplog.text
 
 
 @pytest.mark.parametrize("layout", [name for name, kind in SOURCES.items() if isinstance(kind, Layout)])
