@@ -142,7 +142,10 @@ def prepare(store: PreparedStore, on_bad_scan: str = "error", workers: int = 1) 
     with Bar("preparing", len(missing), "shards") as bar:
         store.make(missing, partial(_make_shard, store, on_bad_scan == "skip"), workers, lambda shard: bar())
     left_out = sum(len(store.head(shard)["left_out"]) for shard in store.shards)
-    check(left_out < len(store.names), f"all {left_out} scans were left out as unusable; remove {store.folder}.")
+    if left_out == len(store.names):
+        for shard in store.shards:  # so that the folder takes another recipe
+            store.files(shard)[0].unlink(missing_ok=True)
+        raise InputError(f"all {left_out} scans were left out as unusable.")
     return left_out, missing
 
 

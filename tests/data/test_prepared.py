@@ -253,6 +253,7 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tm
         path.write_bytes(b"no scan")
     with pytest.raises(InputError, match="all 10 scans were left out as unusable"):
         make(tmp_path / "none", plan_of(root), on_bad_scan="skip")
+    assert [path.name for path in (tmp_path / "none").iterdir()] == ["manifest.json"]
 
 
 def test_a_scan_that_has_no_reflectance_among_others_is_a_bad_one(tmp_path: Path):
