@@ -66,7 +66,7 @@ def pairs(
     store = PairStore(out or default_folder(flow.path), chosen, flow.encoding.shape, flow.generator.noise_shape)
     make_pairs(store, flow.generator.to(where), wait=False)
     if missing := store.missing_pairs():
-        print(f"{store.folder}: other processes are still generating about {missing} of {num} pairs")
+        print(f"{store.folder}: other processes are still generating about {min(missing, num)} of {num} pairs")
     else:
         shards = store.shards
         size = sum(store.files(shard)[0].stat().st_size for shard in shards)

@@ -78,7 +78,7 @@ class PairStore(Store):
 
     def usable(self) -> np.ndarray:
         """The numbers of the usable pairs, from 0; refuses a folder that lacks pairs."""
-        lacking, num = self.missing_pairs(), self.options.num
+        num, lacking = self.options.num, min(self.missing_pairs(), self.options.num)
         check(not lacking, f"{self.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
         flags = [flag for shard in self.shards for flag in self.head(shard)["usable"]]
         return np.flatnonzero(flags[:num])
