@@ -143,6 +143,11 @@ def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(complete, tmp_path):
     assert np.array_equal(filled[:, there], image[:, there])
     assert (filled[0][~there] > 0).any()
     assert "fill_gaps" in complete(tmp_path / "one.npy").refusal
+    xyz = sparse_scan(tmp_path / "room.ply")
+    write_points(tmp_path / "thin.ply", xyz[np.random.default_rng(0).random(len(xyz)) < 0.02])
+    for name, thinned in ("room", False), ("thin", True):
+        said = complete(tmp_path / f"{name}.ply", "--from", "vlp16", out=tmp_path / name).said
+        assert ("of the measured rays have no return: for thinned scans give --fill-gaps" in said) == thinned
 
 
 def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):

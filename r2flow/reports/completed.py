@@ -76,13 +76,14 @@ def write_completed(
             raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, np.ndarray | None] = {}
-    used = kept = outside = blind = 0
+    used = empty = kept = outside = blind = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches) as bar:
         for number in left:
             scan = scans[number]
             whole, given = hiding(scan, job, number)
             used += 0 if scan.image else int((given.state == Ray.RETURN).sum())
+            empty += 0 if scan.image else int((given.state == Ray.EMPTY).sum())
             if given.points is not None:
                 kept, outside = kept + len(given.points.xyz), outside + given.points.dropped
             blind = max(blind, 360 * (given.state == Ray.UNKNOWN).mean() * share_in_sectors(given.state))
@@ -108,6 +109,8 @@ def write_completed(
     if blind and isinstance(checkpoint.generator, TransferFlow):
         print(f"no ray is known in up to {blind:.0f} degrees of a scan, and this model fills no whole sectors: "
               f"--checkpoint {DEFAULT} does, without --to and --size")  # fmt: skip
+    if used < empty:  # 31 % at most of real scans
+        print(f"{empty / (used + empty):.0%} of the measured rays have no return: for thinned scans give --fill-gaps")
     if used:
         sensor = checkpoint.sensor
         size = "x".join(map(str, sensor.shape))
