@@ -233,13 +233,13 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
     other = [lambda: complete(tmp_path / "b", *asked, out=both)]  # a command that begins and ends meanwhile
     monkeypatch.setattr(completed, "complete", lambda *a, **how: (other and other.pop()(), answer(*a, **how))[1])
     assert [complete(tmp_path / drive, *asked, out=both)[0] for drive in "aab"] == [0, 0, 0]
+    other = [lambda: complete(tmp_path / "b", *asked, out=last)]
+    assert "holds other answers: seed" in complete(tmp_path / "a", *asked, "--seed", 1, out=last).refusal
 
 
 def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path, monkeypatch):
     monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))  # no pause
     for place, number in enumerate([0, 1, 0, 1]):
-    other = [lambda: complete(tmp_path / "b", *asked, out=last)]
-    assert "holds other answers: seed" in complete(tmp_path / "a", *asked, "--seed", 1, out=last).refusal
         full_scan(tmp_path / "scans" / f"{place}.npy", number)
     given = prepare_folder(tmp_path / "scans", tmp_path / "prep", SENSOR)
     asked = given, "--mask", "rows:2", "--scans"
@@ -360,13 +360,13 @@ def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path,
     assert torch.equal(answers, answers[:1].expand_as(answers))
     assert torch.equal(*(r2flow.load(run).complete(cloud, sensor="hdl64e") for _ in range(2)))
     assert [message.partition(":")[0] for message in caplog.messages] == ["points in memory"] * 2
+    coarse = torch.from_numpy(cloud).bfloat16()
+    assert torch.equal(*(r2flow.load(run).complete(points, sensor="vlp16") for points in (coarse, coarse.double())))
     for given, found in ((np.zeros(4), "(4,)"), (np.zeros((0, 2, 8, 64)), "(0, 2, 8, 64)"), (["a.bin"], "list")):
         with pytest.raises(InputError, match=rf"points \(N, 3 or 4\); found .*{re.escape(found)}"):
             r2flow.load(run).complete(given)
     with pytest.raises(InputError, match="^points in memory: .*, in Python by sensor: .*beams cannot be told apart"):
         r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
-    coarse = torch.from_numpy(cloud).bfloat16()
-    assert torch.equal(*(r2flow.load(run).complete(points, sensor="vlp16") for points in (coarse, coarse.double())))
 
 
 def test_the_errors_of_hidden_rays_stand_next_to_those_of_interpolation():
@@ -397,7 +397,7 @@ def test_points_of_a_pitched_vehicle_are_warned_of_and_completed(complete, tmp_p
     write_points(tmp_path / "1.ply", xyz @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]))
     code, said, error = complete(tmp_path / "1.ply", "--from", "vlp16", out=tmp_path / "pitched")
     assert (code, error.count("\n"), "1 scan written" in said) == (0, 1, True), error
-    assert "are all scans in one sensor's own frame" in error
+    assert "are all scans of one sensor, in its own frame" in error
 
 
 def test_points_next_to_range_images_are_completed(complete, r2flow, tmp_path: Path):

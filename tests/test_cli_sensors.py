@@ -57,7 +57,7 @@ def test_points_of_another_frame_are_warned_of(r2flow, tmp_path: Path):
     for mount, warned in ((1.5, True), (0, False)):
         write_points(tmp_path / "0.ply", xyz + np.float32([mount, 0, mount]), ring=ring)
         code, said, error = r2flow("sensor", tmp_path / "0.ply")
-        assert (code, "in one sensor's own frame" in error) == (0, warned)
+        assert (code, "of one sensor, in its own frame" in error) == (0, warned)
     assert "not found, 1.73 m assumed" in said  # a round room without a floor
 
 

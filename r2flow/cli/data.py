@@ -130,7 +130,7 @@ def sensor(
         ("elevations", f"{shown} degrees; points lie {off:.2f} from their beams"),
         ("nearest sensor", f"{nearest}, its beams {distance:.2f} degrees off" if nearest else "no built-in sensor"),
         ("resolution", f"{steps:,.0f} steps a turn; images of {mine.columns} columns"),
-        ("range", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle is visible"),
+        ("range seen", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle is visible"),
         ("height", f"{mine.height:.2f} m above the ground" if ground else f"not found, {mine.height:g} m assumed"),
         ("reflectance", "none: encoding.reflectance=false" if scale is None else f"reflectance_scale={scale:g}"),
     ]
