@@ -71,7 +71,7 @@ def option(parameter: Any, annotation: Any) -> tuple[str, str]:
     kind = re.sub(r"Literal\[(.*)\]", lambda m: m[1].replace("'", "").replace(", ", "|"), kind.removesuffix(" | None"))
     name = "/".join([*parameter.opts, *parameter.secondary_opts])
     if parameter.param_type_name == "argument":
-        name = (parameter.metavar or name.upper()) + "..." * (kind.startswith("list") and not parameter.metavar)
+        name = (parameter.metavar or name.upper()) + "..." * kind.startswith("list")
     elif kind not in ("bool", "str"):
         name += f" {kind}"
     default = "" if parameter.default is None or kind == "bool" else f" = {parameter.default}"

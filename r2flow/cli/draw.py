@@ -159,7 +159,7 @@ class PartialOptions:
 @app.command(epilog="Example: r2flow complete scan.pcd --from vlp16 --num 8 --out dense")
 @grouped
 def complete(
-    what: Annotated[list[str], typer.Argument(metavar="SCANS...", help=f"Scan files, range images (.npy), or {SETS}.")],
+    what: Annotated[list[str], typer.Argument(metavar="SCANS", help=f"Scan files, range images (.npy), or {SETS}.")],
     out: OutOption,
     given: PartialOptions,
     how: SamplerOptions,

@@ -23,7 +23,7 @@ PrecisionOption = Annotated[
     Literal["32-true", "bf16-mixed"],
     typer.Option(help="Precision of the network; bf16-mixed is faster on hardware with bfloat16."),
 ]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")]
 SensorOption = Annotated[str, typer.Option(help="Sensor name, or a YAML file (see r2flow sensor).")]
 SizeOption = Annotated[
     str | None, typer.Option(help="Image size, rows x columns, such as 64x1024. Default: the sensor's.")
