@@ -13,7 +13,7 @@ from torch import Tensor
 from r2flow.errors import check
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.registry import Positive, Registry, check_options, construct
+from r2flow.registry import Count, Registry, check_options, construct
 
 # Relative tolerance of range limits in decoding, for float32's rounding.
 LIMIT_TOLERANCE = 1e-5
@@ -114,7 +114,7 @@ class Encoding:
         format: str = "logscale",
         reflectance: bool = True,
         limits: Literal["closed", "open"] = "closed",
-        levels: Positive | None = None,
+        levels: Count | None = None,
     ) -> None:
         self.sensor = sensor
         self.reflectance = reflectance
