@@ -104,7 +104,7 @@ class DataOptions(SourceOptions):
     parts: Sequence[Mapping[str, Any]] | None = None  # of `mixed`: {name, root, split, drives, ..., weight} each
     augment: Mapping[str, Any] | None = None  # `r2flow.data.augment.Augmentation`, of training scans only
     batch_size: Count = 8  # images in one optimiser step, over all devices and accumulated batches
-    workers: Natural = 0  # loader processes per device
+    workers: Annotated[int, Bound("from 0 to 1,000", lambda n: 0 <= n <= 1000)] = 0  # loader processes per device
     memory_gib: NonNegative = 2.0  # training scans that fit into this are kept in memory, others read when needed
     validation: Mapping[str, Any] | None = None  # `ValidationOptions`
     pairs: Mapping[str, Any] | None = None  # `PairOptions`, for pairs
