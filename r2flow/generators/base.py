@@ -136,7 +136,7 @@ class Generator(nn.Module):
 
         A name may have fields (`parse_sampler`). Another sampler keeps the number of steps, with defaults otherwise.
         """
-        given = (parse_sampler(str(name)) if name else {}) | {k: v for k, v in options.items() if v is not None}
+        given = ({} if name is None else parse_sampler(str(name))) | {k: v for k, v in options.items() if v is not None}
         name = given.pop("name", None)
         default, steps = self.sampler, getattr(self.sampler, "steps", None)
         asked = given.get("steps")
