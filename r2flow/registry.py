@@ -88,9 +88,9 @@ class Registry(Mapping[str, T]):
         return iter(self._entries)
 
     def __contains__(self, name: object) -> bool:
-        while name not in self._entries and Registry.on_missing:
+        while isinstance(name, str) and name not in self._entries and Registry.on_missing:
             Registry.on_missing.pop(0)()
-        return name in self._entries
+        return isinstance(name, str) and name in self._entries
 
     def __len__(self) -> int:
         return len(self._entries)
