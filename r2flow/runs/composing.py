@@ -18,7 +18,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import OverrideType, Sweep
+from hydra.core.override_parser.types import Glob, OverrideType, Sweep
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -182,7 +182,7 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
             ) from None
         key, value = parsed.key_or_group, parsed.value()
         names = value if isinstance(value, list) else [value]
-        empty = parsed.is_delete() or "" in names or not all(isinstance(name, str | dict | Sweep) for name in names)
+        empty = parsed.is_delete() or "" in names or not all(isinstance(n, str | dict | Sweep | Glob) for n in names)
         if not key:
             problem = " names no key: give KEY=VALUE"
         elif key == "hydra":

@@ -201,7 +201,7 @@ def test_a_sweep_whose_jobs_reach_their_time_goes_on_with_the_same_command(train
     assert mixed.returncode == 2
     assert "2 of the sweep's jobs failed" in mixed.stderr
     monkeypatch.setattr("r2flow.runs.chain.run_process", Mock(side_effect=[LATER, MemoryError]))
-    assert "the memory has no room" in in_process(tmp_path, ["-m", "seed=1,2"], check=False).refusal
+    assert "the memory has no room" in in_process(tmp_path, ["-m", "backbone=glob(*_small)"], check=False).refusal
 
 
 @pytest.mark.parametrize("option", ["run_dir=here", "run_dir=a,b", "name=here"])
