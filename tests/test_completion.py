@@ -139,7 +139,6 @@ def test_a_flow_without_a_condition_says_what_completes_with_it():
     ],
 )
 def test_what_fits_nothing_is_refused(changed, message):
-    images = torch.zeros(1, 2, *SHAPE)
-    given = {"images": images, "state": torch.zeros(1, *SHAPE, dtype=torch.uint8), **changed}
+    given = {"images": torch.zeros(1, 2, *SHAPE), "state": torch.zeros(1, *SHAPE, dtype=torch.uint8), **changed}
     with pytest.raises(InputError, match=message):
         list(complete(network(), **given))

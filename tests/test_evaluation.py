@@ -205,8 +205,7 @@ class TestExtremes:
 
 def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path, monkeypatch):
     real = open_scans(f"kitti_360:{kitti_360}", READING, "train")
-    other = open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)
-    found = reference_sets(real, {"generated": other})
+    found = reference_sets(real, {"generated": open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)})
     assert list(found) == ["real halves", "generated, as many", "real drives"]
     names = real.source.names
     halves = [one.source.names for one in found["real halves"]]

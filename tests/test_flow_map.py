@@ -174,8 +174,7 @@ DATA = {"name": "pairs", "batch_size": 4, "pairs": {"knots": 3}}
 
 
 def stage(data: dict = DATA, generator: RectifiedFlow | None = None, **options) -> LearnFlowMap:
-    config = {"stage": {"name": "flow_map", **options}, "data": data, "seed": 0}
-    return build_stage(config, generator or flow_map())
+    return build_stage({"stage": {"name": "flow_map", **options}, "data": data, "seed": 0}, generator or flow_map())
 
 
 def batch_of(**further) -> dict[str, torch.Tensor]:
@@ -223,8 +222,7 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
 
 @pytest.mark.parametrize("method", ["chord", "renoise"])
 def test_a_map_s_own_pairs_need_no_knots(method):
-    data = {**DATA, "pairs": {"sampler": {"name": method}}}
-    assert stage(data, objective="knots").objective is OBJECTIVES["knots"]
+    assert stage({**DATA, "pairs": {"sampler": {"name": method}}}, objective="knots").objective is OBJECTIVES["knots"]
 
 
 @pytest.mark.parametrize("objective", list(OBJECTIVES))

@@ -16,8 +16,7 @@ CROPPABLE = [name for name, kind in BACKBONES.items() if kind.croppable]
 
 
 def backbone(name: str, rays: torch.Tensor = RAYS, **options) -> Backbone:
-    options = {**tiny_options(name), **options}
-    model = build_backbone(options, rays, 2).eval().requires_grad_(False)
+    model = build_backbone({**tiny_options(name), **options}, rays, 2).eval().requires_grad_(False)
     torch.manual_seed(1)
     for parameter in model.parameters():  # nothing at zero, or there would be nothing to see
         parameter.copy_(0.3 * torch.randn_like(parameter))
@@ -62,8 +61,7 @@ def test_a_learned_position_follows_the_part():
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_the_weights_are_shared(name):
     whole = backbone(name)
-    piece = whole.cropped(PARTS[0].rows, PARTS[0].columns)
-    own = {parameter.data_ptr() for parameter in piece.parameters()}
+    own = {parameter.data_ptr() for parameter in whole.cropped(PARTS[0].rows, PARTS[0].columns).parameters()}
     shared = {parameter.data_ptr() for parameter in whole.parameters()}
     assert len(own - shared) == (1 if name == "hdit" else 0)  # the position embedding is a piece of the whole one
 

@@ -113,9 +113,6 @@ def test_mmps_takes_a_flow_map_s_velocity():
     torch.testing.assert_close(*by)
 
 
-# The samples
-
-
 def test_mmps_samples_the_posterior_of_a_gaussian():
     prior, case = gaussian(), Case(ROWS)
     y = case.measure(prior.sample(3, draws(4)))
@@ -166,9 +163,6 @@ def test_with_nothing_measured_it_draws_from_the_prior(method):
     means, covariance = moments(velocity_of(prior), method, case, torch.zeros(1, 0).double(), times(100, "power:1.5"))
     torch.testing.assert_close(means[0], prior.means[0], rtol=0, atol=1e-3)
     assert float(bures(covariance, ring(4))) < 0.03**2 * float(torch.trace(ring(4)))
-
-
-# What holds for all of them
 
 
 @pytest.mark.parametrize("method", ALL)

@@ -36,9 +36,6 @@ def expect_rows(points, reflectance=REFLECTANCE, ring=None):
     assert points.dropped == 0
 
 
-# --- what each format says, by hand ---
-
-
 def test_pcd_ascii_in_any_order_and_case_with_other_fields(tmp_path):
     text = pcd_header("label Z Remission X ring y", "2 4 8 4 2 4", "U F F F U F", "ascii")
     text += "".join(f"9 {z} {i} {x} {ring} {y}\n" for x, y, z, i, ring in ROWS)
@@ -144,9 +141,6 @@ def test_an_organised_pcd_may_be_mostly_nan(tmp_path):
 def test_a_coordinate_beyond_float32_is_dropped_as_infinite(tmp_path):
     np.save(tmp_path / "a.npy", np.array([[1.0, 2.0, 3.0], [1e300, 0.0, 0.0]]))
     assert read_points(tmp_path / "a.npy").dropped == 1
-
-
-# --- round trips ---
 
 
 def scan(count: int = 5000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

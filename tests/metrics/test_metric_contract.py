@@ -183,9 +183,6 @@ def test_a_metric_must_give_a_row_for_each_scan(rows, sets, monkeypatch):
     assert metric.given("real") == 0
 
 
-# What torchmetrics promises of every metric
-
-
 def told(metric, sets, size=4):
     for side, scans in sets.items():
         for batch in scans.images.split(size):

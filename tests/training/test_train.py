@@ -114,8 +114,7 @@ def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(train, alone, scans
 
 @pytest.mark.slow
 def test_a_run_told_to_stop_before_its_first_step_says_one_line(scans: Path, tmp_path: Path):
-    command = tiny(scans, "name=early", *hold_at(0, tmp_path / "held"))
-    code, said = stop_held(tmp_path / "held", signal.SIGINT, command)
+    code, said = stop_held(tmp_path / "held", signal.SIGINT, tiny(scans, "name=early", *hold_at(0, tmp_path / "held")))
     assert code == 130, said
     assert lines_of(said) == ["stopped; the same command starts it again: no checkpoint yet"]
 
@@ -214,8 +213,7 @@ def test_a_sweep_refuses_one_folder_for_all_of_its_runs(train: Run, tmp_path: Pa
 @pytest.mark.slow
 @pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGHUP])
 def test_a_killed_sweep_takes_its_job_with_it(scans: Path, tmp_path: Path, by: int):
-    command = ["-m", *tiny(scans, "stage.loss=mse,pseudo_huber", *hold_at(3, tmp_path / "held"))]
-    process = start(tmp_path, command)
+    process = start(tmp_path, ["-m", *tiny(scans, "stage.loss=mse,pseudo_huber", *hold_at(3, tmp_path / "held"))])
     wait_for(tmp_path / "held", process)
     (job,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     os.kill(process.pid, by)
