@@ -34,7 +34,7 @@ class Surroundings(NamedTuple):
 
     @classmethod
     def of(cls, space: ModelSpace, condition: Condition, ring: bool, steps: Tensor) -> "Surroundings":
-        """Candidates and features from a condition (`condition_of`), whose interpolated values are ignored.
+        """Candidates and features from a condition (`condition_of`).
 
         `ring`: the columns are a full turn; `steps`: angles between rows and between columns in radians, (B, 2).
         """
