@@ -38,9 +38,9 @@ def require(what: str, extra: str, *packages: str) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be written to or created, before any work; nothing is written."""
+    """Refuse a folder that cannot be written to or created, before any work; with a manifest it may be complete."""
     there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-    usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    usable = there.is_dir() and ((folder / "manifest.json").is_file() or os.access(there, os.W_OK | os.X_OK))
     check(usable, f"{there} is not a folder that can be written to; give another one.")
 
 
