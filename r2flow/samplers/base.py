@@ -87,7 +87,8 @@ class Sampler(ABC):
         if getattr(generator, self.needs, None) is None:
             check(drawn or generator.told, f"a {kind} draws no scans: give a model of its latents, a latent diffusion.")
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}; a {kind} has none.")
-        check(drawn or not self.draws, f"{self.name} adds noise of N(0, 1); a {kind} starts from other: give jump.")
+        anew = self.draws and self.needs in ("velocity", "map")  # others know what their generator starts from
+        check(drawn or not anew, f"{self.name} adds noise of N(0, 1); a {kind} starts from other: give jump.")
         if getattr(generator, "fixed", False) and self != generator.sampler:
             raise InputError(f"this model is distilled for {generator.sampler} alone: leave sampler and steps out.")
 
@@ -136,8 +137,7 @@ class OnGrid(Sampler):
             object.__setattr__(self, "grid", tuple(float(t) for t in self.grid))
             steps = len(self.grid) - 1
             check(steps == self.steps, f"the time grid has {steps} steps, found steps={self.steps}.")
-            finish = getattr(self, "finish", 0) and self.steps > 1
-            check(not finish, "a grid of times has its own last step: give finish=0.")
+            check(not getattr(self, "finish", 0) or self.steps == 1, "a grid has its own last step: give finish=0.")
         self.times()
 
     def times(self) -> Tensor:

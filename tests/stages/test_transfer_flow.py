@@ -18,6 +18,7 @@ from r2flow.lidar.sensors import build_sensor
 from r2flow.model.completion import completing
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
+from r2flow.samplers.maps import Transport
 from r2flow.simulator import simulate
 from r2flow.stages import build_stage
 from r2flow.stages.transfer import Tasks, Transfer, coarser
@@ -129,11 +130,9 @@ def test_a_flow_for_another_sensor_starts_as_the_parents_answer_to_any_sensor(fl
 
 def test_a_turned_scan_has_a_turned_answer(flow, scans):
     state = measured(scans)
-    noise_free = TransferFlow(flow.space, CONFIG["backbone"], sigma=0.0)
+    noise_free = TransferFlow(flow.space, CONFIG["backbone"], sigma=0.0).eval()
     noise_free.load_state_dict(flow.state_dict())
-    noise_free.eval()
-    one = answered(noise_free, scans, state).x
-    turned = answered(noise_free, scans.roll(7, 3), state.roll(7, 2)).x
+    one, turned = (answered(noise_free, scans.roll(by, 3), state.roll(by, 2)).x for by in (0, 7))
     torch.testing.assert_close(turned, one.roll(7, 3), rtol=0, atol=2e-5)
 
 
@@ -386,5 +385,6 @@ def test_it_draws_nothing_from_noise_alone_and_needs_a_backbone_for_any_size(flo
     for sampler in ("sde", "renoise", "refine"):  # their noise has deviation 1, that of x_0 is sigma
         with pytest.raises(InputError, match=r"N\(0, 1\).*give jump"):
             build_sampler(sampler).check(flow)
+    type("Redrawn", (Transport,), {"draws": True, "name": "redrawn"})().check(flow)  # a plug-in for this flow
     with pytest.raises(InputError, match="backbone=local"):
         built(backbone=tiny_options("hdit"))
