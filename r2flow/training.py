@@ -25,7 +25,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.model_helpers import is_overridden
 
-from r2flow.callbacks import build_callbacks
+from r2flow.callbacks import SamplePictures, build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.loggers import LOGGERS, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
@@ -213,10 +213,10 @@ def _assembled(config: dict[str, Any], generator: Generator, asked: Sequence[str
     data.further = stage.further
     trainer = _build_trainer(config, stage)
     data.check_run(trainer.world_size, trainer.accumulate_grad_batches)
-    steps = (config["callbacks"].get("pictures") or {}).get("steps")
-    if steps and generator.draws and not generator.fixed:
+    callbacks: list[L.Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    for pictures in [one for one in callbacks if isinstance(one, SamplePictures) and one.every]:
         with naming("callbacks.pictures"):
-            generator.choose(steps=steps)
+            generator.choose(steps=pictures.steps if generator.draws and not generator.fixed else None)
     return Run(config, stage, data, trainer)
 
 
