@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from r2flow.errors import check
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.registry import Count, Registry, check_options, construct
+from r2flow.registry import Bound, Registry, check_options, construct
 
 # Relative tolerance of range limits in decoding, for float32's rounding.
 LIMIT_TOLERANCE = 1e-5
@@ -114,7 +114,7 @@ class Encoding:
         format: str = "logscale",
         reflectance: bool = True,
         limits: Literal["closed", "open"] = "closed",
-        levels: Count | None = None,
+        levels: Annotated[float, Bound("that is whole and above 0", lambda n: n > 0 == n % 1)] | None = None,
     ) -> None:
         self.sensor = sensor
         self.reflectance = reflectance

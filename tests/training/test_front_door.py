@@ -36,7 +36,7 @@ REFUSED = {
     "samples=null": "samples must be a group of keys, found None",
     "sampler.grid=[a,b]": "grid must be a word or a list, each a finite number",
     "backbone.base_channels=0": "base_channels must be a whole number of at least 1",
-    "encoding.levels=0.5": "levels must be a whole number of at least 1 or null, found 0.5",
+    "encoding.levels=1.5": "levels must be a finite number that is whole and above 0 or null, found 1.5",
     "backbone.window=[2,9]": "odd sizes",
     "trainer.precision=bf16-true": "rounds the times of a flow to three digits; use bf16-mixed",
     "trainer.strategy=ddp_spawn": "use strategy=ddp",
@@ -130,7 +130,7 @@ def test_a_folder_of_configs_may_have_any_name(tmp_path: Path):
 def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
     asked = ["data.scenes=2", "backbone=hdit_tiny", f"run_dir={tmp_path}"]
     assert build(compose(asked), asked).config["encoding"]["levels"] == 100
-    asked.append("encoding.levels=50")
+    asked += ["encoding.levels=50.0", "sampler.name=dopri5", "+callbacks.pictures={every: 0, steps: 3}"]  # none drawn
     run = build(compose(asked), asked)
     assert run.config["encoding"]["levels"] == run.stage.generator.space.encoding.levels == 50
 
