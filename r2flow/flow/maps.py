@@ -59,7 +59,7 @@ class Paths:
         interval = torch.searchsorted(times[1:-1].contiguous(), t.contiguous(), right=True)
         first = (interval - (n // 2 - 1)).clamp(0, len(times) - n)
         near = first[:, None] + torch.arange(n, device=t.device)
-        weights = torch.linalg.inv(torch.linalg.vander(times[near] - t[:, None]))[:, power].to(self.states)
+        weights = torch.linalg.inv_ex(torch.linalg.vander(times[near] - t[:, None])).inverse[:, power].to(self.states)
         states = self.states[torch.arange(len(t), device=t.device)[:, None], near]
         return (weights.reshape(*near.shape, *[1] * (states.ndim - 2)) * states).sum(1)
 

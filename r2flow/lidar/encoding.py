@@ -114,7 +114,7 @@ class Encoding:
         format: str = "logscale",
         reflectance: bool = True,
         limits: Literal["closed", "open"] = "closed",
-        levels: Annotated[float, Bound("that is whole and above 0", lambda n: n > 0 == n % 1)] | None = None,
+        levels: Annotated[float, Bound("that is whole and above 0", lambda n: n > 0 and n % 1 == 0)] | None = None,
     ) -> None:
         self.sensor = sensor
         self.reflectance = reflectance
