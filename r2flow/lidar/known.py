@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError, check
+from r2flow.lidar.interpolation import nearest_known
 from r2flow.lidar.region import region
 from r2flow.lidar.scan_files import read_numbers
 from r2flow.registry import Count, Natural, Registry, Share, construct
@@ -47,14 +48,10 @@ def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
 def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
     """Share of the unknown rays of a state, (H, W), in sectors of at least `least` degrees without any known ray."""
     unknown = state == Ray.UNKNOWN
-    empty = unknown.all(0)
-    width = math.ceil(least / 360 * len(empty))
-    if empty.all():
-        return 1.0
-    rolled = np.roll(empty, -int(np.flatnonzero(~empty)[0]))  # start at a column with a known ray
-    runs = np.split(rolled, np.flatnonzero(np.diff(rolled)) + 1)
-    wide = sum(len(run) for run in runs if run[0] and len(run) >= width)
-    return float(wide * len(state) / max(unknown.sum(), 1))
+    columns = state.shape[1]
+    before, after = nearest_known(np.tile(~unknown.all(0), 3))  # in three turns
+    wide = (after - before)[columns : 2 * columns] > math.ceil(least / 360 * columns)
+    return float(wide.sum() * len(state) / max(unknown.sum(), 1))
 
 
 Mask = Callable[[np.ndarray, np.random.Generator], np.ndarray]  # measured rays, (H, W) bool -> those to keep, (H, W)
