@@ -168,10 +168,7 @@ def _without_return(azimuth: np.ndarray, steps: float) -> np.ndarray:
 def _blind(azimuth: np.ndarray, columns: int, least: float) -> np.ndarray:
     """Columns of sectors without any return that are wider than `BLIND` and `least` degrees, (W,) bool."""
     ordered = np.sort(azimuth)
-    blind = np.zeros(columns, dtype=bool)
     gaps = np.diff(ordered, append=ordered[:1] + 2 * math.pi)
+    wide = gaps > math.radians(max(BLIND, least))
     middles = math.pi * (1 - 2 * (np.arange(columns) + 0.5) / columns)
-    for begin, gap in zip(ordered, gaps, strict=True):
-        if gap > math.radians(max(BLIND, least)):
-            blind |= (middles - begin) % (2 * math.pi) < gap
-    return blind
+    return ((middles - ordered[wide, None]) % (2 * math.pi) < gaps[wide, None]).any(0)
