@@ -50,18 +50,15 @@ def mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
 
     Features are (M, C). Voxels 56 m or more from the centroid are ignored; an empty sector has the mean 0.
     """
-    edges = torch.linspace(NEAR, FAR, SECTORS + 1, device=coords.device)
-    edges[0] = 0
+    ends = torch.linspace(NEAR, FAR, SECTORS + 1, device=coords.device)[1:]
     position = coords.float()
     distance = (position - position.mean(0)).norm(dim=1) * VOXEL
-    sector = torch.bucketize(distance, edges, right=True) - 1
-    inside = sector < SECTORS
-    sector = sector[inside]
+    sector = torch.bucketize(distance, ends, right=True)  # SECTORS beyond the last end
     # float64, for sums over tens of thousands of voxels.
-    total = torch.zeros(SECTORS, features.shape[1], dtype=torch.float64, device=features.device)
-    total.index_add_(0, sector, features[inside].double())
-    count = torch.bincount(sector, minlength=SECTORS).clamp(min=1)
-    return (total / count[:, None]).to(features.dtype).flatten()
+    total = torch.zeros(SECTORS + 1, features.shape[1], dtype=torch.float64, device=features.device)
+    total.index_add_(0, sector, features.double())
+    count = torch.bincount(sector, minlength=SECTORS + 1).clamp(min=1)
+    return (total / count[:, None])[:-1].to(features.dtype).flatten()
 
 
 def _step(channels: int, out: int, size: int, transposed: bool = False) -> list[nn.Module]:
