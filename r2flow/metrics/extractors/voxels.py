@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
@@ -42,7 +43,7 @@ def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
     voxel, of_point = key.unique(return_inverse=True)
     number = torch.arange(len(points), device=points.device)
     first = torch.full_like(voxel, len(points)).scatter_reduce_(0, of_point, number, "amin").sort().values
-    return coords[first], torch.nn.functional.pad(points[first], (0, 1), value=-1.0)
+    return coords[first], F.pad(points[first], (0, 1), value=-1.0)
 
 
 def mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
@@ -192,22 +193,14 @@ class Corners:
         self.num = len(grid)
         around, share = coords // scale, (coords % scale).float() / scale  # voxel, relative position within it
         self.voxels = grid.find(around)
-        self.corners = []
-        total = torch.zeros(len(coords), device=coords.device)
-        for offset in offsets(2):
-            voxel = grid.find(around + torch.tensor(offset, device=coords.device))
-            ahead = torch.tensor(offset, dtype=torch.bool, device=coords.device)
-            weight = torch.where(ahead, share, 1 - share).prod(1) * (voxel >= 0)
-            total += weight
-            self.corners.append((voxel.clamp_(min=0), weight))
-        self.total = total + 1e-8
+        corners = coords.new_tensor(offsets(2))  # (8, 3)
+        found = grid.find(around[:, None] + corners)
+        weights = torch.where(corners > 0, share[:, None], 1 - share[:, None]).prod(2) * (found >= 0)
+        self.corners, self.weights = found.clamp_(min=0), weights / (weights.sum(1, keepdim=True) + 1e-8)
 
     def to_points(self, features: Tensor) -> Tensor:
         """Interpolate voxel features (M, C) at the points over the existing ones of eight corners: (N, C)."""
-        out = features.new_zeros(len(self.voxels), features.shape[1])
-        for voxel, weight in self.corners:
-            out.addcmul_(features.index_select(0, voxel), (weight / self.total)[:, None])
-        return out
+        return F.embedding_bag(self.corners, features, mode="sum", per_sample_weights=self.weights.to(features))
 
     def to_voxels(self, features: Tensor) -> Tensor:
         """Average point features (N, C) per voxel: (M, C)."""
