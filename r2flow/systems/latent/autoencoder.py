@@ -50,7 +50,7 @@ class Quantiser(nn.Module):
         lengths = codes.square().sum(1)
         with torch.autocast(vectors.device.type, enabled=False):  # full precision, for differences of large numbers
             parts = [
-                (part.square().sum(1, keepdim=True) + lengths - 2 * part @ codes.T).argmin(1)
+                torch.addmm(lengths, part, codes.T, alpha=-2).argmin(1)  # |part|^2 is common to all codes
                 for part in vectors.flatten(0, -2).float().split(4096)  # not all distances at once
             ]
         return torch.cat(parts).view(vectors.shape[:-1])
