@@ -187,16 +187,14 @@ def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
     """Draw points from behind and above the sensor, coloured by height."""
     # A pinhole camera 16 m behind and 9 m above the sensor, pitched down: x' right, y' up, depth ahead.
     eye, pitch = np.array([-16.0, 0.0, 9.0]), np.deg2rad(18)
-    ahead = np.array([np.cos(pitch), 0, -np.sin(pitch)])
-    up = np.array([np.sin(pitch), 0, np.cos(pitch)])
-    relative = xyz - eye
-    depth = relative @ ahead
-    front = depth > 3
-    relative, depth, z = relative[front], depth[front], xyz[front, 2]
-    order = np.argsort(-depth)
-    u, v = (-relative[:, 1] / depth)[order], (relative @ up / depth)[order]
-    size = np.clip(7 / depth[order], 0.2, 0.8) * np.sqrt(30_000 / max(len(xyz), 1))
-    dots = axes.scatter(u, v, c=z[order], s=size, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
+    c, s = np.cos(pitch), np.sin(pitch)
+    camera = np.array([[0, s, c], [-1, 0, 0], [0, c, -s]])  # columns: x', y' and ahead
+    u, v, depth = ((xyz - eye) @ camera).T
+    front = np.flatnonzero(depth > 3)
+    order = front[np.argsort(-depth[front])]
+    u, v, depth, z = u[order] / depth[order], v[order] / depth[order], depth[order], xyz[order, 2]
+    size = np.clip(7 / depth, 0.2, 0.8) * np.sqrt(30_000 / max(len(xyz), 1))
+    dots = axes.scatter(u, v, c=z, s=size, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
     axes.set(xlim=(-0.95, 0.95), ylim=(-0.62, 0.48), aspect="equal")
     _strip(axes, "perspective, colour: height, m" if label else "", "white")
     if label:
