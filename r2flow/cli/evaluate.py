@@ -80,7 +80,8 @@ class EvaluateOptions:
         if self.json is not None and (self.json.is_dir() or self.json.suffix.lower() != ".json"):
             raise InputError(f"--json must be a file that ends in .json, found {self.json}.")
         if not sampled and any(getattr(self, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
-            raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model to sample; found none.")
+            found = ", ".join(named) or "none"
+            raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model; found {found}.")
         if len(named) == len(sampled) and (self.generated_split or self.generated_scale):
             raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
 
