@@ -27,21 +27,19 @@ MARGIN = len(SYM6) // 4  # pixels beyond each edge that the filter needs
 
 
 class BatchDraws:
-    """Random numbers per image for one part of a step: a function of (seed, image number, part)."""
+    """Random numbers per image for one part of a step, on the CPU: a function of (seed, image number, part)."""
 
     def __init__(self, seed: int, batch: Mapping[str, Tensor], part: int) -> None:
         self.streams = [generator(seed, "training", k, part) for k in batch["k"].tolist()]
-        self.device = batch["x_1"].device
 
     def uniform(self, shape: tuple[int, ...]) -> Tensor:
         """Uniform in [0, 1), (B, *shape)."""
-        rows = [torch.from_numpy(stream.random(shape, dtype="float32")) for stream in self.streams]
-        return torch.stack(rows).to(self.device)
+        return torch.stack([torch.from_numpy(stream.random(shape, dtype="float32")) for stream in self.streams])
 
     def normal(self, shape: tuple[int, ...]) -> Tensor:
         """Standard normal, (B, *shape)."""
         rows = [torch.from_numpy(stream.standard_normal(shape, dtype="float32")) for stream in self.streams]
-        return torch.stack(rows).to(self.device)
+        return torch.stack(rows)
 
 
 Draw = tuple[Tensor, Tensor]
@@ -123,18 +121,18 @@ class AdaptiveAugment(nn.Module):
         return sign
 
     def draw(self, source: BatchDraws) -> dict[str, Draw]:
-        """Draw the transformations of a batch, by name; the number of draws does not depend on p."""
+        """Draw a batch's transformations by name, on the CPU; the number of draws does not depend on p."""
         draws, p = {}, float(self.p)
         for name, values in TRANSFORMATIONS.items():
             value, u = values(source), source.uniform((1,))[:, 0]
-            chosen = (u < p * self.policy[name]).float()
-            draws[name] = value.to(self.p.device), chosen.to(self.p.device)
+            draws[name] = value, (u < p * self.policy[name]).float()
         return draws
 
     def forward(self, x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
         """Transform x (B, C, H, W) in at least float32; twice differentiable."""
         with torch.autocast(x.device.type, enabled=False):
-            return coloured(transformed(at_least_float32(x), *affine(draws, x.shape[-2], x.shape[-1])), draws)
+            scale, shift = (part.to(x.device) for part in affine(draws, x.shape[-2], x.shape[-1]))
+            return coloured(transformed(at_least_float32(x), scale, shift), draws)
 
 
 def affine(draws: Mapping[str, Draw], height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -206,7 +204,7 @@ def coloured(x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
     if x.shape[1] != 1:
         return x
     for name in COLOUR:
-        value, chosen = (tensor[:, None, None, None] for tensor in draws[name])
+        value, chosen = (tensor[:, None, None, None].to(x.device) for tensor in draws[name])
         changed = x + value if name == "brightness" else x * (value if name == "contrast" else 1 - 2 * value)
         x = torch.where(chosen > 0, changed, x)
     return x

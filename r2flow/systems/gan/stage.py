@@ -152,7 +152,7 @@ class LearnGan(Stage):
 
         draws = BatchDraws(self.seed, batch, FAKE)
         with torch.no_grad():
-            fake = self.shown(self.make(draws.normal(self.generator.noise_shape), draws), images, draws)
+            fake = self.shown(self.make(draws.normal(self.generator.noise_shape).to(real.device), draws), images, draws)
             seen = self.shown(real, images, BatchDraws(self.seed, batch, REAL))
         of_real, of_fake = self.discriminator(seen), self.discriminator(fake)
         wrong = discriminator_loss(of_real, of_fake)
@@ -174,13 +174,13 @@ class LearnGan(Stage):
     def make(self, z: Tensor, draws: BatchDraws) -> Tensor:
         """G(z), (B, C, H, W), with random mask and rotation."""
         rows, columns = self.generator.space.shape[1:]
-        uniform = draws.uniform((1, rows, columns)) if self.generator.drops else None
-        shift = None if self.generator.angle is None else draws.uniform((1,))[:, 0]
+        uniform = draws.uniform((1, rows, columns)).to(z.device) if self.generator.drops else None
+        shift = None if self.generator.angle is None else draws.uniform((1,))[:, 0].to(z.device)
         return self.generator.made(z, uniform, shift)["image"]
 
     def shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:
         """Input x of D after a number of images of the run."""
-        uniform = draws.uniform(tuple(x.shape[1:])) if self.warmup.left(images) else None
+        uniform = draws.uniform(tuple(x.shape[1:])).to(x.device) if self.warmup.left(images) else None
         x = self.warmup(x, images, uniform)
         return x if self.augment is None else self.augment(x, self.augment.draw(draws))
 
