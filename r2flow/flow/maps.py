@@ -51,7 +51,7 @@ class Paths:
         between = self.at(s) - self.at(t)
         differ = s != t
         mean = between / expand_time(torch.where(differ, s - t, 1), between)
-        return mean if bool(differ.all()) else torch.where(expand_time(differ, mean), mean, self.velocity(t))
+        return torch.where(expand_time(differ, mean), mean, self.velocity(t))
 
     def _coefficient(self, power: int, t: Tensor) -> Tensor:
         """Coefficient of (t' - t)^power, (B, ...), of the polynomials in t' through the n knots nearest to t, (B,)."""
