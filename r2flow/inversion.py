@@ -61,7 +61,7 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
     """
     flow = as_flow(checkpoint.generator, "inversion")
     assert images.shape[2:] == checkpoint.sensor.shape
-    x_1 = checkpoint.encoding.encode(images[:, : 1 + checkpoint.encoding.reflectance])
+    x_1 = checkpoint.encoding.encode(images[:, : 1 + checkpoint.encoding.reflectance].cpu())
     backward = flow.solve(x_1, 1.0, 0.0, sampler=sampler, progress=progress)
     # The last state of an unconverged solution is not noise.
     x_0 = backward.x.cpu().masked_fill(~backward.converged.view(-1, 1, 1, 1), math.nan)
