@@ -145,7 +145,7 @@ def interpolate_scans(
             "a larger tolerance or more steps."
         )
     arrived(2)
-    weights = torch.linspace(0, 1, frames, dtype=torch.float64)
+    weights = torch.linspace(0, 1, frames, dtype=torch.float64, device="cpu")
     parts = []
     for noise in slerp(ends.x_0[0], ends.x_0[1], weights[1:-1]):
         parts.append(flow.solve(noise[None], sampler=sampler, progress=progress))

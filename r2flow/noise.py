@@ -62,7 +62,7 @@ class Draws:
 
     def step(self, shape: tuple[int, ...], j: int) -> Tensor:
         """Noise of each scan in step j, (B, *shape) float32 on the CPU; step 0 is the start."""
-        noise = torch.empty(len(self.numbers), *shape, dtype=torch.float32)
+        noise = torch.empty(len(self.numbers), *shape, dtype=torch.float32, device="cpu")
         for row, number in zip(noise, self.numbers, strict=True):
             row.copy_(standard_normal(shape, self.seed, self.purpose, number, j))
         return noise

@@ -167,7 +167,6 @@ def test_frames_lie_between_the_scans():
     x_0 = (flow().encoding.encode(torch.stack([a, b])) - M) / S
     middle = flow().encoding.decode(M + S * slerp(*x_0, torch.tensor([0.5])))
     torch.testing.assert_close(found.images[2], middle[0], rtol=1e-2, atol=1e-2)
-    assert (found.evaluations > 0).all()
     arrived = []
     interpolate_scans(flow(), torch.stack([a, b]), 5, build_sampler("euler"), arrived=arrived.append)
     assert arrived == [2, 3, 4, 5]

@@ -27,12 +27,12 @@ class Region:
     @property
     def rows(self) -> Tensor:
         """Numbers of the rows, (height,)."""
-        return torch.arange(self.top, self.top + self.height)
+        return torch.arange(self.top, self.top + self.height, device="cpu")
 
     @property
     def columns(self) -> Tensor:
         """Numbers of the columns, (width,)."""
-        return torch.arange(self.left, self.left + self.width) % self.shape[1]
+        return torch.arange(self.left, self.left + self.width, device="cpu") % self.shape[1]
 
     @property
     def share(self) -> float:

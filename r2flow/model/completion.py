@@ -109,7 +109,7 @@ def complete(
         known = condition["known"] > 0
         any_known = bool(known.any())
         answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
-        evaluations, converged, seconds = torch.zeros(num, dtype=torch.int64), torch.ones(num, dtype=torch.bool), 0.0
+        evaluations, converged, seconds = answers.new_zeros(num).long(), answers.new_ones(num).bool(), 0.0
         for start in range(0, 0 if bool(known.all()) else num, batch_size):
             at = slice(start, min(start + batch_size, num))
             numbers = [first + i + answer * 2**32 for answer in range(at.start, at.stop)]  # of noise: 0 is sample i's

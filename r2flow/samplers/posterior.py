@@ -168,10 +168,10 @@ def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, step
     Where their squared residual exceeds `GROWN` r r, as a network's J is not exactly symmetric, it is the combination
     of the same directions with the smallest residual. A scan stops at a residual of 0 or if S is not positive along p.
     """
-    p, rr, solution = r, _dot(r, r), torch.zeros(())
+    p, rr, solution = r, _dot(r, r), r.new_zeros(())
     active = torch.ones_like(rr, dtype=torch.bool)
     tolerance, limit = torch.finfo(r.dtype).eps ** 2 * rr, GROWN * rr
-    least_residual, least = r, torch.zeros(())
+    least_residual, least = r, r.new_zeros(())
     last: tuple[Tensor, Tensor] | None = None  # the previous B p and S p, the S p being orthonormal
     for _ in range(steps):
         product, q = multiply(p)

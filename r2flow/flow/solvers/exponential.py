@@ -201,11 +201,11 @@ class _Krylov:
     def _phi(self, order: int, h: float) -> np.ndarray:
         """phi_order(h H) e_1 by the exponential of an augmented matrix (Al-Mohy, Higham, 2011)."""
         m = self.m
-        augmented = torch.zeros(m + order, m + order, dtype=torch.float64)
-        augmented[:m, :m] = h * torch.from_numpy(self.matrix[:m, :m])
+        augmented = np.zeros((m + order, m + order))
+        augmented[:m, :m] = h * self.matrix[:m, :m]
         augmented[0, m] = 1
-        augmented[m:-1, m + 1 :] = torch.eye(order - 1)
-        return torch.linalg.matrix_exp(augmented)[:m, -1].numpy()
+        augmented[m:-1, m + 1 :] = np.eye(order - 1)
+        return torch.linalg.matrix_exp(torch.from_numpy(augmented))[:m, -1].numpy()
 
     def combination(self, order: int, h: float) -> np.ndarray:
         """phi_order(h J) b in the basis."""
