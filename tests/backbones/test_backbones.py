@@ -106,10 +106,9 @@ def test_nearby_times_are_told_apart_under_autocast(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_derived_buffers_follow_loaded_rays(name):
-    source = tiny(name)
+    source, x = tiny(name), image(1)
     loaded = build_backbone(tiny_options(name), torch.zeros(2, ROWS, COLUMNS), 2).eval()
     loaded.load_state_dict(source.state_dict())
-    x = image(1)
     with torch.no_grad():
         assert torch.equal(source(0.3, x), loaded(0.3, x))
 

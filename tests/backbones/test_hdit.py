@@ -24,13 +24,14 @@ def test_circular_attention_blocks_are_the_references(shared, index):
             torch.testing.assert_close(residual, case["residual"], rtol=0, atol=1e-5)
 
 
-def test_times_and_rays_are_rounded_as_the_references(shared):  # logits of up to 100 amplify what is left
-    case, pool = load_case(shared, "hdit_16x192.pt"), torch.nn.functional.avg_pool2d
-    model, rays = backbone_of("hdit", case), pool(case["state_dict"]["coords"], (1, 4))
+def test_times_and_rays_are_rounded_as_the_references(shared, monkeypatch):  # logits of up to 100 amplify what is left
+    case, F = load_case(shared, "hdit_16x192.pt"), torch.nn.functional  # its norm rounds as published in torch 2.6 too
+    model, rays = backbone_of("hdit", case), F.avg_pool2d(case["state_dict"]["coords"], (1, 4))
+    monkeypatch.setattr("r2flow.backbones.layers.rms_norm", lambda x, scale: F.rms_norm(x, scale.shape, scale, 1e-6))
     torch.testing.assert_close(model.timestep_pe(case["t"]), case["acts"]["timestep_pe"], rtol=0, atol=5e-7)
     for level in range(3):
         assert torch.equal(model.get_buffer(f"table_{level}"), model._blocks(level)[0].residual_attn.rope.table(rays))
-        rays = pool(rays, 2)
+        rays = F.avg_pool2d(rays, 2)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
