@@ -262,21 +262,18 @@ def test_the_jump_from_noise_to_scan_is_regressed_on_pairs_alone(monkeypatch, na
 
 
 def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps_those_of_the_pairs(monkeypatch):
-    draws = torch.Generator().manual_seed(1)
-    noise, scan = torch.randn(2, 4, 2, 8, 32, generator=draws).unbind(0)
+    noise, scan = torch.randn(2, 4, 2, 8, 32, generator=torch.Generator().manual_seed(1)).unbind(0)
     batch = batch_of(noise=noise, scan=scan)
     learned = stage(objective="knots").eval()
     t, s = torch.tensor([0.0, 0.3, 0.5, 1.0]), torch.tensor([1.0, 0.3, 0.75, 1.0])
     learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
-    asked: list[torch.Tensor] = []
-    aims: list[torch.Tensor] = []
+    asked, aims = list[torch.Tensor](), list[torch.Tensor]()
     monkeypatch.setattr(learned.generator, "mean_velocity", lambda t, x, s: asked.append(x) or torch.zeros_like(x))
     learned.loss = lambda found, target: aims.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
     learned.regression_loss(batch, batch["u"])
     on_scans = (1 - t.view(4, 1, 1, 1)) * noise + t.view(4, 1, 1, 1) * scan
     on_pairs = (1 - t.view(4, 1, 1, 1)) * batch["x_0"] + t.view(4, 1, 1, 1) * batch["x_1"]
-    for row, expected, slope in [(0, on_pairs, batch["x_1"] - batch["x_0"]), (1, on_scans, scan - noise),
-                                 (2, on_pairs, batch["x_1"] - batch["x_0"]), (3, on_scans, scan - noise)]:  # fmt: skip
+    for row, (expected, slope) in enumerate([(on_pairs, batch["x_1"] - batch["x_0"]), (on_scans, scan - noise)] * 2):
         torch.testing.assert_close(asked[0][row], expected[row])
         torch.testing.assert_close(aims[0][row], slope[row])
 
@@ -286,6 +283,8 @@ def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths(parent):
     assert stage({**DATA, "scans": scans}, objective="knots").objective is not None
     with pytest.raises(InputError, match=r"leave data\.scans out, or give stage\.objective=knots"):
         stage({**DATA, "scans": scans})
+    with pytest.raises(InputError, match="times of data.pairs.knots=7 are equal in float32"):  # 1 - 8^-10 is 1
+        stage({**DATA, "pairs": {"knots": 7, "sampler": {"name": "adams3", "steps": 16, "grid": "power:10"}}})
     with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
         build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent)
     with pytest.raises(InputError, match=r"data\.scans needs the name of a data set"):

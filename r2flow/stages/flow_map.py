@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
@@ -56,8 +56,8 @@ class LearnFlowMap(Reflow):
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         self.on_pairs = data["name"] == "pairs"
         pairs = (data.get("pairs") or {}) if self.on_pairs else {}
-        by_map = build_sampler(pairs.get("sampler") or "adams3").needs == "map"
-        if self.objective is along_knots and not (pairs.get("knots") or by_map):
+        sampler, knots = build_sampler(pairs.get("sampler") or "adams3"), pairs.get("knots")
+        if self.objective is along_knots and not (knots or sampler.needs == "map"):
             raise InputError(
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
                 "data.pairs.knots=7, or stage.objective=consistency."
@@ -67,6 +67,8 @@ class LearnFlowMap(Reflow):
                 f"stage.objective={self.objective_name} learns from straight lines between pairs, whose velocities are "
                 "not those of scans: leave data.scans out, or give stage.objective=knots."
             )
+        differ = not knots or bool((sampler.knot_times(knots).float().diff() > 0).all())  # float32, as in batches
+        check(differ, f"times of data.pairs.knots={knots} are equal in float32: give fewer knots, or grid=uniform.")
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
