@@ -86,6 +86,7 @@ evaluate scans scans --generated-split train # no split named 'train'
 evaluate simulated:3 scans --split test # simulated:3 has no split: leave 'test' out
 evaluate scans --reference --train-split test # --train; found none
 evaluate scans --reference --steps 4 # found none
+evaluate scans a b c d --steps 4 # found a; b; c (and 1 more)
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans scans --json file.txt/a.json
 evaluate scans scans --json image.npy # --json must be a file

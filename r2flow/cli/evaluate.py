@@ -11,6 +11,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import SETS, DeviceOption, PrecisionOption, ReadingOptions, SamplerOptions, grouped, numbers
+from r2flow.config import at_most_three
 from r2flow.devices import choose_device
 from r2flow.errors import InputError, check, check_folder
 
@@ -80,7 +81,7 @@ class EvaluateOptions:
         if self.json is not None and (self.json.is_dir() or self.json.suffix.lower() != ".json"):
             raise InputError(f"--json must be a file that ends in .json, found {self.json}.")
         if not sampled and any(getattr(self, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
-            found = ", ".join(named) or "none"
+            found = at_most_three(named) or "none"
             raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model; found {found}.")
         if len(named) == len(sampled) and (self.generated_split or self.generated_scale):
             raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
