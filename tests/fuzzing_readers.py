@@ -62,8 +62,7 @@ def prepared(path: Path) -> bytes:
 
 def pairs(path: Path) -> bytes:
     folder = in_folder("pairs")(path)
-    options = PairOptions(num=4, sampler={"name": "euler", "steps": 1}, batch_size=2)
-    store = PairStore(folder, options, (2, 8, 64))
+    store = PairStore(folder, PairOptions(num=4, sampler={"name": "euler", "steps": 1}, batch_size=2), (2, 8, 64))
     try:
         return store.read(0)[0]["x_1"].tobytes()
     except Damaged as error:

@@ -150,7 +150,8 @@ def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(complete, tmp_path):
 
 
 def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):
-    assert "3: vlp16 with 16 beams" in complete("simulated:3", "--from", "vlp16", "--scans", 1, "--steps", 1).said
+    said = complete("simulated:3", "--from", "vlp16", "--scans", 1, "--steps", 1).said
+    assert "simulated:3: vlp16 with 16 beams" in said
     assert np.load(tmp_path / "out" / "simulated-3-000000.npy").shape == (2, 8, 64)
 
 

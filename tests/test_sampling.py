@@ -167,6 +167,7 @@ def test_frames_lie_between_the_scans():
     x_0 = (flow().encoding.encode(torch.stack([a, b])) - M) / S
     middle = flow().encoding.decode(M + S * slerp(*x_0, torch.tensor([0.5])))
     torch.testing.assert_close(found.images[2], middle[0], rtol=1e-2, atol=1e-2)
+    assert (found.evaluations > 0).all()
     arrived = []
     interpolate_scans(flow(), torch.stack([a, b]), 5, build_sampler("euler"), arrived=arrived.append)
     assert arrived == [2, 3, 4, 5]
@@ -232,6 +233,7 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     assert {name: (tmp_path / name).read_bytes() for name in names()[:4]} == whole
     with pytest.raises(InputError, match="holds other samples: seed=0 there, 1 here"):
         write(2, seed=1)
+    assert names() == [f"{number:06d}.npy" for number in range(5)]
     monkeypatch.setattr("r2flow.reports.outputs.draw", mock.Mock(side_effect=MemoryError))
     with pytest.raises(MemoryError):
         write_samples(checkpoint, tmp_path, 2, 1, build_sampler("euler", steps=2), ["npy"], replace=True)

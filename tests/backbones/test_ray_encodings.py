@@ -16,8 +16,7 @@ def units(shared):
 
 
 def test_spherical_harmonics_are_the_references(units):
-    found = SphericalHarmonics((16, 64))(units["hdl_16x64"])
-    torch.testing.assert_close(found, units["sh5_16x64"], rtol=0, atol=1e-5)
+    torch.testing.assert_close(SphericalHarmonics((16, 64))(units["hdl_16x64"]), units["sh5_16x64"], rtol=0, atol=1e-5)
 
 
 def test_rotary_frequencies_are_the_references(units):

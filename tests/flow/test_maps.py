@@ -128,8 +128,7 @@ def test_each_scan_is_asked_for_under_its_own_condition():
 
     speeds = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     rho = torch.where(T == S, 1.0, torch.zeros_like(T))
-    paths = paths_of(lambda x, t: x + 7 * t, TIMES[[0, -1]])
-    _, target = consistency(Told(speeds), paths, T, S, rho)
+    _, target = consistency(Told(speeds), paths_of(lambda x, t: x + 7 * t, TIMES[[0, -1]]), T, S, rho)
     torch.testing.assert_close(target, expand_time(torch.tensor([1.0, 7.0, 3.0]).double(), X_0).expand_as(X_0))
 
 
