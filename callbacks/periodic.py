@@ -6,7 +6,7 @@ from pathlib import Path
 import lightning as L
 import torch
 
-from r2flow.generators import Generator
+from r2flow.generators import Generator, Sampler
 from r2flow.model.sampling import draw
 from r2flow.registry import Count, Natural
 from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure
@@ -62,13 +62,16 @@ class SamplePictures(Periodic):
         super().__init__(every)
         self.folder, self.seed, self.num, self.steps = Path(folder), seed, num, steps
 
+    def sampler(self, generator: Generator) -> Sampler:
+        """The sampler of the pictures; refuses `steps` that the generator's sampler does not have."""
+        return generator.choose(steps=None if generator.fixed else self.steps)
+
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         step, path = trainer.global_step, self.folder / f"step-{trainer.global_step:08d}.png"
         generator: Generator = pl_module.generator  # type: ignore[assignment]
         if path.exists() or not generator.draws:
             return
-        steps = None if generator.fixed else self.steps
-        drawn = draw(generator, range(self.num), self.seed, generator.choose(steps=steps))
+        drawn = draw(generator, range(self.num), self.seed, self.sampler(generator))
         figure = contact_sheet(list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"])
         save_figure(figure, path)
         log_picture(trainer.loggers, "samples", figure_pixels(figure), step)

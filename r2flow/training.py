@@ -214,9 +214,9 @@ def _assembled(config: dict[str, Any], generator: Generator, asked: Sequence[str
     trainer = _build_trainer(config, stage)
     data.check_run(trainer.world_size, trainer.accumulate_grad_batches)
     callbacks: list[L.Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    for pictures in [one for one in callbacks if isinstance(one, SamplePictures) and one.every]:
+    for pictures in [one for one in callbacks if isinstance(one, SamplePictures) and one.every and generator.draws]:
         with naming("callbacks.pictures"):
-            generator.choose(steps=pictures.steps if generator.draws and not generator.fixed else None)
+            pictures.sampler(generator)
     return Run(config, stage, data, trainer)
 
 

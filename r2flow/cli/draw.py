@@ -74,8 +74,7 @@ def _region(checkpoint: "Checkpoint", sector: str | None, rows: str | None) -> "
     from r2flow.lidar.region import MARGIN, region
     from r2flow.model.sampling import evaluated_region
 
-    form = "two azimuths in degrees, such as -45,45"
-    angles = parsed("--sector", sector, form, ",", float, 2) if sector else None
+    angles = parsed("--sector", sector, "two azimuths in degrees, such as -45,45", ",", float, 2) if sector else None
     limits = parsed("--rows", rows, "the first and the last row, such as 0-31", "-", int, 2) if rows else None
     requested = region(checkpoint.sensor.shape, angles, limits, MARGIN if angles else 0.0)
     evaluated = evaluated_region(checkpoint.generator, requested)

@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 
 Rule = Literal["nearest", "linear", "inverse"]  # inverse: linear in 1 / range
-INTERPOLATIONS: dict[str, Rule] = {"nearest": "nearest", "linear": "linear", "linear, 1/r": "inverse"}  # in reports
 
 
 def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse") -> np.ndarray:

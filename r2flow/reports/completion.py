@@ -12,7 +12,7 @@ from r2flow import noise
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
 from r2flow.generators.base import Progress
-from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
+from r2flow.lidar.interpolation import Rule, interpolated
 from r2flow.lidar.known import parse_mask, ray_states
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.completion import UNITS, common_mae, errors, spread_errors
@@ -29,6 +29,7 @@ COLUMNS = {
     "mae_common_m": "MAE where all return (m)", **UNITS, "panel": "panel",
     "mae_of_median_m": "MAE of the median (m)", "crps_m": "CRPS (m)", "coverage": "coverage", "nominal": "of nominal",
 }  # fmt: skip
+INTERPOLATIONS: dict[str, Rule] = {"nearest": "nearest", "linear": "linear", "linear, 1/r": "inverse"}
 
 
 def measured_by(task: str, sensor: Sensor, number: int) -> np.ndarray:

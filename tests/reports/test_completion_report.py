@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from r2flow.generators import Generated, build_generator
-from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
+from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.completion import completion_rows, measured_by
+from r2flow.reports.completion import INTERPOLATIONS, completion_rows, measured_by
 from r2flow.samplers import build_sampler
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder

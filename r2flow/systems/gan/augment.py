@@ -34,12 +34,11 @@ class BatchDraws:
 
     def uniform(self, shape: tuple[int, ...]) -> Tensor:
         """Uniform in [0, 1), (B, *shape)."""
-        return torch.stack([torch.from_numpy(stream.random(shape, dtype="float32")) for stream in self.streams])
+        return torch.stack([torch.from_numpy(rng.random(shape, dtype="float32")) for rng in self.streams])
 
     def normal(self, shape: tuple[int, ...]) -> Tensor:
         """Standard normal, (B, *shape)."""
-        rows = [torch.from_numpy(stream.standard_normal(shape, dtype="float32")) for stream in self.streams]
-        return torch.stack(rows)
+        return torch.stack([torch.from_numpy(rng.standard_normal(shape, dtype="float32")) for rng in self.streams])
 
 
 Draw = tuple[Tensor, Tensor]

@@ -173,8 +173,7 @@ class LearnGan(Stage):
 
     def make(self, z: Tensor, draws: BatchDraws) -> Tensor:
         """G(z), (B, C, H, W), with random mask and rotation."""
-        rows, columns = self.generator.space.shape[1:]
-        uniform = draws.uniform((1, rows, columns)).to(z.device) if self.generator.drops else None
+        uniform = draws.uniform((1, *self.generator.space.shape[1:])).to(z.device) if self.generator.drops else None
         shift = None if self.generator.angle is None else draws.uniform((1,))[:, 0].to(z.device)
         return self.generator.made(z, uniform, shift)["image"]
 
