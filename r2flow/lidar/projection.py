@@ -85,13 +85,12 @@ def project_indices(
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     finite = np.isfinite(r)
-    points = xyz
     if not finite.all():  # rays without a return: fired in unfolding, but not in any pixel
-        points, r = np.where(finite[:, None], xyz, np.float32(0)), np.where(finite, r, np.float32(0))
+        xyz, r = np.where(finite[:, None], xyz, np.float32(0)), np.where(finite, r, np.float32(0))
     unfolding = projection == "unfolding"
-    row = unfolded_rows(xyz, sensor, convention, ring) if unfolding else _rows(points, r, sensor, convention)
+    row = unfolded_rows(xyz, sensor, convention, ring) if unfolding else _rows(xyz, r, sensor, convention)
     pixel = row * columns
-    pixel += _columns(points, columns, convention)
+    pixel += _columns(xyz, columns, convention)
     within = finite & (r >= sensor.min_range) & (r <= sensor.max_range)
     if convention != "centre":
         if convention == "lidm":

@@ -222,7 +222,8 @@ def test_points_of_an_image_of_any_width_unfold_to_it(columns):
     sensor = SENSORS["vlp16"].resized(columns=columns)
     image = cloud(sensor, 5)[1][None]
     xyz, _ = image_to_points(image, sensor.rays())
-    np.testing.assert_allclose(project(xyz, None, sensor, "unfolding")[0], image[0], rtol=1e-6)
+    for points in (xyz, np.insert(xyz, range(len(xyz)), np.nan, axis=0)):
+        np.testing.assert_allclose(project(points, None, sensor, "unfolding")[0], image[0], rtol=1e-6)
 
 
 def test_lost_rays_leave_every_point_its_beam(tmp_path):
