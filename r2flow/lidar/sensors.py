@@ -88,7 +88,7 @@ class Sensor:
         else:
             assert convention == "reference", convention
             elevation, shift = self.row_edges[:-1], 0.0
-        azimuth = math.pi - 2 * math.pi * (np.arange(self.columns) + shift) / self.columns
+        azimuth = math.pi * (1 - 2 * (np.arange(self.columns) + shift) / self.columns)  # 0 exactly in the middle
         grid = np.stack(np.meshgrid(np.deg2rad(elevation), azimuth, indexing="ij"))
         return torch.from_numpy(grid.astype(np.float32))
 

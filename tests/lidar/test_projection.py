@@ -217,7 +217,7 @@ def test_ring_numbers_keep_their_rows_whichever_rings_returned(how, first, missi
     np.testing.assert_allclose(again[0], image, rtol=1e-6)
 
 
-@pytest.mark.parametrize("columns", [48, 63, 64, 255])
+@pytest.mark.parametrize("columns", [48, 63, 64, 83, 255])
 def test_points_of_an_image_of_any_width_unfold_to_it(columns):
     sensor = SENSORS["vlp16"].resized(columns=columns)
     image = cloud(sensor, 5)[1][None]
