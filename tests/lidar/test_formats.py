@@ -88,7 +88,7 @@ def test_archives_of_numpy(tmp_path: Path, save):
     same(read_points(path))
     save(path, xyz=F4, intensity=INTENSITY, ring=RING, pose=np.eye(4))
     same(read_points(path), RING)
-    save(path, X=XYZ[:, 0], Y=XYZ[:, 1], Z=XYZ[:, 2], Reflectivity=INTENSITY, stamp=3)
+    save(path, X=XYZ[:, 0], Y=XYZ[:, 1], Z=XYZ[:, 2], Reflectivity=INTENSITY, scan=3)
     same(read_points(path))
     save(path, F4)
     same(read_points(path), intensity=None)

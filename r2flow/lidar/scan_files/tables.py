@@ -50,7 +50,8 @@ def read_npz(path: Path) -> Table:
         check_unpacked(path, sum(info.file_size for info in members.values()))
         lower = {name.lower(): name for name in members}
         alone = next(iter(members)) if len(members) == 1 else None
-        table = next((lower[name] for name in TABLES if name in lower), alone)
+        usual = () if {"x", "y", "z"} <= lower.keys() else TABLES
+        table = next((lower[name] for name in usual if name in lower), alone)
         others = [name for name in _named(members) if name != table]
         arrays = {}
         for name in [*([table] if table else []), *others]:
