@@ -187,7 +187,7 @@ def folder(root: Path) -> list[Drive]:
 
 
 def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
-    """All folders from a root down with their files, following links, each folder once."""
+    """All folders from a root down with their files, following links, each folder once, without hidden folders."""
     seen: set[str] = set()
     walk = os.walk(root, onerror=lambda e: warn_odd(Path(e.filename), "left out, not readable"), followlinks=True)
     for place, folders, names in walk:
@@ -195,7 +195,7 @@ def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
             folders.clear()
             continue
         seen.add(real)
-        folders.sort()
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
         yield place, names
 
 

@@ -92,7 +92,8 @@ def made_here(root: str | Path) -> bool:
         return folder.is_dir()
     with os.scandir(folder) as entries:  # knows folders without a system call per file; fails at a loop of links
         listed = [e for e in entries if scan_ending(e.name) or (os.path.isdir(e) if e.is_symlink() else e.is_dir())]
-    below = [e.path for e in listed if scan_ending(e.name) or os.access(e, os.X_OK)]  # not a disk's lost+found
+    shown = (e for e in listed if not e.name.startswith("."))  # not a disk's .Trash-1000, nor its lost+found
+    below = [e.path for e in shown if scan_ending(e.name) or os.access(e, os.X_OK)]
     return bool(below) and all(map(manifest_of, below))
 
 

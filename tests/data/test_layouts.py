@@ -78,7 +78,7 @@ def test_a_missing_or_empty_root_says_what_was_looked_for(layout: str, tmp_path:
 
 def test_a_folder_that_may_not_be_entered_is_left_out_with_its_name(tmp_path: Path, monkeypatch, caplog):
     Store(tmp_path / "day", "samples", {}).begin()
-    for place in ("day", "lost+found"):  # of a disk, for root alone
+    for place in ("day", "lost+found", ".Trash-0"):  # of a disk, for root alone; of what was deleted there
         write_scan(tmp_path / place / "0.bin", 1)
     scandir, closed = os.scandir, Mock(side_effect=PermissionError(13, "Permission denied", tmp_path / "lost+found"))
     monkeypatch.setattr(os, "access", lambda path, mode: "lost" not in str(path))
