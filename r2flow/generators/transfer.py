@@ -125,14 +125,12 @@ class TransferFlow(Flow):
 
     def answers(self, t: Tensor, x: Tensor, about: Surroundings, rows: Tensor) -> Answers:
         """p(x_1 | x_t, condition) at times t, (B,) or (), with x = x_t, (B, C, H, W); `rows` are of `RowFeatures`."""
-        shape = len(x), -1, *x.shape[2:]
-        inputs = torch.cat([x - about.start, about.features, rows.expand(*shape)], 1)
+        inputs = torch.cat([x - about.start, about.features, rows.expand(len(x), -1, *x.shape[2:])], 1)
         output = self.backbone(t, inputs).float()
         if self.foreign:
-            rows = rows.clone()
-            rows[:, ROW] += STEEP * RAISED
-            inputs = torch.cat([x - about.start, about.features, rows.expand(*shape)], 1)
-            output[:, -2] = self.backbone(t, inputs).float()[:, -2]
+            raised = inputs.clone()
+            raised[:, ROW - RowFeatures.FEATURES] += STEEP * RAISED  # the elevation, among the last inputs
+            output[:, -2] = self.backbone(t, raised).float()[:, -2]
         logits, shifts, scales = output[:, :-2].chunk(3, 1)
         returns, strength = output[:, -2:].split(1, 1)
         bias = output.new_tensor([0, 0, 0, 0, 2, 1, 0])[:, None, None]
