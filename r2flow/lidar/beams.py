@@ -66,19 +66,20 @@ def _beams(scans: Sequence[Points]) -> Beams:
     if (rings := _rings(scans, elevations)) is not None:
         beams = _by_laser(elevations, rings, RING_AFTER_RING)
         # A ring with few returns may be merged with the next; elevation peaks separate them.
-        more = peaks is not None and len(peaks.elevations) > len(beams.elevations)
-        return replace(peaks, order=RING_AFTER_RING) if more and peaks is not None else beams
-    if peaks is None and all(map(_is_scattered, scans)):
+        if peaks is not None and len(peaks.elevations) > len(beams.elevations):
+            return replace(peaks, order=RING_AFTER_RING)
+        return beams
+    if peaks is not None:
+        return peaks
+    if all(map(_is_scattered, scans)):
         raise NoBeamsError(
             "their points lie on no beams, as those of a Livox or another scanner whose pattern does not repeat, or of "
             "several scans in one file: they are no rows of a range image, which a spinning LiDAR makes"
         )
-    if peaks is None:
-        raise InputError(
-            "the beams cannot be told apart: no ring numbers of beams, no known order of the points, and "
-            "their elevations form no peaks. Are they scans of one sensor, in its own frame? If so, use a built-in one."
-        )
-    return peaks
+    raise InputError(
+        "the beams cannot be told apart: no ring numbers of beams, no known order of the points, and "
+        "their elevations form no peaks. Are they scans of one sensor, in its own frame? If so, use a built-in one."
+    )
 
 
 def _is_scattered(scan: Points) -> bool:
