@@ -54,8 +54,8 @@ def open_partial(
     """Open the scans of some names (`open_scans`). Scans are read on demand, except a few to determine their sensor.
 
     A scan of the model's sensor is measured everywhere. A scan of another sensor is measured in the rows that contain
-    its beams: the beams of `source`, else of the sensor stored with samples and prepared scans, else an estimate from
-    the scans.
+    its beams: of prepared scans those of the sensor stored with them, of others those of `source`, else of the sensor
+    stored with samples, else an estimate from the scans.
 
     Args:
         reading: How the model's training scans became images.
