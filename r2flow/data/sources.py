@@ -265,7 +265,7 @@ class SimulatedScans(MadeScans):
 
     slow, word = True, "scene"
 
-    def __init__(self, sensor: Sensor, seed: int, numbers: Sequence[int], reflectance: bool = True) -> None:
+    def __init__(self, sensor: Sensor, seed: int, numbers: Sequence[int], reflectance: bool) -> None:
         self.sensor, self.seed, self.numbers, self.reflectance = sensor, seed, numbers, reflectance
 
     def about(self) -> dict[str, Any]:

@@ -127,7 +127,7 @@ def _between(log_r: Tensor, strength: Tensor, distance: Tensor) -> tuple[Tensor,
     return -((-log_r).exp() * share).sum(1, keepdim=True).clamp(min=1e-6).log(), (strength * share).sum(1, keepdim=True)
 
 
-def nearest_returns(returned: Tensor, steps: Tensor, ring: bool = True) -> Tensor:
+def nearest_returns(returned: Tensor, steps: Tensor, ring: bool) -> Tensor:
     """Rows and columns from each ray to the nearest returns above, below, left and right, (4, 2, B, H, W) float32.
 
     `Above` is the quadrant of previous rows whose distance in columns is at most the distance in rows; the others are

@@ -158,7 +158,7 @@ class TransferFlow(Flow):
     def map(self, condition: Condition | None = None) -> MeanVelocity:
         return Conditioned(self, condition or {})
 
-    def transported(self, x_0: Tensor, condition: Condition, residual: float = 1.0) -> Tensor:
+    def transported(self, x_0: Tensor, condition: Condition, residual: float) -> Tensor:
         """x_1 in one evaluation, by the monotone map of a normal number z per ray to its density: log r = F^-1(Phi(z)).
 
         This is the optimal transport between the two in one dimension. z is the noise, smoothed so that neighbouring

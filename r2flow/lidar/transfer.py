@@ -30,7 +30,7 @@ class Partial:
     points: Points | None = None  # all points of the scan's file; the image has the nearest one of each pixel
 
 
-def sensor_of(scans: list[Points], named: Sensor | None = None) -> Sensor:
+def sensor_of(scans: list[Points], named: Sensor | None) -> Sensor:
     """The sensor of some scans, named or estimated, with as many columns as rays per turn."""
     if named is None:
         estimate = estimate_sensor(scans)

@@ -104,7 +104,7 @@ class Rays:
     and height z of the laser. The s of an intersection with an upright surface depends on the column only.
     """
 
-    def __init__(self, lasers: Lasers, columns: int, ground: float = 0.0) -> None:
+    def __init__(self, lasers: Lasers, columns: int, ground: float) -> None:
         self.lasers, self.columns, self.ground = lasers, columns, ground
         self.shape = len(lasers.elevation), columns
         self.azimuth = np.pi - 2 * np.pi * (np.arange(columns) + 0.5) / columns  # a in radians, (W,), float64

@@ -136,7 +136,7 @@ def _clumps(
         b.add(blob, "vegetation", "leaves", albedo)
 
 
-def tree(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
+def tree(b: SceneBuilder, x: float, y: float, size: float) -> None:
     if not b.post(x, y):
         return
     draws, ground = b.draws, b.level(x, y)
@@ -148,7 +148,7 @@ def tree(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
     _clumps(b, x, y, ground + clear + tall, crown, tall, clump * crown, count, draws.uniform(0.4, 1.3))
 
 
-def bush(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
+def bush(b: SceneBuilder, x: float, y: float, size: float) -> None:
     """A few leafy clumps on the ground."""
     height = b.draws.uniform(0.3, 0.9) * size
     z = b.level(x, y) + height * 0.8
@@ -253,7 +253,7 @@ def cabinet(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
     b.add(box, "other-structure", "concrete")
 
 
-def person(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = True) -> None:
+def person(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool) -> None:
     """Two legs, a trunk, arms and a head."""
     if not b.take(x, y, 0.0, 0.5, 0.5):
         return
