@@ -230,9 +230,10 @@ def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
     x = encoding.encode(case["metres"][None])
     assert_near(x, case["model_space"], 1e-6)
     assert torch.equal(returns(x[None], encoding)[0], case["mask"])
-    metric = Encoding(sensor, "metric", reflectance=False)  # published: r < 1 / 255 m is no return, without the shift
-    edge = torch.tensor([0.0, 0.0038, 0.005, 1.0])[None, None, None]
-    assert returns(metric.encode(edge), metric).flatten().tolist() == [-1, -1, 1, 1]
+    edge = torch.tensor([0.0, 0.0038, 0.005, 1.0])[None, None, None]  # published: r < 1 / 255 m is no return
+    for name, mask in (("metric", [-1, -1, 1, 1]), ("inverse", [-1, 1, 1, 1])):  # `inverse` clips to 1 m
+        other = Encoding(sensor, name, reflectance=False)
+        assert returns(other.encode(edge), other).flatten().tolist() == mask
     encoding = Encoding(sensor, "shifted_log", reflectance=False, limits="open")
     decoded = encoding.decode(case["sample"][None])[0]
     assert torch.equal(decoded > 0, case["sample_valid"])
@@ -389,9 +390,8 @@ def test_a_latent_diffusion_starts_from_its_autoencoder_alone():
 
 @pytest.mark.parametrize(("changes", "said"), [({"name": "ddpm"}, "denoise"), ({"steps": 1000}, "in 1 to 999")])
 def test_a_sampler_that_a_latent_diffusion_does_not_have_is_refused(changes: dict[str, Any], said: str):
-    generator = build_generator(DIFFUSION)
     with pytest.raises(InputError, match=said):
-        generator.choose(**changes)
+        build_generator(DIFFUSION).choose(**changes)
 
 
 def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():

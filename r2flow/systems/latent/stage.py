@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from r2flow.errors import InputError
 from r2flow.generators import Generator
-from r2flow.lidar.encoding import Encoding, ShiftedLog
+from r2flow.lidar.encoding import Encoding
 from r2flow.processes import averaged
 from r2flow.registry import Count, Natural, NonNegative, construct
 from r2flow.stages.base import Batch, SingleLoss, Stage
@@ -80,14 +80,11 @@ def adversarial_factor(step: int, start: int, inverted: bool = False) -> float:
 
 
 LEAST = 1 / 255  # metres: shorter ranges are not returns
-SHIFT = 1e-4  # metres; added by `ShiftedLog`, missing in the published threshold
 
 
 def returns(x: Tensor, encoding: Encoding) -> Tensor:
     """Mask of returns of images in model space, 1 or -1, (B, 1, H, W)."""
-    metres = LEAST - SHIFT if isinstance(encoding.format, ShiftedLog) else LEAST
-    least = encoding.format.forward(torch.full((1, 1, 1), metres, device=x.device))
-    return torch.where(x[:, :1] < 2 * least - 1 + 1e-6, -1.0, 1.0)
+    return torch.where(encoding.format.inverse((x[:, :1] + 1) / 2) < LEAST, -1.0, 1.0)
 
 
 class LearnAutoencoder(Stage):
