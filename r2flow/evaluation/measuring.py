@@ -162,8 +162,9 @@ def measure(
     for name, metric in metrics.items():
         metric.reset()
         metric.load_real_state(real[name].states)
+    before = getattr(generated.source, "unsolved", 0)
     empty = _update(metrics, generated, range(len(generated)), False, work, protocol)
-    unsolved = int(summed(torch.tensor(getattr(generated.source, "unsolved", 0))))
+    unsolved = int(summed(torch.tensor(getattr(generated.source, "unsolved", 0) - before)))
     elevations = generated.sensor.elevations
     described: dict[str, Any] = {
         "name": protocol.name, "points": {"real": WORDS[protocol.real], "generated": WORDS[protocol.generated]},
