@@ -157,14 +157,13 @@ class LearnGan(Stage):
         of_real, of_fake = self.discriminator(seen), self.discriminator(fake)
         wrong = discriminator_loss(of_real, of_fake)
         self.take_step(for_discriminator, wrong)
-        if self.augment is not None:
-            self.augment.count(of_real)
 
         if self.r1 and step % self.r1_every == 0:
             penalty = self.penalty(real, images, BatchDraws(self.seed, batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
             self.log("train/last_r1", penalty, sync_dist=True)  # Lightning repeats it until the next one
         if self.augment is not None:
+            self.augment.count(of_real)
             if self.augment.every and step % self.augment.every == 0:
                 self.augment.move()
             self.log("train/augmented", self.augment.p)
