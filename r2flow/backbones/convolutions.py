@@ -75,7 +75,7 @@ class Resample(ExactBuffers):
 class GroupNorm(nn.GroupNorm):
     """Group norm computed in float32."""
 
-    def __init__(self, channels: int, groups: int = GROUPS, eps: float = EPS, affine: bool = True) -> None:
+    def __init__(self, channels: int, groups: int, eps: float = EPS, affine: bool = True) -> None:
         shared(channels, groups, f"{groups} groups")
         super().__init__(groups, channels, eps=eps, affine=affine)
 
@@ -123,8 +123,8 @@ class BlockOptions:
     condition_channels: int
     ring: bool
     dropout: float
-    groups: int = GROUPS
-    eps: float = EPS
+    groups: int
+    eps: float
 
 
 class ResidualBlock(nn.Module):

@@ -65,7 +65,7 @@ def is_hidden_matrix(p: Tensor) -> bool:
     return p.ndim >= 2 and min(p.shape[:2]) >= LEAST_CHANNELS
 
 
-def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
+def orthogonalised(matrix: Tensor) -> Tensor:
     """Approximate U V^T of a matrix U S V^T, (rows, columns): singular values become 0.68 to 1.14, tiny ones less.
 
     Newton-Schulz iteration: each step is the polynomial a X + (b A + c A A) X with A = X X^T, in bfloat16.
@@ -73,7 +73,7 @@ def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
     a, b, c = 3.4445, -4.7750, 2.0315
     x = matrix.T if matrix.shape[0] > matrix.shape[1] else matrix
     x = (x / (torch.linalg.matrix_norm(x) + 1e-7)).bfloat16()
-    for _ in range(steps):
+    for _ in range(5):
         square = x @ x.T
         x = a * x + (b * square + c * square @ square) @ x
     x = x.to(matrix.dtype)
