@@ -25,7 +25,7 @@ class Backbone(ExactBuffers):
     - follow_rays: Computes unsaved buffers from `coords`; called by the constructor and whenever `coords` is loaded.
     - takes_second_time: The class supports `second_time=True`: it then has an `interval_embedding` of s - t, created
       after all other layers, whose last layer is zero, and `velocity` takes s (see `condition`).
-    - croppable: It can be evaluated on a part of its image. Layers that use the ring pad with zeros after `open_ring`.
+    - croppable: It can be evaluated on a part of its image. A layer's `open_ring` ends its wrapping of columns.
     - any_size: It takes images of any number of rows and columns.
     - learns_directions: It learns a vector per direction, so that scans must not be rotated in training.
 

@@ -15,7 +15,7 @@ from r2flow.backbones.layers import uncast, wrapped, zero_initialised
 class Local(Backbone):
     """Residual 3 x 3 convolutions, dilated along the rows, on images of any number of rows and columns.
 
-    Padding is circular in azimuth if the image is a full turn, else zero.
+    Padding is circular in azimuth for `ring`, also of crops in training, else zero.
 
     Args:
         channels: Width of the hidden layers.

@@ -73,7 +73,7 @@ class Generator(nn.Module):
         fixed: True for a distilled model: only `sampler` is valid.
     """
 
-    draws: ClassVar[bool] = True  # whether it makes scans of noise; False for an autoencoder, never sampled
+    draws: ClassVar[bool] = True  # whether it makes scans of N(0, I) alone; False for autoencoders, transfer flows
     told: ClassVar[bool] = False  # whether it takes a condition of `r2flow.generators.condition_of`
     learns_directions: ClassVar[bool] = False  # whether it learns a vector per direction: no rotation in training
     usual: ClassVar[Sampler] = FixedSteps()  # default sampler of a new generator
