@@ -148,7 +148,8 @@ class MMPS(Posterior):
         def mean(t: Tensor, x: Tensor) -> Tensor:
             at = t.clamp(min=EARLIEST)
             with torch.enable_grad():
-                state = (x * ((1 - at) / (1 - t))).detach().requires_grad_()
+                scale = torch.where(t < at, (1 - at) / (1 - t), 1)  # 0 / 0 at a late t that float32 rounds to 1
+                state = (x * scale).detach().requires_grad_()
                 x_1 = state + (1 - at) * u(at, state, at)
 
             def multiply(p: Tensor) -> tuple[Tensor, Tensor]:
