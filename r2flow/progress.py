@@ -51,7 +51,6 @@ class Bar(Progress):
             print(line.rstrip(), file=sys.stderr, flush=True)
 
     def evaluated(self) -> None:
-        """Count an evaluation of the network."""
         self._spent += 1
         self.set(note=f"{self._spent} evaluations")
         self(self._share)

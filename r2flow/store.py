@@ -66,7 +66,6 @@ class Store:
         self.digest = checksum(self.described)
 
     def files(self, item: int) -> list[Path]:
-        """The files of an item."""
         return [self.folder / f"{self.kind}-{item:06d}.safetensors"]
 
     def check(self) -> bool:
@@ -109,7 +108,6 @@ class Store:
         return True
 
     def missing(self, items: Iterable[int]) -> list[int]:
-        """The items that do not exist yet."""
         return [item for item in items if not self.has(item)]
 
     def write(self, item: int, tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> None:

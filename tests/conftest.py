@@ -91,7 +91,6 @@ def write_run(folder: Path, flow: Checkpoint, stage: dict[str, Any], scale: floa
 
 @contextlib.contextmanager
 def small_disk(size: int) -> Iterator[None]:
-    """Writing a file past a number of bytes fails as on a full disk."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     try:
@@ -113,7 +112,6 @@ def memory_below(size: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def refused(*words: object) -> Iterator[None]:
-    """The block ends in one line for the user, which holds these words."""
     with pytest.raises(InputError) as caught:
         yield
     assert "\n" not in str(caught.value)
@@ -166,13 +164,11 @@ class Done(NamedTuple):
 
     @property
     def said(self) -> str:
-        """The output of a command that succeeds."""
         assert self.returncode == 0, self.stderr
         return self.stdout
 
     @property
     def quiet(self) -> str:
-        """The output of a command that succeeds without a warning."""
         assert not self.stderr
         return self.said
 
@@ -185,7 +181,6 @@ class Done(NamedTuple):
 
 
 def captured(run: Callable[[], int | None]) -> Done:
-    """A command in this process, which costs no import of torch."""
     said, complained = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
@@ -257,7 +252,6 @@ def numbers(source: Sequence[np.ndarray]) -> list[int]:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """What lies in a folder, by name, but for hidden files."""
     return {path.name: path.read_bytes() for path in sorted(folder.glob("[!.]*")) if path.is_file()}
 
 
@@ -272,7 +266,6 @@ def kitti_360(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def numbered(tmp_path: Path) -> Path:
-    """Twelve scans in a folder, at 5 to 16 m."""
     return folder_of(tmp_path / "scans", 0, 12)
 
 

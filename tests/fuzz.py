@@ -51,7 +51,6 @@ def damaged(content: bytes, draw: np.random.Generator) -> bytes:
 
 
 def peak() -> int:
-    """The most memory that this process has had, in bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
@@ -60,7 +59,6 @@ def too_long(*_: object) -> None:
 
 
 def finding(read: Callable[[Path], object], path: Path, whole: object) -> tuple[bool, str | None]:
-    """Whether a damaged file was read, and what is wrong with that."""
     from r2flow.errors import InputError
 
     signal.alarm(PATIENCE)
@@ -80,7 +78,6 @@ def finding(read: Callable[[Path], object], path: Path, whole: object) -> tuple[
 
 
 def main(folder: Path, seed: int, count: int) -> None:
-    """Damage each file of `folder/KIND/NAME` `count` times and read it."""
     from tests.fuzzing_readers import READERS
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))

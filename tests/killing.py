@@ -31,7 +31,6 @@ def die_at(rename: int, before: bool) -> None:
 
 
 def in_child(work: Callable[[], object]) -> int:
-    """Begin work in a child process: its process id."""
     child = os.fork()
     if child == 0:
         try:

@@ -64,7 +64,6 @@ def full_scan(path: Path, number: int = 0) -> np.ndarray:
 
 
 def sparse_scan(path: Path, steps: int = 900) -> np.ndarray:
-    """A VLP-16's scan of a round room without reflectance; its points."""
     e = np.deg2rad(np.asarray(VLP16.elevations) + 0.1)[None]
     a = np.linspace(-np.pi, np.pi, steps, endpoint=False)[:, None]
     e, a = np.broadcast_arrays(e, a)

@@ -63,7 +63,6 @@ def distance(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.fixture
 def measured(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
-    """Scans of points anywhere in their bins, and the points."""
     draw, clouds = np.random.default_rng(5), []
     for number, image in enumerate(images(6, 1)):
         xyz = points(image[0], *angles(*draw.uniform(0.02, 0.98, (2, H, W)))).astype(np.float32)

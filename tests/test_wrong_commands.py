@@ -194,7 +194,6 @@ def listing(folder: Path) -> dict[Path, tuple[int, int]]:
 @pytest.fixture
 def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
     def ready(run: r2flow.training.Run) -> None:
-        """In place of `fit`: what it reads before the first step."""
         if run.config["data"]["name"] != "simulated":
             run.data.read()
         raise AssertionError("it would train")

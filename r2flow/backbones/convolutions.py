@@ -68,7 +68,6 @@ class Resample(ExactBuffers):
         self.ring = False
 
     def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:
-        """All taps per output value."""
         return output.numel() * self.kernel.numel() ** 2
 
 

@@ -234,7 +234,6 @@ def _reading_of(model: Any) -> Reading:
 
 
 def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale: float | None = None) -> Tensor:
-    """`r2flow.read`."""
     check(isinstance(path, str | Path), f"give the path of a scan; found {type(path)}.")
     right = reflectance_scale is None or (isinstance(reflectance_scale, Real) and 0 < reflectance_scale < math.inf)
     check(right, f"reflectance_scale must be a positive number, found {reflectance_scale!r}.")

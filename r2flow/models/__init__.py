@@ -35,7 +35,6 @@ DENSIFY = "densify"
 
 
 def model_file(name: str) -> Path:
-    """Path of a model's file."""
     MODELS[name]  # refuses unknown names
     return FOLDER / f"{name}.safetensors"
 

@@ -70,7 +70,6 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
 
 
 def write_json(page: Page, path: Path) -> None:
-    """Write only the JSON of a page."""
     write_file(path, _json(page, provenance(page)))
 
 

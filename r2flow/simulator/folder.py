@@ -40,7 +40,6 @@ class SimulatedFolder(FileStore):
             )
 
     def simulate(self, item: int) -> None:
-        """Simulate a scan and write its files."""
         scan = simulate(self.sensor, self.seed, item)
         rays, name = self.sensor.rays(), f"{item:06d}"
         write_scan(scan.image, rays, self.folder, name, self.formats)

@@ -102,7 +102,6 @@ class SceneBuilder:
         self._rows[type(solid)].append((*solid, LABELS[label], INDEX[material], albedo, closed, pattern, base))
 
     def build(self, rig: int | None = None) -> Scene:
-        """The scene as tables."""
         return Scene(self.ground, tuple(_table(shape, rows) for shape, rows in self._rows.items() if rows), rig)
 
 

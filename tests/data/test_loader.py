@@ -9,7 +9,6 @@ from r2flow.errors import InputError
 
 
 def numbers(*values: float) -> InMemory:
-    """Scans of one pixel, whose ranges are these numbers."""
     return InMemory(np.array(values, np.float32).reshape(-1, 1, 1, 1), [str(value) for value in values])
 
 

@@ -69,7 +69,6 @@ def measured(metric: ScanMetric, real: Scans, generated: Scans) -> ScanMetric:
 
 
 def given(metric: ScanMetric, real: ArrayLike, generated: ArrayLike) -> dict[str, float]:
-    """The metric's figures of rows, (N, ...), in the place of scans."""
     for rows, side in ((real, SIDES[0]), (generated, SIDES[1])):
         metric.add_rows(torch.as_tensor(rows).flatten(1), side, range(len(rows)))
     return metric.compute()
@@ -77,6 +76,5 @@ def given(metric: ScanMetric, real: ArrayLike, generated: ArrayLike) -> dict[str
 
 @pytest.fixture
 def summary(monkeypatch: pytest.MonkeyPatch) -> Summary:
-    """The stand-in; also what every name of a network loads."""
     put_in_place_of_networks(monkeypatch)
     return Summary()

@@ -32,7 +32,6 @@ def scans(r, q=0.3, sensor=SENSOR):
 
 
 def by_name(rows, extractor=BOTH):
-    """Features (B, D) as {statistic: (B, cells)}."""
     cells = [SECTORS if name.endswith(SECTORED) else BANDS for name in extractor.scales]
     return dict(zip(extractor.scales, rows.split(cells, dim=1), strict=True))
 

@@ -22,7 +22,6 @@ SENSOR = SENSORS["hdl64e"].resized(16, 64)
 
 
 def walls(count: int, seed: int) -> np.ndarray:
-    """Scenes of a sort: ground and a wall at a distance of its own."""
     e, a = SENSOR.rays().numpy()
     images = []
     for index in range(count):

@@ -67,7 +67,6 @@ def scan(sensor, noise, *things, ground=None):
 
 
 def figures(*scans):
-    """Of the first set as generated, of the last as real."""
     return measured(METRICS["things"](), scans[-1], scans[0]).compute()
 
 

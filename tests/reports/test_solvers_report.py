@@ -41,7 +41,6 @@ def test_a_row_is_what_the_solver_did():
 
 
 def trained(problem):
-    """An exact problem in the place of a checkpoint."""
     return SimpleNamespace(encoding=None, generator=Field(problem, (16,)))
 
 

@@ -148,7 +148,6 @@ def train(scans: Path, tmp_path: Path) -> Run:
 
 @pytest.fixture(scope="session")
 def alone(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """(folder, what it printed) of the tiny run that nobody disturbed."""
     cwd = tmp_path_factory.mktemp("alone")
     done = run_train(cwd, scans, "name=alone")
     return cwd / "runs" / "alone", done.stdout

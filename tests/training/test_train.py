@@ -30,7 +30,6 @@ from tests.training.conftest import TINY, Run, hold_at, in_process, start, stop_
 
 
 def weights(run: Path) -> tuple[dict, dict]:
-    """(raw, averaged) of the last checkpoint."""
     content = read_checkpoint(checkpoints_of(run)[0])
     return content["current_model_state"], content["state_dict"]
 

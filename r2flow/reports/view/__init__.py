@@ -93,7 +93,6 @@ def page(panels: Sequence[Panel], title: str = "r2flow") -> str:
 
 
 def write_page(path: str | Path, panels: Sequence[Panel], title: str = "r2flow") -> Path:
-    """Write the `page` of panels atomically."""
     write_file(path, page(panels, title))
     return Path(path)
 
