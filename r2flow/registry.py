@@ -99,7 +99,6 @@ class Registry(Mapping[str, T]):
         return f"Registry({self.kind}: {', '.join(self)})"
 
     def add(self, name: str, entry: T) -> None:
-        """Add an entry."""
         if name in self._entries:
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
         self._entries[name] = entry
@@ -121,7 +120,7 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
     parameters = _parameters(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
-    known = _by_keyword(parameters[given:])
+    known = _by_keyword(parameters, given)
     for key, value in options.items():
         if key not in known:
             names = ", ".join(known) or "none"
@@ -144,7 +143,7 @@ def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any
 
     `given` positional arguments are passed in addition.
     """
-    options = _by_keyword(_parameters(constructor)[given:])
+    options = _by_keyword(_parameters(constructor), given)
     defaults = {name: MISSING if p.default is p.empty else p.default for name, p in options.items()}
     if dataclasses.is_dataclass(constructor):
         for f in dataclasses.fields(constructor):
@@ -153,8 +152,10 @@ def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any
     return defaults
 
 
-def _by_keyword(parameters: Sequence[inspect.Parameter]) -> dict[str, inspect.Parameter]:
-    return {p.name: p for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)}
+def _by_keyword(parameters: Sequence[inspect.Parameter], given: int) -> dict[str, inspect.Parameter]:
+    taken = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD][:given]
+    by_name = [p for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    return {p.name: p for p in by_name if p.name not in taken}
 
 
 def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:

@@ -46,6 +46,10 @@ def test_an_annotated_option_is_checked_as_what_it_annotates():
         check_options("thing", make, {"width": 1, "name": 3})
 
 
+def test_arguments_by_position_take_no_option_by_keyword():
+    assert options_of(lambda *given, damping=1.0: None, given=2) == {"damping": 1.0}
+
+
 def test_options_of_a_dataclass_have_values_of_their_own():
     @dataclass
     class Settings:
