@@ -34,7 +34,7 @@ class Stage(L.LightningModule):
     `optimizers_for` and, in every `training_step`, calls `take_step(optimizer, loss)` for each of `own_optimizers()`.
 
     Args:
-        generator: The generator to train. Checkpoints store its weights and no others.
+        generator: The generator to train; commands load it from a checkpoint without the stage.
         learning_rate: AdamW's learning rate; linear warm-up, then a cosine to 0 at the run's last step.
         betas, weight_decay: AdamW's.
         muon: Learning rate of the weight matrices by `Muon`, with the same schedule; None: AdamW for all weights.
@@ -103,7 +103,7 @@ class Stage(L.LightningModule):
         seed_torch(self.seed, "dropout", batch_idx * self.trainer.world_size + self.global_rank)
 
     def configure_optimizers(self) -> Any:
-        return self.optimizers_for(self.generator.parameters())
+        return self.optimizers_for(self.parameters())
 
     def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
         """AdamW or `Muon` with a schedule for each group of parameters, in the format of `configure_optimizers`."""

@@ -73,6 +73,11 @@ def test_steps_of_its_own_are_clipped_scheduled_and_counted_as_lightning_s(tmp_p
     assert not torch.equal(manual.other.weight, Manual().other.weight)
 
 
+def test_parameters_of_the_stage_itself_learn_too(tmp_path):
+    stage = type("Own", (Automatic,), {"training_step": lambda self, batch, _: self.other(batch).square().sum()})()
+    assert not torch.equal(fitted(stage, tmp_path).other.weight, Automatic().other.weight)
+
+
 class Given(SingleLoss):
     def regression_loss(self, batch, u):
         return u.mean() + 0 * self.generator.layer.bias.sum()
