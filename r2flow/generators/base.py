@@ -123,12 +123,12 @@ class Generator(nn.Module):
         noise_of_step = None if draws is None else lambda j: self.further_noise(draws, j).to(x)
         with autocast(self.device, precision):
             made = how(self, x, conditions, noise_of_step, progress or (lambda: None))
-        whole = isinstance(made, Generated) and len(made.x) == len(x)
-        check(whole, f"sampler {how.name} must give a Generated of {len(x)} scans, one for each noise.")
+        shapes = x.shape, (len(x), *self.space.shape)  # the noise of a part of the image has its shape
+        whole = isinstance(made, Generated) and made.x.shape in shapes
+        check(whole, f"sampler {how.name} must give a Generated of {len(x)} scans of {self.space.shape}.")
         return made
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
-        """Noise of step j."""
         return draws.step(self.noise_shape, j)
 
     def choose(self, name: str | None = None, **options: Any) -> Sampler:
