@@ -134,9 +134,9 @@ class ScanMetric(Metric):
     def add_rows(self, rows: Tensor, side: Side, numbers: Sequence[int]) -> None:
         """Add the rows of scans of these numbers to the statistics of a side."""
         whole = rows.isfinite().all(1)
+        self.accumulate(rows[whole], side)
         getattr(self, f"{side}_scans").add_(len(rows))
         getattr(self, f"{side}_left_out").add_(int((~whole).sum()))
-        self.accumulate(rows[whole], side)
         if self.keeping and whole.any():
             numbered = torch.cat([torch.tensor(numbers, device=rows.device)[whole, None], rows[whole]], 1)
             getattr(self, f"{side}_rows").append(numbered.flatten().float().to(self.device))
@@ -149,6 +149,8 @@ class ScanMetric(Metric):
     def compute(self) -> dict[str, float]:
         """Values by name; undefined values are NaN and explained in `remarks`."""
         values, remarks = self.figures()
+        usable = isinstance(values, dict) and all(hasattr(v, "__float__") for v in values.values())
+        check(usable, f"the figures of '{self.name}' must be numbers by name, found {values!r}.")
         self._remarks = []
         for side in SIDES:
             scans, compared = self.given(side), self.count(side)

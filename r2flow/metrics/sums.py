@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.errors import check
 from r2flow.metrics.base import SIDES, ScanMetric, Side
 
 
@@ -25,6 +26,8 @@ class SumMetric(ScanMetric):
         """Compute values from the two sums of rows, (width,) each; zeros if a set has nothing to compare."""
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
+        width = rows.shape[1]
+        check(width == self.width, f"rows of '{self.name}' must be (B, {self.width}), found (B, {width}).")
         total: Tensor = getattr(self, f"{side}_sum")
         total += rows.sum(0, dtype=torch.float64).to(total)
 
