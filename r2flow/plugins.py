@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from hashlib import sha256
 from importlib.metadata import entry_points
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any
 
 from r2flow.errors import InputError, check
@@ -47,6 +48,8 @@ def load_plugins(names: Sequence[str]) -> None:
             file = _import(name)
         except (Exception, SystemExit) as error:  # modules may raise any exception
             message = " ".join(str(error).split()) or "no message"
+            lines = [n for frame, n in walk_tb(error.__traceback__) if frame.f_code.co_filename == _identity(name)]
+            message += f" (line {lines[-1]})" if lines else ""  # the last one of the file itself
             raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {message}") from None
         _loaded.update({_identity(name): name, file: name})
 

@@ -166,7 +166,7 @@ def test_a_generator_without_options_is_given_by_its_name():
     ("text", "words"),
     [
         ("def f(:\n", "SyntaxError"),
-        ("raise RuntimeError('a\\nb')", "RuntimeError: a b"),
+        ("def f():\n    raise RuntimeError('a\\nb')\nf()", "RuntimeError: a b (line 2)"),
         ("import sys; sys.exit(0)", "SystemExit"),
         ("from r2flow.stages import STAGES, Rectify\nSTAGES.add('rectify', Rectify)", "named 'rectify' exists already"),
     ],
