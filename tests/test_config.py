@@ -149,3 +149,12 @@ def test_a_backbone_for_a_system_with_its_own_network_is_refused(asked: str):
         check(compose(["stage=flow_map", "data=pairs"]), parent=Parent(gan, Path("gan")))
     with pytest.raises(InputError, match="vanilla_gan has its own network: leave backbone.* out"):
         check(compose([*command, asked]), [*command, asked])
+
+
+def test_an_option_called_as_a_key_of_its_group_is_refused(monkeypatch):
+    monkeypatch.setitem(BACKBONES._entries, "own", lambda rays, name="a", init="b": None)
+    with pytest.raises(InputError, match="backbone 'own' has an option 'name'"):
+        compose(["backbone=own"])
+    monkeypatch.setitem(STAGES._entries, "own", lambda generator, init="b": None)
+    with pytest.raises(InputError, match="stage 'own' has an option 'init'"):
+        compose(["stage=own"])

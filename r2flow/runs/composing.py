@@ -127,7 +127,10 @@ def add_choices() -> None:
                 node = {**options_of(import_module(module).build_sensor), "name": name}
             else:
                 node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
-                node = {"name": name, **({"init": None} if group == "stage" else {}), **node}
+                keys = {"name": name, **({"init": None} if group == "stage" else {})}
+                for key in keys.keys() & node.keys():
+                    raise InputError(f"{group} '{name}' has an option '{key}', a key of every {group}: rename it.")
+                node = {**keys, **node}
             ConfigStore.instance().store(name, node, group=group)
 
 
