@@ -33,6 +33,7 @@ OPERATIONS: dict[Any, Callable[..., int]] = {  # two operations a multiply-accum
 
 
 def count_parameters(model: nn.Module) -> int:
+    """Number of learned parameters, without buffers."""
     return sum(parameter.numel() for parameter in model.parameters())
 
 

@@ -70,6 +70,7 @@ def labels(folders: Sequence[Path]) -> list[str]:
 
 
 def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
+    """Read all runs; build each network once."""
     folders = find_runs(paths)
     costs: dict[str, dict[str, Any]] = {}
     runs = []

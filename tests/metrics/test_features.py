@@ -21,6 +21,7 @@ def kernel_distance(real, generated):
 
 
 def brute_force(real, generated, k):
+    """The papers' definitions, one pair after the other."""
 
     def radius(rows, i):
         return np.sort(np.linalg.norm(np.delete(rows, i, 0) - rows[i], axis=1))[k - 1]
