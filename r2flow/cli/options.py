@@ -24,7 +24,7 @@ PrecisionOption = Annotated[
     typer.Option(help="Precision of the network; bf16-mixed is faster on hardware with bfloat16."),
 ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")]
-SensorOption = Annotated[str, typer.Option(help="Sensor name, or a YAML file (see r2flow sensor).")]
+SensorOption = Annotated[str, typer.Option(help="Sensor name or YAML file (see r2flow sensor).")]
 SizeOption = Annotated[
     str | None, typer.Option(help="Image size, rows x columns, such as 64x1024. Default: the sensor's.")
 ]
@@ -143,7 +143,7 @@ class SamplerOptions:
         str | None,
         typer.Option(
             help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: dopri5, torchdiffeq; "
-            "stochastic: sde; flow maps: jump, chord, renoise, refine; completion: mmps, replace, repaint. "
+            "stochastic: sde; flow maps: jump, chord, renoise, refine; completion: transport, mmps, replace, repaint. "
             "For other systems see docs/systems.md."
         ),
     ] = None
