@@ -99,7 +99,9 @@ class Registry(Mapping[str, T]):
         return f"Registry({self.kind}: {', '.join(self)})"
 
     def add(self, name: str, entry: T) -> None:
-        if name in self._entries:
+        """Add an entry; a class of a notebook replaces its former version, since cells run again."""
+        modules = {getattr(one, "__module__", "") for one in (self._entries.get(name), entry)}
+        if name in self._entries and modules != {"__main__"}:
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
         self._entries[name] = entry
 
@@ -139,10 +141,7 @@ def construct(what: str, constructor: Callable[..., T], options: Mapping[str, An
 
 
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
-    """Keyword options of a constructor with their defaults; `MISSING` for an option without a default.
-
-    `given` positional arguments are passed in addition.
-    """
+    """Keyword options of a constructor, after `given` positional ones, with their defaults; `MISSING` without one."""
     options = _by_keyword(_parameters(constructor), given)
     defaults = {name: MISSING if p.default is p.empty else p.default for name, p in options.items()}
     if dataclasses.is_dataclass(constructor):

@@ -67,7 +67,6 @@ def test_the_last_finite_state_is_kept():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_growth_beyond_float32_is_flagged(method):
-    # x' = 1000 x grows by e^1000.
     solution = solve(lambda t, x: 1e3 * x, X_0, method=method, steps=64, tolerance=1e-3)
     assert not solution.converged.any()
     assert solution.x.isfinite().all()

@@ -104,7 +104,6 @@ def test_a_defect_on_one_device_is_skipped_and_ends_on_all(scans: Path, tmp_path
     assert len(set(errors)) == 1
     states = [read_checkpoint(path) for path in checkpoints_of(tmp_path / "runs" / "broken")]
     assert [state["global_step"] for state in states] == [4, 2]
-    # Steps 3 and 4 changed nothing.
     for name, value in states[0]["current_model_state"].items():
         assert torch.equal(value, states[1]["current_model_state"][name])
 
