@@ -112,7 +112,7 @@ class Encoding:
         self,
         sensor: Sensor,
         format: str = "logscale",
-        reflectance: bool = True,
+        reflectance: Annotated[bool, Bound("(auto is decided by a run, from its scans)", lambda b: True)] = True,
         limits: Literal["closed", "open"] = "closed",
         levels: Annotated[float, Bound("that is whole and above 0", lambda n: n > 0 and n % 1 == 0)] | None = None,
     ) -> None:

@@ -31,7 +31,6 @@ def test_resizing_keeps_the_field_of_view(sensor):
         assert smaller.shape == (rows, 256)
         edges = smaller.row_edges
         assert abs(edges[[0, -1]] - sensor.row_edges[[0, -1]]).max() < abs(np.diff(edges)).max() / 2 + 1e-9
-    # Evenly spaced beams stay so: the edges are exact.
     even = Sensor("even", tuple(9.5 - beam for beam in range(40))).resized(10)
     np.testing.assert_allclose(even.row_edges, np.linspace(10, -30, 11), atol=1e-12)
 

@@ -13,10 +13,10 @@ from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.files import write_file
+from r2flow.generators import build_generator
 from r2flow.lidar.sensors import SENSORS, build_sensor, write_sensor
-from r2flow.runs.composing import compose
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
-from r2flow.training import build, check
+from r2flow.training import build, check, compose
 from tests.training.conftest import Run, in_process
 
 REFUSED = {
@@ -104,14 +104,15 @@ def test_a_wrong_value_is_refused(tmp_path: Path, arguments: str, words: str):
 
 
 def test_python_refuses_a_wrong_key_and_a_chain():
-    with pytest.raises(InputError, match=r"no key 'stage.step'. Did you mean 'stage.steps'\?"):
-        compose(["stage=distill", "stage.step=3"])
-    with pytest.raises(InputError, match=r"overrides are a list, as \['data=prepared'\]"):
-        compose("data=prepared")
-    with pytest.raises(InputError, match=r"folders are a list, as \['conf'\]"):
-        compose(folders="conf")
-    with pytest.raises(InputError, match="a chain of runs: train it by `r2flow train`"):
-        build(compose(["experiment=demo"]))
+    for words, wrong in (
+        (r"no key 'stage.step'. Did you mean 'stage.steps'\?", lambda: compose(["stage=distill", "stage.step=3"])),
+        (r"overrides are a list, as \['data=prepared'\]", lambda: compose("data=prepared")),
+        (r"folders are a list, as \['conf'\]", lambda: compose(folders="conf")),
+        ("a chain of runs: train it by `r2flow train`", lambda: build(compose(["experiment=demo"]))),
+        (r"true or false \(auto is decided by a run, from its scans\), found", lambda: build_generator(compose())),
+    ):
+        with pytest.raises(InputError, match=words):
+            wrong()
 
 
 def test_a_folder_of_configs_may_have_any_name(tmp_path: Path):
