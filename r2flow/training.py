@@ -173,7 +173,7 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     given = {key_of(text) for text in asked}
     drawn = sorted(key for key in given if f"{key}.".startswith("data.pairs."))
     if drawn and config["data"]["name"] != PAIRS:
-        raise InputError(f"{', '.join(drawn)} are of data=pairs, found data={config['data']['name']}: leave them out.")
+        raise InputError(f"data={config['data']['name']} has no pairs (data=pairs has): leave out {', '.join(drawn)}.")
     for key, scans in (("data", config["data"]), ("data.scans", config["data"].get("scans"))):
         if scans is not None:
             _refuse_unread(key, scans, given)

@@ -67,7 +67,7 @@ REFUSED = {
     "seed=1,2": "seed=1,2 is several values: for a sweep add -m, for a list give seed=[1,2].",
     "data=folder & data.root=. & data.scenes=5": "no simulated scenes: leave data.scenes out",
     "data=mixed & data.parts=[{name: simulated}] & data.split=train": "has its own: leave data.split",
-    "data.pairs.num=5": "data.pairs.num are of data=pairs, found data=simulated",
+    "data.pairs.num=5": "data=simulated has no pairs (data=pairs has): leave out data.pairs.num.",
     "stage=reflow & data=pairs & stage.init=street & data.drives=[1]": "pairs are drawn, not read: leave data.drives",
     "stage=reflow & data=pairs & stage.init=street & data.reading={convention: lidm}": "convention is that of the flow",
     "preview=street": "preview is of a chain of runs",
