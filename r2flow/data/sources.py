@@ -129,7 +129,7 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path)
 def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
     """Warn, once per folder, of scans that are not in one sensor's own frame; whether they are not."""
     if unclear := is_unclear(scans):
-        warn_odd(Path(path), "its beams are not clear: are all scans of one sensor, in its own frame, not a vehicle's?")
+        warn_odd(Path(path), "its beams are not clear: give scans of one sensor, in its own frame, not a vehicle's")
     return unclear
 
 
