@@ -182,8 +182,10 @@ class ScanMetric(Metric):
         count = self.count(side)
         if not count:
             return torch.zeros(0, 1)
-        table = dim_zero_cat(getattr(self, f"{side}_rows")).cpu().view(count, -1)
-        return table[table[:, 0].argsort(stable=True)]
+        rows = getattr(self, f"{side}_rows")
+        table = (rows[0] if len(rows) == 1 else dim_zero_cat(rows)).cpu().view(count, -1)
+        order = table[:, 0].argsort(stable=True)
+        return table if bool((order.diff() == 1).all()) else table[order]  # a copy of all rows may have no room
 
     def real_state(self) -> dict[str, Tensor]:
         """Statistics of the real set, on the CPU and gathered from all processes, for a disk cache."""
