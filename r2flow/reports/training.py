@@ -56,8 +56,9 @@ def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> Figure:
         if 0 < 3 * shown.min() < shown.max():  # else its labels would be 1.11 x 10^0
             axes.set_yscale("log")
         axes.grid(alpha=0.25)
-        handles = {line.get_label(): line for line in axes.lines}
-        axes.legend(handles.values(), handles, fontsize=8)
+        if len(styles) <= len(STYLES):  # more labels share styles, and a legend that hides the curves
+            handles = {line.get_label(): line for line in axes.lines}
+            axes.legend(handles.values(), handles, fontsize=8).set_in_layout(False)
     return figure
 
 

@@ -209,10 +209,10 @@ def test_a_folder_that_is_no_run_is_named(tmp_path, content):
         read_runs([tmp_path / "thing"])
 
 
-@pytest.mark.parametrize(("values", "scale"), [([1.1, 1.2], "linear"), ([0.1, 1.0], "log"), ([0.0, 1.0], "linear")])
-def test_losses_have_a_logarithmic_axis_where_it_has_labels(values, scale):
-    figure = curves_figure([("run", {"train/loss": (np.array([1, 2]), np.array(values))})])
-    assert figure.axes[0].get_yscale() == scale
+@pytest.mark.parametrize(("losses", "runs", "y"), [([5, 6], 1, "linear"), ([1, 9], 12, "log"), ([0, 1], 13, "linear")])
+def test_losses_have_a_logarithmic_axis_and_a_legend_where_these_say_something(losses, runs, y):
+    figure = curves_figure([(str(i), {"train/loss": (np.array([1, 2]), np.array(losses))}) for i in range(runs)])
+    assert (figure.axes[0].get_yscale(), figure.axes[0].get_legend() is None) == (y, runs > 12)  # of 12 styles
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,6 @@ def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -
 
 
 def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """An image, and its semantic ids, (H, W), if there are any."""
     if isinstance(source, SimulatedScans):
         made = simulate(source.sensor, source.seed, source.numbers[number])
         return made.image[: 1 + source.reflectance], made.labels
