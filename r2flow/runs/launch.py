@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
@@ -141,9 +142,10 @@ def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], erro
 
 def job_folder(given: Sequence[str], overrides: str) -> str:
     """Folder name of a sweep's job: the swept values, and a hash of all overrides."""
-    pairs = [text.partition("=") for text in given]
-    swept = {key.lstrip("+~") for key, _, value in pairs if "," in value and not re.fullmatch(r"\[[^][]*]", value)}
-    parts = [part for part in overrides.split(",") if part.partition("=")[0].lstrip("+~") in swept]
+    parsed = OverridesParser.create().parse_overrides(list(given))
+    swept = {one.get_key_element().lstrip("+~") for one in parsed if one.is_sweep_override()}
+    whole = re.split(r",(?=~|\+*[\w.@/]+=)", overrides)  # not at the commas of a list
+    parts = [part for part in whole if part.partition("=")[0].lstrip("+~") in swept]
     readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
     return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
 
