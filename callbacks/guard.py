@@ -102,8 +102,7 @@ class Guard(L.Callback):
         learned = [name for name, _ in pl_module.named_parameters()]
         for key in ("current_model_state", "state_dict"):
             state = checkpoint.get(key, {})
-            broken = _not_finite((name, state[name]) for name in learned if name in state)
-            if broken:
+            if broken := _not_finite((name, state[name]) for name in learned if name in state):
                 what = "averaged weights" if key == "state_dict" and "current_model_state" in checkpoint else "weights"
                 self._end(
                     trainer,

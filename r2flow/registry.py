@@ -99,9 +99,8 @@ class Registry(Mapping[str, T]):
         return f"Registry({self.kind}: {', '.join(self)})"
 
     def add(self, name: str, entry: T) -> None:
-        """Add an entry; a class of a notebook replaces its former version, since cells run again."""
         modules = {getattr(one, "__module__", "") for one in (self._entries.get(name), entry)}
-        if name in self._entries and modules != {"__main__"}:
+        if name in self._entries and modules != {"__main__"}:  # cells of a notebook run again
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
         self._entries[name] = entry
 
@@ -153,8 +152,8 @@ def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any
 
 def _by_keyword(parameters: Sequence[inspect.Parameter], given: int) -> dict[str, inspect.Parameter]:
     taken = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD][:given]
-    by_name = [p for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    return {p.name: p for p in by_name if p.name not in taken}
+    kinds = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
+    return {p.name: p for p in parameters if p.kind in kinds and p.name not in taken}
 
 
 def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:

@@ -237,8 +237,12 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     try:
         with _quiet():
             trainer = L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
+        rank_zero_only.rank = trainer.global_rank  # type: ignore[attr-defined] # not SLURM_PROCID of a task alone
         if environment := getattr(trainer.strategy, "cluster_environment", None):
             environment.validate_settings(trainer.num_devices, trainer.num_nodes)
+        if (tasks := trainer.world_size) != (processes := trainer.num_devices * trainer.num_nodes):
+            start = f"srun --ntasks-per-node={trainer.num_devices}, or on one machine by env -u SLURM_NTASKS"
+            raise ValueError(f"the cluster starts {tasks} of {processes} processes; under SLURM start it by {start}.")
         if trainer.world_size > 1 and isinstance(interval, str | Mapping):  # Lightning asks each process's clock
             raise ValueError("a val_check_interval in time comes at another step on each device; give it in steps.")
         return trainer

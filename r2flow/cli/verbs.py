@@ -19,8 +19,7 @@ from r2flow.signals import Stopped, listening, stop_at_once
 # ClickException: in click for older releases of typer, in typer for newer ones.
 USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
-# Panels of --help and their verbs, in order.
-GROUPS = {
+GROUPS = {  # panels of --help and their verbs, in order
     "Make": ("train", "pairs"),
     "Draw": ("sample", "complete", "interpolate"),
     "Look": ("view", "show"),

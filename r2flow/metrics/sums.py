@@ -26,8 +26,7 @@ class SumMetric(ScanMetric):
         """Compute values from the two sums of rows, (width,) each; zeros if a set has nothing to compare."""
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
-        width = rows.shape[1]
-        check(width == self.width, f"rows of '{self.name}' must be (B, {self.width}), found (B, {width}).")
+        check(rows.shape[1] == self.width, f"rows of '{self.name}' must be (B, {self.width}), found {(*rows.shape,)}.")
         total: Tensor = getattr(self, f"{side}_sum")
         total += rows.sum(0, dtype=torch.float64).to(total)
 

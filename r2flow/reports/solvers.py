@@ -248,8 +248,7 @@ def _figure(panels: Sequence[tuple[str, Sequence[Row], str, str]], columns: int)
         for method, group in groupby(rows, itemgetter("method")):
             methods[method] = STYLES[METHODS.index(method) % len(STYLES)] if method in METHODS else STYLES[-1]
             solved = [row for row in group if math.isfinite(reached(row)) and math.isfinite(row[y])]
-            points = sorted((row[x], max(row[y], ROUNDING / 10)) for row in solved)
-            if points:
+            if points := sorted((row[x], max(row[y], ROUNDING / 10)) for row in solved):
                 axes.plot(*np.array(points).T, **methods[method], ms=4.5, lw=1.1)
         axes.set(xscale="log", yscale="log", xlabel=LABELS[x], ylabel=LABELS[y])
         axes.set_title(title.replace("_", " "), fontsize=9)

@@ -9,10 +9,7 @@ from r2flow.callbacks import CALLBACKS, Entry, Stopping
 
 
 class Hold(L.Callback):
-    """Writes `file` at the end of a step, before the first one for 0, and waits to be told to stop.
-
-    It does not wait where `file` with the ending `.go` is there.
-    """
+    """Writes `file` at the end of a step, 0: before the first, and waits for a signal unless `file.go` exists."""
 
     def __init__(self, file: str, step: int = 0, seconds: float = 60.0) -> None:
         self.file, self.step, self.seconds = Path(file), step, seconds

@@ -78,6 +78,7 @@ REFUSED = {
     "backbone=hditt": "no backbone config named 'hditt' | Did you mean 'hdit'?",
     "expriment=r2dm": "no key 'expriment' | Did you mean 'experiment'?",
     "hydra/sweeper=optuna": "no hydra/sweeper config named 'optuna'; known: basic. Others are plug-ins of Hydra",
+    "hydra/launcher=submitit_of_tomorrow": "pip install 'r2flow[slurm]'.",
     "sensor=mine": "no sensor config named 'mine' | sensor=FILE.yaml",
     "+backbone.widht=8": "no option 'widht'",
     "sensor.columns=100": "100 | nearest",

@@ -10,17 +10,19 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.callbacks.stopping import slurm_job
+from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, read_checkpoint
 from r2flow.signals import LATER
-from tests.training.conftest import TINY, Run, hold_at, in_process, start, tiny, wait_for
+from r2flow.training import build, compose
+from tests.training.conftest import TINY, Run, hold_at, start, tiny, wait_for
 from tests.training.test_train import assert_bit_equal, weights
 
 STEPS = 20
@@ -226,20 +228,22 @@ def test_what_is_queued_again_is_named_as_scontrol_names_it(variables: dict[str,
         assert slurm_job() == job
 
 
-def test_a_launcher_that_is_not_installed_says_how_to_get_it(tmp_path: Path):
-    done = in_process(tmp_path, ["-m", "hydra/launcher=submitit_of_tomorrow", "seed=1,2"], check=False)
-    assert "pip install 'r2flow[slurm]'." in done.refusal
+def test_tasks_of_a_job_train_together_or_alone(scans: Path):
+    slurm = dict.fromkeys(("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID"), "0") | {"SLURM_NTASKS": "1"}
+    with patch.dict(os.environ, slurm), patch.object(rank_zero_only, "rank", 3):  # Lightning's SLURM_PROCID
+        build(compose(tiny(scans)))
+        assert rank_zero_only.rank == 0  # else it has no curves
+        with pytest.raises(InputError, match="1 of 2 .* srun --ntasks-per-node=2"):  # it would train on one device
+            build(compose(tiny(scans, *TWO)))
 
 
 @pytest.mark.slow
 def test_a_sweep_through_submitit_runs_every_job_and_reports_a_failed_one(train: Run, tmp_path: Path):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra 'slurm'")
-    launcher: list[Any] = ["hydra/launcher=submitit_local", "trainer.max_steps=2"]
+    launcher = ["hydra/launcher=submitit_local", "trainer.max_steps=2"]
     done = train(*launcher, "stage.loss=mse,nonsense", check=False, flags=("-m",))
     assert done.returncode == 2
-    assert "of the sweep's jobs failed" in done.stderr
-    assert "stage.loss=nonsense" in done.stderr
-    finished = [path.parent.name for path in (tmp_path / "runs" / "sweep").glob("*/samples")]
-    assert len(finished) == 1
-    assert "stage.loss=mse" in finished[0]  # named by what is swept although another process made it
+    assert f"of the sweep's jobs failed: {tmp_path / 'runs' / 'sweep' / 'stage.loss=nonsense'}-" in done.stderr
+    (finished,) = (tmp_path / "runs" / "sweep").glob("*/samples")
+    assert "stage.loss=mse" in finished.parent.name  # named by what is swept although another process made it
     assert train(*launcher, "stage.loss=mse", flags=("-m",)).returncode == 0
