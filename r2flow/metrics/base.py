@@ -101,7 +101,7 @@ class ScanMetric(Metric):
         return {self.name: float(self.distance(self.kept("real"), self.kept("generated")))}, []
 
     def distance(self, real: Tensor, generated: Tensor) -> Tensor | float:
-        """The value for the stored rows of two sets, (N, D) and (M, D) float32."""
+        """The value for the stored rows of two sets, (N, D) and (M, D) float32, which it must not change in place."""
         raise NotImplementedError
 
     def update(self, scans: Scans | Tensor, real: bool, numbers: Sequence[int] | None = None) -> None:
