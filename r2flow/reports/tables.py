@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.cells import cell_len
 
-from r2flow.errors import printable
+from r2flow.errors import one_line
 
 Row = Mapping[str, Any]
 # By key, with a heading for each in order; or cells in order, with a heading for each.
@@ -20,15 +20,14 @@ NUMBER = re.compile(r"[-+]?\d|-?$|none$|inf$")  # how cells of a right-aligned c
 def table(rows: Rows, columns: Columns) -> str:
     """Format rows as a Markdown table, numbers with three digits."""
     headings, cells = _text(rows, columns)
-    lines = ["| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
-    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in cells]
-    return "\n".join(lines)
+    escaped = [[cell.replace("|", "\\|") for cell in line] for line in (headings, *cells)]
+    first, *others = ["| " + " | ".join(line) + " |" for line in escaped]
+    return "\n".join([first, "|" + "---|" * len(headings), *others])
 
 
 def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
     """Print rows as a table: numbers right-aligned, cells not truncated, no heading line if all headings are ""."""
     headings, cells = _text(rows, columns)
-    cells = [[printable(cell) for cell in line] for line in cells]
     lines = [headings, *cells] if any(headings) else cells
     widths = [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
     right = [bool(cells) and all(map(NUMBER.match, column)) for column in zip(*cells or [headings], strict=True)]
@@ -60,5 +59,5 @@ def words(values: Mapping[str, Any]) -> str:
 
 def _text(rows: Rows, columns: Columns) -> tuple[list[str], list[list[str]]]:
     if isinstance(columns, Mapping):
-        return list(columns.values()), [[shown(row.get(key)) for key in columns] for row in rows]  # type: ignore[union-attr]
-    return list(columns), [[shown(cell) for cell in row] for row in rows]
+        rows, columns = [[row.get(key) for key in columns] for row in rows], list(columns.values())  # type: ignore[union-attr]
+    return [*map(one_line, columns)], [[one_line(shown(cell)) for cell in row] for row in rows]

@@ -11,7 +11,7 @@ from r2flow.reports.tables import print_table, shown, table
 
 ROWS = [
     {"solver": "euler", "evaluations": 4, "error": 0.5},
-    {"solver": "a|b, c", "evaluations": 8, "error": math.nan, "note": "late"},
+    {"solver": "a|b\nc", "evaluations": 8, "error": math.nan, "note": "late"},
 ]
 
 
@@ -19,7 +19,7 @@ def page(**changes) -> Page:
     figure = blank_figure(3, 2)
     figure.add_subplot().plot([0, 1], [0, 1], **STYLES[0])
     given = {
-        "name": "speed", "title": "How fast", "text": ["First.", table(ROWS, {"solver": "solver", "error": "RMS"})],
+        "name": "speed", "title": "How fast", "text": ["First.", table(ROWS, {"solver": "s|", "error": "RMS"})],
         "rows": ROWS, "figures": {"speed": figure}, "seeds": {"scenes": 3},
     }  # fmt: skip
     return Page(**{**given, **changes})
@@ -53,7 +53,7 @@ def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
     assert content["origin"]["seeds"] == {"scenes": 3}
     assert content["origin"]["machine"]["cores"] >= 1
     text = (tmp_path / "speed.md").read_text()
-    for words in ("# How fast\n", "![speed](speed.png)", "First.", "| a\\|b, c | - |", f"```\n{command()}\n"):
+    for words in ("# How fast\n\n![speed](speed.png)\n\nFirst.\n\n| s\\| |", "a\\|b\\nc | - |", f"```\n{command()}\n"):
         assert words in text
 
 
