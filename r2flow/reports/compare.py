@@ -57,7 +57,7 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
         runs += [path] if path in inside else [run for run in inside if not run.name.startswith(".")]
     if wrong := [path for path in paths if not runs or not path.exists()]:
         raise InputError(f"{wrong[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
-    return list(dict.fromkeys(runs))
+    return list({run.resolve(): run for run in runs}.values())  # a link and its run are one
 
 
 def labels(folders: Sequence[Path]) -> list[str]:

@@ -144,10 +144,10 @@ def test_what_is_free_on_resumption_still_tells_configurations_apart(tmp_path, k
 
 
 def test_a_sweep_s_files_and_folders_without_a_run_are_passed_over(tmp_path):
-    make_run(tmp_path / "a")
+    (tmp_path / "latest").symlink_to(make_run(tmp_path / "a"))
     (tmp_path / "multirun.yaml").touch()
     (tmp_path / "logs").mkdir()
-    assert find_runs(sorted(tmp_path.iterdir())) == [tmp_path / "a"]
+    assert [run.resolve() for run in find_runs(sorted(tmp_path.iterdir()))] == [tmp_path / "a"]
     with pytest.raises(InputError, match="none is not a run"):
         find_runs([tmp_path / "a", tmp_path / "none"])
     with pytest.raises(InputError, match="logs is not a run"):
