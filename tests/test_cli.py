@@ -42,7 +42,7 @@ def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path)
 
 def test_info_says_what_is_in_a_checkpoint(r2flow, saved):
     said = r2flow("info", saved[0]).said
-    for words in ("hdit", "2 x 8 x 64", "hdl64e", "logscale", "backbone.base_channels"):
+    for words in ("hdit", "2 x 8 x 64", "hdl64e", "logscale", "backbone.base_channels", "fixed       False"):
         assert words in said
     assert json.loads(r2flow("info", saved[0], "--json").said)["step"] == 7
 

@@ -39,7 +39,7 @@ def print_contents(contents: dict[str, Any]) -> None:
     for name in ("encoding", "sampler", "few"):
         if options := contents.get(name):
             summary[name] = ", ".join(f"{key} {value}" for key, value in options.items())
-    summary |= {key: f"{value:,}" for key, value in summary.items() if isinstance(value, int)}
+    summary |= {key: f"{value:,}" for key, value in summary.items() if type(value) is int}
     print_table([(key, str(value)) for key, value in summary.items()], ("", ""))
     print()
     config = flatten({key: value for key, value in contents["config"].items() if key != "published"})
