@@ -99,8 +99,7 @@ def draw(
     if evaluated is not None:
         whole = space.shape[1:]
         generator, noise = generator.part(evaluated), evaluated.crop(noise)
-        if condition is not None:  # crop per-pixel conditions
-            condition = {n: evaluated.crop(x) if x.shape[-2:] == whole else x for n, x in condition.items()}
+        condition = condition and {n: evaluated.crop(x) if x.shape[-2:] == whole else x for n, x in condition.items()}
     start = time.perf_counter()
     generated = generator(noise, condition, sampler=sampler, draws=draws, precision=precision, progress=progress)
     x_1 = generated.x.cpu()  # also synchronises the GPU

@@ -27,12 +27,11 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu") -> None:
+def report(runs: Mapping[str, Path], out: Path, num: int = 16, device: str = "cpu") -> None:
     """Sample every run, compare the samples with held-out scans, and write figure, table and scans.
 
     The first run was trained on scans. Each makes `num` scans for each number of steps; autoencoders make none.
     """
-    out = Path(out)
     loaded = {name: load_checkpoint(run, device) for name, run in runs.items()}
     flows = {name: flow for name, flow in loaded.items() if flow.generator.draws} or loaded
     first, last = next(iter(loaded.values())), list(flows)[-1]

@@ -273,9 +273,9 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
     return figure
 
 
-def copies_figure(nearest: Mapping[str, Nearest], pairs: int = 4) -> Figure:
-    """Draw the scans of each set nearest to training scans, next to the aligned training scan."""
-    chosen = [(name, copies, int(i)) for name, copies in nearest.items() for i in np.argsort(copies.distances)[:pairs]]
+def copies_figure(nearest: Mapping[str, Nearest]) -> Figure:
+    """Draw the four scans of each set nearest to training scans, next to the aligned training scan."""
+    chosen = [(name, copies, int(i)) for name, copies in nearest.items() for i in np.argsort(copies.distances)[:4]]
     figure = blank_figure(14, 0.9 * len(chosen) + 0.2)
     panels = figure.subplots(len(chosen), 2, squeeze=False)
     for (left, right), (name, copies, place) in zip(panels, chosen, strict=True):
