@@ -224,8 +224,8 @@ def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
     config = {key: CONFIG[key] for key in ("sensor", "encoding", "backbone")}
     mine = Checkpoint(build_generator(config).eval(), config)
     mine.model.mid_levels[0].residual_ffn.adarms = mine.model.mid_levels[0].residual_attn.norm  # a plug-in may tie them
-    mine.save(tmp_path / "mine.safetensors")
-    loaded = load_checkpoint(tmp_path / "mine.safetensors")
+    mine.save(tmp_path / "mine-step-1.safetensors")
+    loaded = load_checkpoint(tmp_path / "mine-step-1.safetensors")
     names = mine.generator.state_dict().keys()
     torch.testing.assert_close(loaded.generator.state_dict(), mine.generator.state_dict(), rtol=0, atol=0)
     assert loaded.config == config
@@ -236,4 +236,4 @@ def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
     max(mine.generator.parameters(), key=torch.Tensor.numel).data.fill_(1e5)
     with pytest.raises(InputError, match="float16"):
         save_checkpoint(mine, tmp_path / "compiled.safetensors", half=True)
-    assert repr(loaded) == "Checkpoint(mine, rectified_flow, 8x64 hdl64e, step 0)"
+    assert repr(loaded) == "Checkpoint(mine-step-1, rectified_flow, 8x64 hdl64e, step 0)"

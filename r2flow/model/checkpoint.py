@@ -62,10 +62,9 @@ class Checkpoint:
     format: str = "r2flow"
 
     def __repr__(self) -> str:
-        name = self.path.stem if step_of(self.path) < 0 else self.path.absolute().parent.parent.name  # the run's
         kind = (self.config.get("generator") or {}).get("name", "rectified_flow")
         size = "x".join(map(str, self.sensor.shape))
-        return f"Checkpoint({name}, {kind}, {size} {self.sensor.name}, step {self.step})"
+        return f"Checkpoint({title_of(self.path)}, {kind}, {size} {self.sensor.name}, step {self.step})"
 
     @property
     def sensor(self) -> Sensor:
@@ -157,6 +156,12 @@ class Checkpoint:
     def save(self, path: str | Path) -> None:
         """Write one file that `r2flow.load` reads; see `save_checkpoint`."""
         save_checkpoint(self, path)
+
+
+def title_of(path: Path) -> str:
+    """Name of a checkpoint's run, else of its file."""
+    path = path.resolve()
+    return path.parents[1].name if path.parent.name == FOLDER else path.stem
 
 
 def step_of(path: Path) -> int:

@@ -18,7 +18,7 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import write_scan
 from r2flow.lidar.region import Region
-from r2flow.model.checkpoint import FOLDER, Checkpoint, weights_hash
+from r2flow.model.checkpoint import Checkpoint, title_of, weights_hash
 from r2flow.model.sampling import draw, warn_unsolved
 from r2flow.progress import Bar, track
 from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
@@ -82,9 +82,7 @@ def write_samples(
     if region is not None:
         shown, rays = [region.crop(torch.from_numpy(image)).numpy() for image in shown], region.crop(rays)
     if shown:
-        path = checkpoint.path.resolve()
-        model = path.parents[1].name if path.parent.name == FOLDER else path.stem
-        draw_pages(shown, rays, out, f"{model}, seed {seed}")
+        draw_pages(shown, rays, out, f"{title_of(checkpoint.path)}, seed {seed}")
     return endings
 
 
