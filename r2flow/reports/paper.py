@@ -160,7 +160,7 @@ def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str
     lines = []
     for run in (run for run in runs if run.role == "1-RF"):
         config = run.checkpoint.config
-        row = {"backbone": config["backbone"]["name"], **cost(config, 3, device)}
+        row = {"backbone": (config["backbone"] or {}).get("name"), **cost(config, 3, device)}
         if printed := same_architecture(row["parameters"]):
             row |= {"gmac_printed": printed.gmac, "latency_printed": printed.latency_ms, "frd_printed": printed.frd}
         evaluated = [r for r in rows if r["weights"] == weights_hash(run.checkpoint) and "frd/frd" in r]

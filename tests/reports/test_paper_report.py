@@ -77,16 +77,17 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     comparisons = [{"kind": "judged", "real": real, "generated": one, "metrics": metrics} for one in sets]
     last, stage = "checkpoints/step-00000007.ckpt", {"name": "transfer"}
     unnamed = [write_run(tmp_path / name, network(), stage, 0.3 + i) / last for i, name in enumerate("ab")]
+    own = write_run(tmp_path / "own", network(backbone=None, generator={"name": "vanilla_gan", "doublings": 2}), stage)
     results = tmp_path / "e.json"
     results.write_text(json.dumps({"comparisons": comparisons}))
-    options = "--results", results, "--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0"
+    options = f"1-RF={own}", "--results", results, "--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0"
     command = "report", "paper", f"9-RF={runs['2-RF']}", runs["1-RF"], *unnamed, *options, "-o", tmp_path / "out"
     said = r2flow(*command).said
     assert all(f"({name})" in said for name in ("9-RF", f"a/{last}", f"b/{last}"))
     assert "r2flow, 5 scans of 8x64 against 7 of held" in (tmp_path / "out" / "paper.md").read_text()
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
-    (architecture,) = content["architectures"]
+    architecture, _ = content["architectures"]
     assert architecture["parameters"] == sum(p.numel() for p in network().generator.backbone.parameters())
     written = {path.stem for path in (tmp_path / "out").glob("*.png")}
     assert written == {"figure_3", "figure_5", "figure_6", "figure_7", "figure_8a", "figure_8b"}
