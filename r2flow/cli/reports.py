@@ -225,6 +225,8 @@ def paper(
         checkpoint = load_checkpoint(model, where)
         check(checkpoint.generator.draws, f"{model} does not generate scans from noise.")
         runs.append(PaperRun(role or role_of(checkpoint, label), model, checkpoint))
+        alike = checkpoint.sensor.shape == runs[0].checkpoint.sensor.shape
+        check(alike, f"{model} makes images of another size than {runs[0].label}: report it apart.")
     scans = None if real is None else open_scans(real, reading_for([real], runs[0].checkpoint))
     check_folder(out)
     page = paper_page(runs, rows, scans, num, steps, where)

@@ -47,10 +47,7 @@ def write_samples(
     Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes; `replace` deletes samples of
     other settings in the folder. The contact sheet shows at most 8 of `pictures`. Files have the sensor's shape, 0
     outside the region (`r2flow.model.sampling.sample`). Formats: `ply` and `bin` are points in metres with reflectance,
-    `npy` is the range image, float32 (2 or 1, H, W); default: all that suit the model.
-
-    Returns:
-        The formats.
+    `npy` is the range image, float32 (2 or 1, H, W); default: all that suit the model. Returns the formats.
     """
     generator, out, rays = checkpoint.generator, Path(out), checkpoint.sensor.rays()
     sampler = sampler or generator.sampler

@@ -11,7 +11,7 @@ from r2flow.metrics.birds_eye import js_distance
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.reports.paper import PaperRun, marginals_apart, role_of, same_architecture, scans_figure, table_i
 from r2flow.reports.printed import COLUMNS, TABLE_II
-from tests.conftest import write_run
+from tests.conftest import CONFIG, write_run
 from tests.test_sampling import network
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
@@ -91,5 +91,7 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     assert architecture["parameters"] == sum(p.numel() for p in network().generator.backbone.parameters())
     written = {path.stem for path in (tmp_path / "out").glob("*.png")}
     assert written == {"figure_3", "figure_5", "figure_6", "figure_7", "figure_8a", "figure_8b"}
+    wide = write_run(tmp_path / "wide", network(sensor={**CONFIG["sensor"], "columns": 128}), stage)
+    assert "wide makes images of another size" in r2flow(*command, wide).refusal
     results.write_text(json.dumps({"comparisons": comparisons[1:]}))
     assert "the results are of other models" in r2flow(*command).refusal
