@@ -213,11 +213,11 @@ def build_sensor(
 
 def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
     """Read a sensor from a YAML file with the options of `build_sensor`, in another size if given."""
-    path = Path(path)
-    with reading(path, 1 << 20, "sensor's YAML"):  # of a dozen lines
-        options = yaml.safe_load(path.read_text(encoding="utf-8"))
+    with reading(Path(path), 1 << 20, "sensor's YAML"):  # of a dozen lines
+        options = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         named = isinstance(options, dict) and all(isinstance(key, str) for key in options)
         check(named, "it is not a sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
+        check(options.get("rays", "centre") == "centre", "rays are a model's: give sensor.rays=reference in training.")
         options |= {key: value for key, value in (("rows", rows), ("columns", columns)) if value is not None}
         return construct(str(path), build_sensor, options)
 
@@ -228,11 +228,10 @@ def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> S
         raise InputError(f"a size is (rows, columns), found {size!r}.")
     if isinstance(sensor, Sensor):
         return sensor if size is None else sensor.resized(*size)
-    sensor = str(sensor)
-    if sensor.lower().endswith(ENDINGS):
+    if str(sensor).lower().endswith(ENDINGS):
         return read_sensor(sensor, *(size or (None, None)))
     try:
-        return build_sensor(sensor, *(size or (None, None)))
+        return build_sensor(str(sensor), *(size or (None, None)))
     except UnknownName as error:
         raise UnknownName(f"{error} Your own is a YAML file: r2flow sensor SCANS --out NAME.yaml") from None
 
@@ -249,4 +248,5 @@ def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
 def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
     """The keys of `sensor` in a config: the options of `build_sensor`, and rays through the pixels' centres."""
     options = {key: np.asarray(value).tolist() for key, value in asdict(sensor).items()}  # NumPy's numbers as Python's
-    return {**options, "rows": None, "rays": "centre"}
+    named = {"rows": len(sensor.elevations), "elevations": None} if sensor.name in SENSORS else {}  # beams by the name
+    return {**options, "rows": None, "rays": "centre", **named}

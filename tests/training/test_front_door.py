@@ -11,12 +11,12 @@ import yaml
 
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.data.resolving import resolve
-from r2flow.errors import InputError
 from r2flow.files import write_file
 from r2flow.generators import build_generator
 from r2flow.lidar.sensors import SENSORS, build_sensor, write_sensor
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.training import build, check, compose
+from tests.conftest import refused
 from tests.training.conftest import Run, in_process
 
 REFUSED = {
@@ -106,13 +106,13 @@ def test_a_wrong_value_is_refused(tmp_path: Path, arguments: str, words: str):
 
 def test_python_refuses_a_wrong_key_and_a_chain():
     for words, wrong in (
-        (r"no key 'stage.step'. Did you mean 'stage.steps'\?", lambda: compose(["stage=distill", "stage.step=3"])),
-        (r"overrides are a list, as \['data=prepared'\]", lambda: compose("data=prepared")),
-        (r"folders are a list, as \['conf'\]", lambda: compose(folders="conf")),
+        ("no key 'stage.step'. Did you mean 'stage.steps'?", lambda: compose(["stage=distill", "stage.step=3"])),
+        ("overrides are a list, as ['data=prepared']", lambda: compose("data=prepared")),
+        ("folders are a list, as ['conf']", lambda: compose(folders="conf")),
         ("a chain of runs: train it by `r2flow train`", lambda: build(compose(["experiment=demo"]))),
-        (r"true or false \(auto is decided by a run, from its scans\), found", lambda: build_generator(compose())),
+        ("true or false (auto is decided by a run, from its scans), found", lambda: build_generator(compose())),
     ):
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             wrong()
 
 
@@ -152,6 +152,8 @@ def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
     part = {"name": "simulated", "sensor": str(tmp_path / "my sensor.yaml")}
     (part,) = resolve({"name": "mixed", "parts": [part]})["parts"]
     assert build_sensor(**part["sensor"]) == replace(SENSORS["vlp16"], name="mine")
+    (tmp_path / "own.yaml").write_text("{name: hdl32e, rows: 16, rays: centre}")  # a built-in sensor by its name
+    assert build_sensor(**compose([f"sensor={tmp_path}/own.yaml"])["sensor"]) == SENSORS["hdl32e"].resized(16)
 
 
 def test_a_named_choice_has_options_of_its_own():
@@ -189,9 +191,8 @@ def test_a_folder_is_no_plugin(tmp_path: Path):
 @pytest.mark.parametrize("text", ["", "- 1", "x", "a: [", "a: \0", "data: 3", "trainer: [1]", "a: &a [*a]"])
 def test_a_damaged_config_is_refused_in_one_line(tmp_path: Path, text: str):
     (tmp_path / CONFIG).write_text(text)
-    with pytest.raises(InputError, match=r"config\.yaml is damaged \(.*\); remove it") as caught:
+    with refused("config.yaml is damaged (", "); remove it"):
         read_config(tmp_path)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_lost_config_is_that_of_the_newest_checkpoint(tmp_path: Path):
@@ -199,7 +200,7 @@ def test_a_lost_config_is_that_of_the_newest_checkpoint(tmp_path: Path):
     content = {**dict.fromkeys(RESUMED), "config": config}
     AtomicCheckpointIO().save_checkpoint(content, tmp_path / "checkpoints" / "step-00000004.ckpt")
     assert read_config(tmp_path) == config
-    with pytest.raises(InputError, match="seed=1 there, 2 here"):
+    with refused("seed=1 there, 2 here"):
         open_run(tmp_path, {**config, "seed": 2})
     assert open_run(tmp_path, config) == tmp_path / "checkpoints" / "step-00000004.ckpt"
     assert yaml.safe_load((tmp_path / CONFIG).read_text()) == config
