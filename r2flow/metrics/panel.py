@@ -124,12 +124,12 @@ def _pairs(x: np.ndarray, returned: np.ndarray, edges: np.ndarray, parts: int) -
 
 
 def rate_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean |x - y| over bins, x and y the rates of counts (missing, all, of images), 0 without; at least `lacking`."""
+    """Mean |x - y| over bins, rates of counts (missing, all, of images), 0 without; at least `lacking`, NaN of none."""
     sets = a.reshape(3, -1), b.reshape(3, -1)
     (x, p), (y, q) = ((lost / np.maximum(rays, 1), rays / pixels) for lost, rays, pixels in sets)
     # Share of a set's rays beyond 100 times the other's in their bin, which have no rate to compare: 1 if it has none.
     lacking = [np.maximum(u - 100 * v, 0).sum() / u.sum() for u, v in ((p, q), (q, p)) if u.any()]
-    return float(max([np.abs(x - y).mean(), *lacking]))
+    return float(max([np.abs(x - y).mean(), *lacking])) if lacking else float("nan")
 
 
 def row_distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -197,9 +197,9 @@ def panel(images: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 
 def distances(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
-    """Distance per member between the counts of two sets, (D,) each; 0 if equal."""
+    """Distance per member between the counts of two sets, (D,) each; 0 if equal, NaN if neither has any."""
     parts = zip(PANEL.items(), np.split(a, ENDS[:-1]), np.split(b, ENDS[:-1]), strict=True)
-    return {name: member.distance(x, y) for (name, member), x, y in parts}
+    return {name: member.distance(x, y) if (x + y).any() else float("nan") for (name, member), x, y in parts}
 
 
 def mean_distance(lines: Mapping[str, float]) -> float:

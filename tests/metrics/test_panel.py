@@ -146,6 +146,8 @@ def test_a_set_without_surfaces_is_not_near_in_the_drop_rate():
     for rates, expected in (([[2, 9], [10, 90]], 0.1), ([[2, 0], [10, 0]], 0.9), ([[1, 0], [10, 0.5]], 0.4)):
         other = np.array([*rates, [200, 200]])
         assert rate_distance(counts, other) == rate_distance(other, counts) == pytest.approx(expected)
+    lines = distances(*(panel(x[:, :, 9:11], SENSORS["vlp16"].resized(2, 64)) for x in (real, lossy)))  # of two rows
+    assert {*filter(lambda x: np.isnan(lines[x]), lines)} == {"surface normals", "incidence", "drop rate by incidence"}
 
 
 def test_range_alone_leaves_reflectance_out():
