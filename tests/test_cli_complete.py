@@ -397,7 +397,7 @@ def test_points_of_a_pitched_vehicle_are_warned_of_and_completed(complete, tmp_p
     write_points(tmp_path / "1.ply", xyz @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]))
     code, said, error = complete(tmp_path / "1.ply", "--from", "vlp16", out=tmp_path / "pitched")
     assert (code, error.count("\n"), "1 scan written" in said) == (0, 1, True), error
-    assert "are all scans of one sensor, in its own frame" in error
+    assert "give scans of one sensor, in its own frame" in error
 
 
 def test_points_next_to_range_images_are_completed(complete, r2flow, tmp_path: Path):

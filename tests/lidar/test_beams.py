@@ -258,7 +258,7 @@ def test_two_sensors_in_one_file_are_warned_of(tmp_path: Path, caplog, ringed: b
     rings = np.concatenate([one.ring, other.ring]) if ringed else None
     write_points(tmp_path / "0.ply", np.concatenate(xyz), ring=rings)
     warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["vlp16"]), tmp_path)
-    assert ("are all scans of one sensor, in its own frame" if ringed else "degrees off its beams") in caplog.text
+    assert ("give scans of one sensor, in its own frame" if ringed else "degrees off its beams") in caplog.text
 
 
 @pytest.mark.parametrize("name", SENSORS)
