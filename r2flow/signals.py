@@ -4,6 +4,7 @@ import atexit
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +14,7 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
-Handler = Callable[[int, FrameType | None], None] | signal.Handlers
+Handler = Callable[[int, FrameType | None], object] | signal.Handlers
 
 STOPPING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -123,14 +124,9 @@ def out_of_reach() -> Iterator[None]:
 
 
 def outlive_the_signal(worker: int = 0) -> None:
-    """Keep a loader's worker alive after a signal for 30 s, since its run may need it to finish a step.
-
-    The worker also ends with its run.
-    """
+    """Keep a loader's worker alive for 30 s after a signal, since its run may need it; it also ends with its run."""
     end_with_parent()
-
-    def end_later(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(30)
-
-    hear(end_later)
+    sys.excepthook = lambda *_: None  # called if a stopped run drops the connection for a tensor
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    hear(lambda number, frame: signal.alarm(30))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # blocked if started `out_of_reach`

@@ -2,7 +2,6 @@
 
 import logging
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -67,7 +66,6 @@ next(loader)
 time.sleep(100)
 """
 
-
 STORE = """
 import time
 from r2flow.store import Store
@@ -77,7 +75,7 @@ Store(".", "scans", {}).make([100, 101], time.sleep, 2)
 
 @pytest.mark.parametrize("script", [LOADER, STORE])
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path, script: str):
-    parent = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, start_new_session=True)
+    parent = start(tmp_path, ["-c", script], [sys.executable])
     try:
         wait_until(lambda: len(list(tmp_path.iterdir())) == 2)  # a file of each
         time.sleep(0.2)  # until both wait
@@ -93,7 +91,8 @@ def test_a_run_hears_the_signal_of_its_job_that_its_launcher_ignores():
         assert signal.getsignal(signal.SIGUSR1) is stop_at_once
 
 
-def test_a_worker_does_not_hear_what_its_run_ignores():
+def test_a_worker_does_not_hear_what_its_run_ignores(monkeypatch):
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
     with listening(signal.SIG_IGN):  # as a hang-up under nohup
         outlive_the_signal()
         assert {signal.getsignal(number) for number in STOPPING} == {signal.SIG_IGN}
@@ -102,25 +101,31 @@ def test_a_worker_does_not_hear_what_its_run_ignores():
 WORKERS = """
 import os, signal, sys
 from functools import partial
+from types import SimpleNamespace
 from r2flow.signals import Stopped, listening, stop_at_once
 from r2flow.store import Store
 
 if __name__ != "__main__":
     os.killpg(0, {number})  # when a worker has started and imports this file
 else:
+    from r2flow.data.sets import ScanSet
+    source = SimpleNamespace(drives={{}}, drawn=False, batch=lambda numbers: os.killpg(0, {number}))
     try:
         with listening(stop_at_once):
-            Store("out", "scans", {{}}).make(range(4), partial(print, bytes(2**20)), 2)  # more than a pipe takes
+            {work}
     except Stopped as stop:
         sys.exit(stop.code)
 """
+MAKE = 'Store("out", "scans", {{}}).make(range(4), partial(print, bytes(2**20)), 2)  # more than a pipe takes'
+READ = 'list(ScanSet("", source, None).batches(range(99), 1, 2))'
 
 
 @pytest.mark.parametrize("number", STOPPING)
-def test_told_to_stop_when_workers_start(tmp_path: Path, number: int):
-    (tmp_path / "script.py").write_text(WORKERS.format(number=int(number)))
+@pytest.mark.parametrize("work", [MAKE, READ])
+def test_told_to_stop_when_workers_start(tmp_path: Path, number: int, work: str):
+    (tmp_path / "script.py").write_text(WORKERS.replace("{work}", work).format(number=int(number)))
     process = start(tmp_path, ["script.py"], [sys.executable])
-    assert process.communicate(timeout=60)[0] == ""
+    assert process.communicate(timeout=60)[0] in ("", "stopped\n")  # the latter within an import
     assert process.returncode == 128 + number
 
 

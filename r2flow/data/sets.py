@@ -2,7 +2,8 @@
 
 import copy
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from functools import cached_property, partial
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch.utils.data import DataLoader
 from r2flow.data.sources import ScanSource, spread
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator
-from r2flow.signals import end_with_parent
+from r2flow.signals import out_of_reach, outlive_the_signal
 
 
 class ScanSet:
@@ -66,14 +67,16 @@ class ScanSet:
 
     def batches(
         self, numbers: Sequence[int], batch_size: int, workers: int = 0, with_points: bool = False
-    ) -> Iterable[Any]:
+    ) -> Iterator[Any]:
         """Batches of these scans in order, read by `workers` further processes: images, (B, 2 or 1, H, W), or pairs of
         images and the measured points of the pixels, (B, 3, H, W) (`ScanSource.with_points`)."""
         read = partial(_with_points, self.source) if with_points else self.source.batch
         chunks: Any = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
         # Processes take seconds to start; samples are drawn in the process of the network.
         workers = 0 if self.source.drawn or len(chunks) < 8 else workers
-        return DataLoader(chunks, batch_size=None, collate_fn=read, num_workers=workers, worker_init_fn=end_with_parent)
+        loader = DataLoader(chunks, None, collate_fn=read, num_workers=workers, worker_init_fn=outlive_the_signal)
+        with out_of_reach() if workers else nullcontext():  # the end of a process would be an error here
+            return iter(loader)
 
 
 def _with_points(source: ScanSource, numbers: list[int]) -> tuple[Tensor, Tensor]:
