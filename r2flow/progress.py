@@ -46,7 +46,7 @@ class Bar(Progress):
         now, task = time.monotonic(), self.tasks[0]
         if self._lines and now - self._printed >= self.every and task.speed:
             self._printed = now
-            counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
+            counted = f"{self._doing} {int(task.completed + 1e-6)}/{task.total:.0f} {self._unit}"  # not those begun
             line = f"{counted}  {task.speed:.2f}/s  {duration(task.time_remaining or 0)} left  {task.fields['note']}"
             print(line.rstrip(), file=sys.stderr, flush=True)
 

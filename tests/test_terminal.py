@@ -86,9 +86,9 @@ def test_without_a_terminal_there_is_a_line_every_half_minute(capsys, monkeypatc
         bar.set(100)  # of an earlier run
         for _ in range(8):
             now += 10.0
-            bar(5)
-    # 15 scans in 30 s leave 185 for 6 min 10 s; 30 in 60 s leave 170 for 5 min 40 s
-    lines = "completing 115/300 scans  0.50/s  6:10 left\ncompleting 130/300 scans  0.50/s  5:40 left\n"
+            bar(5.2)
+    # 15.6 scans in 30 s leave 184.4 for 5 min 55 s; 31.2 in 60 s leave 168.8 for 5 min 25 s
+    lines = "completing 115/300 scans  0.52/s  5:55 left\ncompleting 131/300 scans  0.52/s  5:25 left\n"
     assert capsys.readouterr() == ("", lines)
 
 
