@@ -123,9 +123,9 @@ class Generator(nn.Module):
         noise_of_step = None if draws is None else lambda j: self.further_noise(draws, j).to(x)
         with autocast(self.device, precision):
             made = how(self, x, conditions, noise_of_step, progress or (lambda: None))
-        shapes = x.shape, (len(x), *self.space.shape)  # the noise of a part of the image has its shape
-        whole = isinstance(made, Generated) and made.x.shape in shapes
-        check(whole, f"sampler {how.name} must give a Generated of {len(x)} scans of {self.space.shape}.")
+        shape = tuple(made.x.shape) if isinstance(made, Generated) else ()
+        if shape != x.shape and shape != (len(x), *self.space.shape):  # x of a part of the image has its shape
+            raise InputError(f"sampler {how.name} must give a Generated of {len(x)} scans of {self.space.shape}.")
         return made
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
