@@ -184,6 +184,7 @@ def test_scans_whose_lasers_cannot_be_found_are_refused_in_one_line():
 def test_rings_stored_from_behind_on_are_refused():
     sensor = SENSORS["vlp16"].resized(columns=48)
     xyz, _ = image_to_points(np.full((1, 16, 48), 9, np.float32), sensor)
+    assert (project(xyz, None, sensor, "unfolding")[0] > 0).all()
     from_behind = np.roll(xyz.reshape(16, 48, 3), 24, axis=1).reshape(-1, 3)
     with pytest.raises(InputError, match="from azimuth 0 on"):
         project(from_behind, None, sensor, "unfolding")

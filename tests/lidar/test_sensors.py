@@ -136,6 +136,7 @@ def test_a_sensor_of_one_s_own_has_every_option(tmp_path):
     text += "columns: 64\nmin_range: 1\nmax_range: 50\nheight: 2\n"
     mine = read_sensor(written(tmp_path, text))
     assert mine == Sensor("mine", (2.0, 1.0, 0.0, -1.0), 64, 1.0, 50.0, 2.0, firing=(3, 1, 0, 2))
+    assert mine.rays()[0, :, 0].rad2deg().tolist() == pytest.approx([2, 1, 0, -1], abs=1e-6)
     smaller = read_sensor(written(tmp_path, text + "rows: 2\n"))
     assert smaller.elevations == (1.5, -0.5)  # two rows of two beams each
     assert (smaller.shape, smaller.firing) == ((2, 64), None)

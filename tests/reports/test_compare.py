@@ -69,6 +69,7 @@ def test_every_number_is_the_folder_s(tmp_path):
     assert found["val_best"] == 0.4
     assert found["val_last"] == 0.6
     assert found["bend"] == 0.05
+    assert run.label == "run"
 
 
 @pytest.mark.parametrize("order", [1, -1])
