@@ -99,8 +99,9 @@ class Registry(Mapping[str, T]):
         return f"Registry({self.kind}: {', '.join(self)})"
 
     def add(self, name: str, entry: T) -> None:
+        """Add an entry; raises ValueError for a name that is taken, except by a former run of a notebook's cell."""
         modules = {getattr(one, "__module__", "") for one in (self._entries.get(name), entry)}
-        if name in self._entries and modules != {"__main__"}:  # cells of a notebook run again
+        if name in self._entries and modules != {"__main__"}:
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
         self._entries[name] = entry
 

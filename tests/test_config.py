@@ -152,9 +152,7 @@ def test_a_backbone_for_a_system_with_its_own_network_is_refused(asked: str):
 
 
 def test_an_option_called_as_a_key_of_its_group_is_refused(monkeypatch):
-    monkeypatch.setitem(BACKBONES._entries, "own", lambda rays, name="a", init="b": None)
-    with pytest.raises(InputError, match="backbone 'own' has an option 'name'"):
-        compose(["backbone=own"])
-    monkeypatch.setitem(STAGES._entries, "own", lambda generator, init="b": None)
-    with pytest.raises(InputError, match="stage 'own' has an option 'init'"):
-        compose(["stage=own"])
+    for table, group, keys in ((BACKBONES, "backbone", "name"), (STAGES, "stage", "init, name")):
+        monkeypatch.setitem(table._entries, "own", lambda one, name="a", init="b": None)
+        with pytest.raises(InputError, match=f"{group} 'own' has an option '{keys}'"):
+            compose([f"{group}=own"])

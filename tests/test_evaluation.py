@@ -164,8 +164,7 @@ class TestSets:
         assert open_scans(str(tmp_path), READING).source.names == ["a.pcd.bin"]
 
     def test_scans_are_read_as_all_parts_of_a_mixture_were(self):
-        reading = {"convention": "reference"}
-        parts = [{"reading": {**reading, "reflectance_scale": 255.0}}, {"reading": reading}]
+        parts = [{"reading": {"convention": "reference", **more}} for more in ({"reflectance_scale": 255.0}, {})]
         learned = flow()
         learned.config["data"] = {"name": "mixed", "parts": parts}
         found = reading_for([], learned)

@@ -48,17 +48,12 @@ def test_an_annotated_option_is_checked_as_what_it_annotates():
         check_options("thing", make, {"width": 1, "name": 3})
 
 
-def test_arguments_by_position_take_no_option_by_keyword():
-    assert options_of(lambda *given, damping=1.0: None, given=2) == {"damping": 1.0}
-
-
-def test_options_of_a_dataclass_have_values_of_their_own():
+def test_options_are_those_by_keyword_and_have_values_of_their_own():
     @dataclass
     class Settings:
         size: int
         names: list[str] = field(default_factory=list)
 
-    first = options_of(Settings)
-    assert first == {"size": MISSING, "names": []}
-    first["names"].append("changed")
-    assert options_of(Settings)["names"] == []
+    options_of(Settings)["names"].append("changed")
+    assert options_of(Settings) == {"size": MISSING, "names": []}
+    assert options_of(lambda *given, damping=1.0: None, given=2) == {"damping": 1.0}

@@ -77,8 +77,7 @@ def open_partial(
     for (folder, spec), paths in groups.items():
         opened.append(_files(folder, paths, spec or str(paths[0]), reading, source, scale))
     scans = [scan for some, _ in opened for scan in some]
-    duplicates = [name for name, count in Counter(scan.name for scan in scans).items() if count > 1]
-    if duplicates:
+    if duplicates := [name for name, count in Counter(scan.name for scan in scans).items() if count > 1]:
         raise InputError(f"two of the scans would have answers called {duplicates[0]}: complete them apart.")
     return scans, [line for _, lines in opened for line in lines]
 

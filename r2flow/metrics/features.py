@@ -164,8 +164,7 @@ class Manifold(FeatureMetric):
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         names = [f"{name}_{self.name.removeprefix('manifold_')}" for name in NAMES]
-        few = [side for side in SIDES if self.count(side) <= NEIGHBOURS]
-        if few:
+        if few := [side for side in SIDES if self.count(side) <= NEIGHBOURS]:
             remark = f"{self.name}: too few {' and '.join(few)} scans to have {NEIGHBOURS} neighbours each."
             return dict.fromkeys(names, float("nan")), [remark]
         real, generated = self.kept("real"), self.kept("generated")

@@ -124,7 +124,7 @@ def _pairs(x: np.ndarray, returned: np.ndarray, edges: np.ndarray, parts: int) -
 
 
 def rate_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean |x - y| over bins, rates of counts (missing, all, of images), 0 without; at least `lacking`, NaN of none."""
+    """Mean |x - y| of rates over bins of counts (missing, all, of images), 0 if empty; at least `lacking`, else NaN."""
     sets = a.reshape(3, -1), b.reshape(3, -1)
     (x, p), (y, q) = ((lost / np.maximum(rays, 1), rays / pixels) for lost, rays, pixels in sets)
     # Share of a set's rays beyond 100 times the other's in their bin, which have no rate to compare: 1 if it has none.

@@ -207,6 +207,7 @@ def _components(count: int, edges: np.ndarray) -> np.ndarray:
 
 
 def _least(label: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Minimum of values (N, ...) per label 0, 1, ..., (labels, ...)."""
     least = np.full((label.max(initial=-1) + 1, *values.shape[1:]), np.inf)
     np.fmin.at(least, label, values)
     return least

@@ -112,8 +112,7 @@ def draw(
 
 def warn_unsolved(converged: Tensor, first: int = 0, of: str = "") -> None:
     """Warn about unconverged scans; `first` is the number of the first scan, `of` says of what."""
-    lost = [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]
-    if lost:
+    if lost := [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]:
         log.warning(
             "not solved, so no scans of this flow: %s%s; try another solver, or for a velocity that is singular at t = "
             "1 a last step before it: --sampler adams3:finish=0.001.",

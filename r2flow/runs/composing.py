@@ -128,7 +128,7 @@ def add_choices() -> None:
             else:
                 node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
                 keys = {"name": name, **({"init": None} if group == "stage" else {})}
-                taken = ", ".join(keys.keys() & node)
+                taken = ", ".join(sorted(keys.keys() & node))
                 check(not taken, f"{group} '{name}' has an option '{taken}', a key of every {group}: rename it.")
                 node = keys | node
             ConfigStore.instance().store(name, node, group=group)

@@ -194,4 +194,5 @@ def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, step
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Sum of a b over each scan, (B, 1, ...)."""
     return (a * b).flatten(1).sum(1).view(-1, *(1,) * (a.ndim - 1))

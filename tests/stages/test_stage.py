@@ -71,9 +71,6 @@ def test_steps_of_its_own_are_clipped_scheduled_and_counted_as_lightning_s(tmp_p
     assert manual.rates == automatic.rates
     assert automatic.rates[:2] == pytest.approx([0.05, 0.1])  # a warm-up of 16 images is one of two steps
     assert not torch.equal(manual.other.weight, Manual().other.weight)
-
-
-def test_parameters_of_the_stage_itself_learn_too(tmp_path):
     stage = type("Own", (Automatic,), {"training_step": lambda self, batch, _: self.other(batch).square().sum()})()
     assert not torch.equal(fitted(stage, tmp_path).other.weight, Automatic().other.weight)
 

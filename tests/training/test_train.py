@@ -203,8 +203,8 @@ def test_a_sweep_whose_jobs_reach_their_time_goes_on_with_the_same_command(train
 
 def test_a_job_s_folder_names_what_is_swept():
     given = ["backbone.depths=[1,1],[1,2]", "loggers=[csv,wandb]", "seed=range(2)"]
-    name = job_folder(given, "backbone.depths=[1,2],loggers=[csv,wandb],seed=0")
-    assert name[:-6] == "backbone.depths=_1_2_seed=0-"
+    overrides = "backbone.depths=[1,2],loggers=[csv,wandb],seed=0"
+    assert job_folder(given, overrides)[:-6] == "backbone.depths=_1_2_seed=0-"
 
 
 @pytest.mark.parametrize("option", ["run_dir=here", "run_dir=a,b", "name=here"])
