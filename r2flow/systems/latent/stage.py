@@ -83,8 +83,8 @@ LEAST = 1 / 255  # metres: shorter ranges are not returns
 
 
 def returns(x: Tensor, encoding: Encoding) -> Tensor:
-    """Mask of returns of images in model space, 1 or -1, (B, 1, H, W)."""
-    return torch.where(encoding.format.inverse((x[:, :1] + 1) / 2) < LEAST, -1.0, 1.0)
+    """Mask of returns of images in model space, 1 or -1, (B, 1, H, W); up to 1e-6 above the limit, -1."""
+    return torch.where(encoding.format.inverse((x[:, :1] + 1 - 1e-6) / 2) < LEAST, -1.0, 1.0)
 
 
 class LearnAutoencoder(Stage):
