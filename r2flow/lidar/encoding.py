@@ -163,13 +163,12 @@ class Encoding:
             returned = self._between(r)
         else:
             returned = (r >= near * (1 - LIMIT_TOLERANCE)) & (r <= far * (1 + LIMIT_TOLERANCE))
-        zero = torch.zeros_like(r)
-        image = torch.where(returned, r.clamp(near, far), zero)
+        image = torch.where(returned, r.clamp(near * (1 + 1e-6), far * (1 - 1e-6)), 0.0)  # also their rounded points
         if self.reflectance:
             reflectance = y[..., 1:, :, :].clamp(0, 1)
             if self.levels is not None:
                 reflectance = (reflectance * self.levels).round() / self.levels
-            image = torch.cat([image, torch.where(returned, reflectance, zero)], dim=-3)
+            image = torch.cat([image, torch.where(returned, reflectance, 0.0)], dim=-3)
         return image
 
     def _between(self, r: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import FORMATS, Encoding, ModelSpace
+from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.sensors import SENSORS, Sensor
 
 HDL64E = SENSORS["hdl64e"]
@@ -14,11 +15,12 @@ HDL64E = SENSORS["hdl64e"]
 @pytest.mark.parametrize("format", list(FORMATS))
 @pytest.mark.parametrize("reflectance", [True, False])
 def test_encode_then_decode_is_exact_to_a_millimetre_or_to_float32(sensor, format, reflectance):
-    r = torch.linspace(sensor.min_range, sensor.max_range, math.prod(sensor.shape)).view(1, *sensor.shape)
+    near, far = sensor.min_range, sensor.max_range
+    r = torch.linspace(0.9 * near, 1.1 * far, math.prod(sensor.shape)).view(1, *sensor.shape).clamp(near, far)
     r[:, ::5, ::7] = 0
     image = torch.cat([r, torch.rand(r.shape) * (r > 0)]) if reflectance else r
     if format == "inverse_depth":  # which has no tolerance at the limits, where float32 may lose a range
-        image[0] = image[0].clamp(sensor.min_range * (1 + 2e-5), sensor.max_range * (1 - 2e-5)) * (image[0] > 0)
+        image[0] = image[0].clamp(near * (1 + 2e-5), far * (1 - 2e-5)) * (image[0] > 0)
     encoding = Encoding(sensor, format, reflectance)
     x = encoding.encode(image[None])
     assert x.shape == (1, encoding.channels, *sensor.shape)
@@ -28,6 +30,7 @@ def test_encode_then_decode_is_exact_to_a_millimetre_or_to_float32(sensor, forma
     held = image[0] ** 2 / sensor.min_range * 2**-26 + 1e-4 if format.startswith("inverse") else torch.zeros(())
     assert ((decoded[0] - image[0]).abs() < held.clamp(min=1e-3)).all()
     assert torch.equal(decoded[0] == 0, image[0] == 0)
+    np.testing.assert_array_equal(project(*image_to_points(decoded.numpy(), sensor), sensor)[0] == 0, image[0] == 0)
     if reflectance:
         assert (decoded[1] - image[1]).abs().max() < 1e-6
 
@@ -35,8 +38,7 @@ def test_encode_then_decode_is_exact_to_a_millimetre_or_to_float32(sensor, forma
 def test_logscale_is_the_paper_s():
     encoding = Encoding(HDL64E)
     image = torch.zeros(2, *HDL64E.shape)
-    image[:, 0, 0] = torch.tensor([1.45, 0.25])
-    image[:, 0, 1] = torch.tensor([80.0, 1.0])
+    image[:, 0, :2] = torch.tensor([[1.45, 80.0], [0.25, 1.0]])
     x = encoding.encode(image)
     assert x[:, 5, 5].tolist() == [-1, -1]  # a dropped ray is exactly -1
     assert x[0, 0, 0].item() == pytest.approx(2 * math.log2(2.45) / math.log2(81) - 1, abs=1e-6)
