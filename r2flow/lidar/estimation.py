@@ -135,7 +135,7 @@ def _family(name: str) -> str:
 def _distance(beams: np.ndarray, table: np.ndarray) -> float:
     """Distance in degrees: the 80th percentile over beams, paired in order at the best offset, as scans may be cropped.
 
-    With beams missing in between, later pairs are wrong: then the median distance to the nearest of well spaced beams.
+    With beams missing between, later pairs are wrong: then the median to the nearest of well spaced beams, if most fit.
     """
     longer, shorter = (table, beams) if len(table) >= len(beams) else (beams, table)
     if len(longer) > 1.05 * len(table) + 1:
@@ -143,9 +143,10 @@ def _distance(beams: np.ndarray, table: np.ndarray) -> float:
     shifts = range(len(longer) - len(shorter) + 1)
     paired = min(float(np.quantile(np.abs(longer[s : s + len(shorter)] - shorter), 0.8)) for s in shifts)
     gap = float(np.median(-np.diff(table)))
-    spanned = np.count_nonzero((table <= beams[0] + gap / 2) & (table >= beams[-1] - gap / 2))
-    nearest = float(np.median(np.abs(beams[:, None] - table).min(axis=1)))
-    return min(paired, nearest) if nearest <= gap / 10 and len(beams) >= 0.75 * spanned else paired
+    spanned = int(np.count_nonzero((table <= beams[0] + gap / 2) & (table >= beams[-1] - gap / 2)))
+    off = np.abs(beams[:, None] - table).min(axis=1)
+    fits = np.median(off) <= gap / 10 and np.count_nonzero(off < gap / 4) >= 0.75 * max(spanned, len(beams))
+    return min(paired, float(np.median(off))) if fits else paired
 
 
 def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:

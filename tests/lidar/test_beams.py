@@ -65,10 +65,8 @@ def test_a_sensor_is_found_again(name, how):
     assert found.steps == pytest.approx(192, rel=1e-4)
     assert found.sensor.columns == 192
     assert found.sensor.height == pytest.approx(HEIGHT, abs=0.01)
-    if name == "mine":
-        assert nearest_sensor(found.beams.elevations)[0] is None
-    else:
-        assert nearest_sensor(found.beams.elevations) == (name, pytest.approx(0, abs=1e-3))
+    nearest, distance = nearest_sensor(found.beams.elevations)
+    assert nearest is None if name == "mine" else (nearest, distance) == (name, pytest.approx(0, abs=1e-3))
     assert found.beams.firing == (sensor.firing if how == FIRINGS else None)
 
 
@@ -302,8 +300,9 @@ def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
 def test_sensors_of_one_s_own_are_judged_by_their_beams():
     mine = Sensor("mine", tuple(np.linspace(3, -25, 24).tolist()))
     assert [other_sensor([scan(s, RING_AFTER_RING)], mine) is None for s in (mine, SENSORS["vlp16"])] == [True, False]
-    few = scan(SENSORS["pandar64"], RING_AFTER_RING).xyz[:900]
-    assert other_sensor([Points(few)], SENSORS["vlp16"]) is None  # a few returns say nothing
+    few = Points(scan(SENSORS["pandar64"], RING_AFTER_RING).xyz[:900])
+    assert other_sensor([few], SENSORS["vlp16"]) is None  # a few returns say nothing
+    assert nearest_sensor(35 - 4 * np.arange(11.0))[0] is None  # six of these are beams of a VLP-16
     less = scan(Sensor("less", tuple(np.delete(HDL64E_RINGS, [n for n in range(32, 64) if n % 4]))), RING_AFTER_RING)
     assert "21 of its 64 rows lie between" in other_sensor([less], SENSORS["hdl64e_rings"]).seen
 
