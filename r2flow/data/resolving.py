@@ -63,7 +63,7 @@ def _checked_parts(run: DataOptions) -> list[Data]:
     parts: list[Data] = [{"scenes": run.scenes, **part} for part in run.parts]
     for number, part in enumerate(parts):
         if isinstance(name := part.get("sensor"), str):
-            part["sensor"] = options_of_sensor(read_sensor(name)) if name.endswith(ENDINGS) else {"name": name}
+            part["sensor"] = options_of_sensor(read_sensor(name)) if name.lower().endswith(ENDINGS) else {"name": name}
         _check_set(f"data.parts[{number}]", PartOptions, part)
         if part.get("sensor") is not None:
             check_options(f"data.parts[{number}].sensor", build_sensor, part["sensor"])

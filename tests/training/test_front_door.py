@@ -145,11 +145,11 @@ def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(scans:
 
 
 def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
-    write_sensor(replace(SENSORS["vlp16"], name="mine"), tmp_path / "my sensor.yaml", "")
-    sensor = compose(["sensor.columns=256", f"sensor='{tmp_path}/my sensor.yaml'", "sensor.min_range=3"])["sensor"]
+    write_sensor(replace(SENSORS["vlp16"], name="mine"), tmp_path / "my sensor.YAML", "")
+    sensor = compose(["sensor.columns=256", f"sensor='{tmp_path}/my sensor.YAML'", "sensor.min_range=3"])["sensor"]
     assert [sensor[key] for key in ("name", "rows", "columns", "min_range")] == ["mine", None, 256, 3]
     assert sensor["elevations"] == list(SENSORS["vlp16"].elevations)
-    part = {"name": "simulated", "sensor": str(tmp_path / "my sensor.yaml")}
+    part = {"name": "simulated", "sensor": str(tmp_path / "my sensor.YAML")}
     (part,) = resolve({"name": "mixed", "parts": [part]})["parts"]
     assert build_sensor(**part["sensor"]) == replace(SENSORS["vlp16"], name="mine")
     (tmp_path / "own.yaml").write_text("{name: hdl32e, rows: 16, rays: centre}")  # a built-in sensor by its name
