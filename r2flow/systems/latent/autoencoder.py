@@ -210,17 +210,15 @@ class Autoencoder(nn.Module):
         widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
         self.mask, self.code_channels = mask, code_channels
         finest, coarsest = widths[0], widths[-1]
+        downwards = zip([width, *widths[:-1]], widths, [*self.strides, None], strict=True)
+        upwards = zip([*widths[1:], coarsest], widths, [None, *self.strides], strict=True)
         down = (
             Level([before, *[after] * blocks], SQUARE, i in attention, down=stride)
-            for i, (before, after, stride) in enumerate(
-                zip([width, *widths[:-1]], widths, [*self.strides, None], strict=True)
-            )
+            for i, (before, after, stride) in enumerate(downwards)
         )
         up = (
             Level([before, *[after] * (blocks + 1)], BLOCK[stride or (1, 2)], i in attention, up=stride)
-            for i, (before, after, stride) in enumerate(
-                zip([*widths[1:], coarsest], widths, [None, *self.strides], strict=True)
-            )
+            for i, (before, after, stride) in enumerate(upwards)
         )
         self.encoder = nn.Sequential(OrderedDict(
             conv_in=CircularConv2d(channels, width), down=nn.Sequential(*down), mid=_middle(coarsest),

@@ -1,5 +1,6 @@
 """Training of LiDM: an adversarial autoencoder, and the diffusion of its latents."""
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,8 @@ from r2flow.registry import Count, Natural, NonNegative, construct
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.diffusion.process import noised
 from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
+
+log = logging.getLogger(__name__)
 
 
 class PatchDiscriminator(nn.Module):
@@ -33,9 +36,7 @@ class PatchDiscriminator(nn.Module):
         for layer in range(1, layers + 1):
             wide = width * min(2**layer, 8)
             stride = 2 if layer < layers else 1
-            parts += [
-                nn.Conv2d(narrow, wide, 4, stride, 1, bias=False), nn.BatchNorm2d(wide), nn.LeakyReLU(0.2),
-            ]  # fmt: skip
+            parts += [nn.Conv2d(narrow, wide, 4, stride, 1, bias=False), nn.BatchNorm2d(wide), nn.LeakyReLU(0.2)]
             narrow = wide
         self.main = nn.Sequential(*parts, nn.Conv2d(narrow, 1, 4, 1, 1))
         for module in self.main:
@@ -124,15 +125,16 @@ class LearnAutoencoder(Stage):
         self.autoencoder = self.generator.first_stage_model
         channels = generator.space.shape[0] + self.autoencoder.mask
         self.discriminator = construct("stage.discriminator", PatchDiscriminator, discriminator, channels)
-        rows, columns = generator.space.shape[1:]
+        (rows, columns), latents = generator.space.shape[1:], self.generator.noise_shape[1:]
         if min(rows, columns) < self.discriminator.smallest:
             raise InputError(
                 f"stage.discriminator judges images of at least {self.discriminator.smallest} rows and columns, found "
                 f"{rows} x {columns}; give it fewer layers, as stage.discriminator='{{layers: 1}}'."
             )
+        if any(side % 4 for side in latents):
+            log.warning("%d x %d latents: stage=latent_diffusion takes at most 2 generator.unet.multipliers", *latents)
         self.adversarial_weight, self.codebook_weight = adversarial_weight, codebook_weight
-        self.adversarial_start, self.inverted = adversarial_start, inverted
-        self.mask_factor = mask_factor
+        self.adversarial_start, self.inverted, self.mask_factor = adversarial_start, inverted, mask_factor
 
     def configure_optimizers(self) -> Any:
         return self.optimizers_for(self.autoencoder.parameters(), self.discriminator.parameters())

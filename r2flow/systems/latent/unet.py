@@ -104,7 +104,7 @@ class LatentUNet(nn.Module):
         super().__init__()
         channels, rows, columns = shape
         widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
-        halved("the U-Net of the latents", (rows, columns), len(widths) - 1)
+        halved("the U-Net of the latents (generator.unet.multipliers)", (rows, columns), len(widths) - 1)
         condition, self.width = 4 * width, width
         self.time_embed = nn.Sequential(ExactLinear(width, condition), nn.SiLU(), ExactLinear(condition, condition))
         self.position = nn.Parameter(torch.zeros(width, rows, columns)) if position == "learnable" else None
