@@ -93,13 +93,13 @@ def mask_identity(text: str) -> str:
     """A mask's text with a hash of each file in it."""
     parts = [part.strip() for part in text.split("+")]
     return "+".join(
-        f"{part} ({hashlib.sha256(Path(part).read_bytes()).hexdigest()[:16]})" if part.endswith(".npy") else part
-        for part in parts
+        f"{one} ({hashlib.sha256(Path(one).read_bytes()).hexdigest()[:16]})" if one.lower().endswith(".npy") else one
+        for one in parts
     )
 
 
 def _one_mask(text: str) -> Mask:
-    if text.endswith(".npy"):
+    if text.lower().endswith(".npy"):
         return _from_file(Path(text))
     name, _, numbers = text.partition(":")
     mask = MASKS[name]

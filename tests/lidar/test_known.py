@@ -57,7 +57,7 @@ def test_a_mask_from_a_file_has_the_size_of_the_scans(tmp_path):
     np.save(tmp_path / "mask.npy", np.eye(16, 64, dtype=np.uint8))
     assert (parse_mask(str(tmp_path / "mask.npy"))(WHOLE, draws()) == np.eye(16, 64, dtype=bool)).all()
     with pytest.raises(InputError, match="16, 64"):
-        parse_mask(str(tmp_path / "mask.npy"))(WHOLE[:8], draws())
+        parse_mask(str((tmp_path / "mask.npy").rename(tmp_path / "mask.NPY")))(WHOLE[:8], draws())
     for other in (np.full((16, 64), 0.5), np.ones((1, 2, 2), bool), np.full((2, 2), None)):
         np.save(tmp_path / "other.npy", other)
         with pytest.raises(InputError, match=r"other\.npy"):
