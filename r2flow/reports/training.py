@@ -30,7 +30,7 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
     folders = Path(run, "metrics").glob("version_*/metrics.csv")
     numbered = {int(number): path for path in folders if (number := path.parent.name.split("_")[1]).isdecimal()}
     for _, path in sorted(numbered.items()):
-        for row in csv.DictReader(path.read_text(encoding="utf-8", errors="replace").splitlines()):
+        for row in csv.DictReader(path.read_text("utf-8", "replace").rpartition("\n")[0].splitlines()):
             for name in (name for name in names if row.get(name)):
                 with suppress(TypeError, ValueError):  # a line cut by a kill or a full disk
                     values[name][int(row["step"]) + 1] = float(row[name])  # Lightning logs the index of the step
