@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from PIL import Image
 
@@ -70,6 +71,9 @@ def test_every_number_is_the_folder_s(tmp_path):
     assert found["val_last"] == 0.6
     assert found["bend"] == 0.05
     assert run.label == "run"
+    (folder / "config.yaml").unlink()
+    torch.save({"config": CONFIG}, folder / "checkpoints" / "step-00000038.ckpt")
+    assert [one.values for path in (folder, tmp_path) for one in read_runs([path])] == [found, found]
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -192,7 +196,7 @@ def test_the_page_is_written_with_its_picture(tmp_path):
 def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path):
     run = make_run(tmp_path / "run", train=[2.0, 1.0, 0.5], checkpoint=3)
     log = run / "metrics" / "version_0" / "metrics.csv"
-    log.write_bytes(log.read_bytes() + b"3,0.2" + b"\0\xff" * 20 + b"\n4,0.x\n")
+    log.write_bytes(log.read_bytes() + b"3,0.2" + b"\0\xff" * 20 + b"\n4,0.x\n5,0.2" + bytes(200_000))
     (run / "metrics" / "version_x").mkdir()
     (run / "metrics" / "version_x" / "metrics.csv").touch()
     steps, values = read_curves(run)["train/loss"]
