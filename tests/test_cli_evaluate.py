@@ -130,13 +130,14 @@ def points(r2flow, real, tmp_path):
     return measure
 
 
-def test_several_samplers_and_steps_make_a_set_each(points, saved, tmp_path):
+def test_several_samplers_and_steps_make_a_set_each(points, r2flow, real, saved, tmp_path):
     rows, page = points(saved[0], "--sampler", "euler,heun2", "--steps", "1,2")
     assert [(row["flow"].partition(", ")[2], row["evaluations"]) for row in rows] == [
         ("euler", 1), ("euler", 2), ("heun2", 2), ("heun2", 4),
     ]  # fmt: skip
     assert all(row["jsd/jsd"] > 0 and row["seconds"] > 0 for row in rows)
     assert f"{saved[0].name}, heun2, 2 steps" in page
+    assert "no sampler named ''" in r2flow("evaluate", real, saved[0], "--sampler", "euler,").refusal
     assert (tmp_path / "evaluation_speed.png").stat().st_size > 10_000
 
 

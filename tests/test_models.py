@@ -26,7 +26,7 @@ from tests.conftest import ROOT
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_of_the_package_draws(name):
     found = load_checkpoint(name)
-    assert found.path == find_model(name)
+    assert found.path == find_model(name) == find_checkpoint(f"{name}/")
     assert name_of(found.path) == name
     assert all(value.isfinite().all() for value in found.generator.state_dict().values())
     if not found.generator.draws:

@@ -89,7 +89,7 @@ def prepare(
     content = f"{usable} scan{'s' * (usable != 1)} in {shards} shard{'s' * (shards != 1)}"
     kept = f" ({there} there already)" if there else ""
     reflectance = "no reflectance in the scans" if levels is None else f"reflectance as n/{levels}"
-    skipped = f"; {left_out} scans left out" if left_out else ""
+    skipped = f"; {left_out} scan{'s' * (left_out != 1)} left out" if left_out else ""
     print(f"{out}: {content}{kept}, {size / 2**20:.1f} MiB; {reflectance}{skipped}")
 
 

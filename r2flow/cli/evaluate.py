@@ -212,7 +212,7 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
     from r2flow.evaluation.sets import sampled_set
     from r2flow.samplers import split_samplers
 
-    names = split_samplers(options.sampler) if options.sampler else [None]
+    names = [None] if options.sampler is None else split_samplers(options.sampler)
     steps = numbers("steps", options.steps) if options.steps else [None]
     sets, samplers = {}, _samplers(flow.generator, names, steps, options.tolerance)
     if not samplers:
@@ -235,7 +235,8 @@ def _samplers(
     from r2flow.registry import options_of
     from r2flow.samplers import SAMPLERS, parse_sampler
 
-    fields = [options_of(SAMPLERS[parse_sampler(name)["name"]]) if name else vars(generator.sampler) for name in names]
+    own = vars(generator.sampler)
+    fields = [own if name is None else options_of(SAMPLERS[parse_sampler(name)["name"]]) for name in names]
     curve = names == [None] and len(steps) > 1  # a generator without steps (GAN) is one point of the curve
     varied = {option for option in ("steps", "tolerance") if curve or any(option in other for other in fields)}
     chosen: list[Sampler] = []

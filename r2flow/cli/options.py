@@ -157,7 +157,7 @@ class SamplerOptions:
         from r2flow.samplers import parse_sampler
 
         given = {key: value for key, value in asdict(self).items() if key != "sampler" and value is not None}
-        return {**(parse_sampler(self.sampler) if self.sampler else {}), **given}
+        return {**({} if self.sampler is None else parse_sampler(self.sampler)), **given}
 
 
 @dataclass(frozen=True)

@@ -181,7 +181,7 @@ def find_checkpoint(path: str | Path) -> Path:
 
     A file or a run in the current folder takes precedence over a model of the same name.
     """
-    name, path = str(path), Path(path).expanduser()
+    name, path = str(path).rstrip("/"), Path(path).expanduser()
     if path.is_file():
         return path
     checkpoints = checkpoints_of(path) or sorted(path.glob("step-*.ckpt"), key=step_of, reverse=True)
