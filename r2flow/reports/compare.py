@@ -54,12 +54,10 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     runs: list[Path] = []
     for path in paths:
         files = [file for level in ("", "*/", "*/*/") for file in sorted(path.glob(f"{level}c*"))]
-        inside = [file.parent for file in files if file.name == CONFIG or checkpoints_of(file.parent)]
+        inside = [file.parent for file in files if file.name == CONFIG or checkpoints_of(file.parent)]  # or CONFIG lost
         runs += [path] if path in inside else [run for run in inside if not run.name.startswith(".")]
     if wrong := [path for path in paths if not runs or not path.exists()]:
-        raise InputError(
-            f"{wrong[0]} is not a run: it has no {CONFIG} and no checkpoint. Give folders that train.py has written."
-        )
+        raise InputError(f"{wrong[0]} is not a run: it has no {CONFIG} and no checkpoint. Give folders of train.py.")
     return list({run.resolve(): run for run in runs}.values())  # a link and its run are one
 
 
