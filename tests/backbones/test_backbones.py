@@ -24,7 +24,6 @@ LISTED = {  # under these names in the oracle
     "efficient_unet": "eff_base", "efficient_unet_large": "eff_large",
 }  # fmt: skip
 
-
 CASES = {
     "eff_16x64_polar": "efficient_unet", "adm_16x64_fourier": "adm_unet",
     **dict.fromkeys(("hdit_16x192", "hdit_16x192_fourier_features", "hdit_16x64_dup"), "hdit"),

@@ -25,7 +25,6 @@ def logistic_solution(x_0, t):
 
 X_0 = torch.tensor([[0.1], [0.3], [0.6]], dtype=torch.float64)
 
-
 FIXED = [name for name, entry in SOLVERS.items() if isinstance(entry, FixedStep)]
 ADAPTIVE = [name for name, entry in SOLVERS.items() if isinstance(entry, EmbeddedMethod)]
 
@@ -47,6 +46,11 @@ def test_an_adaptive_method_of_equal_steps_has_its_order(method):
         return (solution.x - logistic_solution(X_0, 1)).abs().max().item()
 
     assert math.log2(error(32) / error(64)) == pytest.approx(SOLVERS[method].order, abs=0.35)
+    # Between the stages, a path is of order 4 (Hairer II.6): exact, as its slope, for a velocity t^q up to q = 3.
+    nodes, theta = np.array([0.0, *SOLVERS[method].nodes]), np.linspace(0, 1, 9)
+    exact = [[theta ** (q + 1) / (q + 1), theta**q] for q in range(4)]
+    found = [[weights.T @ nodes**q for weights in SOLVERS[method].interpolant(theta)] for q in range(4)]
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("method", FIXED)
