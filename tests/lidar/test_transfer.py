@@ -60,7 +60,7 @@ def test_the_rows_are_measured_that_a_beam_looks_into(source, target):
 
 
 def test_a_measured_row_has_the_range_of_its_beam_in_every_column():
-    seen = points_through(wall(fired()), fired(), TARGET)
+    seen = points_through(wall(fired()), fired(VLP16.elevations), TARGET)  # its beams are 0.1 degrees off
     for e, row in zip(BEAMS, rows_of(np.asarray(BEAMS), TARGET), strict=True):
         if row >= 0:
             np.testing.assert_allclose(seen.image[0, row], RADIUS / math.cos(math.radians(e)), rtol=1e-5)

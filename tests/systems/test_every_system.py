@@ -106,7 +106,6 @@ FAMILIES = {
 }  # fmt: skip
 FIRST = ["experiment=lidm_autoencoder", "size=small", *TINY, "trainer.max_steps=3", "generator.autoencoder.codes=16"]
 
-
 assert_equal = partial(torch.testing.assert_close, rtol=0, atol=0)  # bit-equal, whatever is nested in what
 
 
