@@ -164,7 +164,6 @@ name=x scans=3 # no key 'scans'
 name=x +parent=3
 """
 
-
 USUAL = {"", "-", "c", "o", "x", "a", "1", "0", "3", "name", "run", "out", "scans", "train", "data", "report"}
 
 
