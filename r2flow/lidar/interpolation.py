@@ -35,8 +35,7 @@ def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = Fal
     count = known.shape[1]
     at, lines = np.arange(count), np.arange(len(known))[:, None]
     left, right = nearest_known(known)
-    inside = (left >= 0) & (right < count)
-    fillable = (left >= 0) | (right < count) if extend else inside & (known.sum(1, keepdims=True) > 1)
+    fillable = (left >= 0) | (right < count) if extend else (left >= 0) & (right < count)
     nearest = np.where((left < 0) | ((right < count) & (right - at < at - left)), right, left).clip(0, count - 1)
     returned = known & (values[0] > 0)
     back = returned[lines, nearest]
