@@ -51,16 +51,16 @@ class Scan:
         return normals(self.r, self.sensor)
 
 
-def histogram(x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Counts of values in [a, b) per bin, (bins,), without NaN; like numpy's histogram, faster for few bins."""
+def histogram(x: np.ndarray, edges: np.ndarray, weighted: bool = False) -> np.ndarray:
+    """Counts, or sums, of values in [a, b) per bin, (bins,), without NaN; like numpy's, faster for few bins."""
     place = np.searchsorted(edges[:-1], x, side="right") - 1
     inside = (place >= 0) & (x <= edges[-1])
-    return np.bincount(place[inside], None if weights is None else weights[inside], len(edges) - 1)
+    return np.bincount(place[inside], x[inside] if weighted else None, len(edges) - 1)
 
 
 def drop_rate(value: np.ndarray, missing: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Per bin of a value, counts of missing rays and of all rays, and the rays of the image, (3, bins)."""
-    return np.stack([histogram(value, edges, missing), histogram(value, edges), np.full(len(edges) - 1, value.size)])
+    return np.stack([histogram(value[missing], edges), histogram(value, edges), np.full(len(edges) - 1, value.size)])
 
 
 def differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -153,12 +153,7 @@ class Member(NamedTuple):
 
 def histogram_of(values: Callable[[Scan], np.ndarray], edges: np.ndarray, weighted: bool = False) -> Member:
     """The histogram of some values of a scan, each counted once, or as often as its value says."""
-
-    def counts(scan: Scan) -> np.ndarray:
-        x = values(scan).ravel()
-        return histogram(x, edges, x if weighted else None)
-
-    return Member(counts, len(edges) - 1)
+    return Member(lambda scan: histogram(values(scan).ravel(), edges, weighted), len(edges) - 1)
 
 
 PANEL: dict[str, Member] = {
@@ -222,7 +217,9 @@ class Panel(SumMetric):
     biased = True
 
     def rows(self, scans: Scans) -> Tensor:
-        return nan_where_empty(panel_rows(scans), scans)
+        if self.name not in scans.features:
+            scans.features[self.name] = nan_where_empty(panel_rows(scans), scans)
+        return scans.features[self.name]
 
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
         if not (real.any() and generated.any()):

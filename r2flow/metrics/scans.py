@@ -47,7 +47,7 @@ class Scans:
         r = images[:, :1]
         self.images = torch.where((r > MASK[0]) & (r < MASK[1]), images, torch.zeros_like(images))
         self.sensor = sensor
-        self.features: dict[Any, Tensor] = {}  # of networks, by network
+        self.features: dict[Any, Tensor] = {}  # of networks, by network; the counts of the panel
 
     def __len__(self) -> int:
         return len(self.images)
