@@ -235,8 +235,7 @@ def _samplers(
     from r2flow.registry import options_of
     from r2flow.samplers import SAMPLERS, parse_sampler
 
-    own = vars(generator.sampler)
-    fields = [own if name is None else options_of(SAMPLERS[parse_sampler(name)["name"]]) for name in names]
+    fields = [vars(generator.sampler) if n is None else options_of(SAMPLERS[parse_sampler(n)["name"]]) for n in names]
     curve = names == [None] and len(steps) > 1  # a generator without steps (GAN) is one point of the curve
     varied = {option for option in ("steps", "tolerance") if curve or any(option in other for other in fields)}
     chosen: list[Sampler] = []

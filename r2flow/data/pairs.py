@@ -80,8 +80,7 @@ class PairStore(Store):
         """The numbers of the usable pairs, from 0; refuses a folder that lacks pairs."""
         num, lacking = self.options.num, min(self.missing_pairs(), self.options.num)
         check(not lacking, f"{self.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
-        flags = [flag for shard in self.shards for flag in self.head(shard)["usable"]]
-        return np.flatnonzero(flags[:num])
+        return np.flatnonzero([flag for shard in self.shards for flag in self.head(shard)["usable"]][:num])
 
     def noise(self, index: int) -> Tensor:
         """x_0 of a pair, which is not stored: the noise of (seed, "pairs", index)."""

@@ -26,8 +26,7 @@ class Scripted(L.LightningModule):
         self.warmup_steps = 0
 
     def training_step(self, batch, batch_idx):
-        optimizer = self.optimizers()
-        optimizer.step()
+        self.optimizers().step()
         with torch.no_grad():
             self.weight.fill_(self.values[batch_idx])
 

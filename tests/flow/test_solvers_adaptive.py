@@ -94,8 +94,7 @@ def in_tolerances(solution, exact, tolerance):
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-5])
 def test_jumps_in_time_are_located(tolerance):
-    draws = torch.Generator().manual_seed(5)
-    at, by = torch.rand(2, 60, generator=draws, dtype=torch.float64)
+    at, by = torch.rand(2, 60, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     drawn = zip((0.02 + 0.96 * at).tolist(), (0.5 + 2.5 * by).tolist(), strict=True)
     jumps = Mixed([Discontinuous(jump, where) for where, jump in drawn])
     x_0 = noise(60, 16).double()

@@ -51,6 +51,5 @@ def test_a_folder_of_another_seed_or_sensor_is_refused(tmp_path):
 def test_the_verb_writes_the_scans_of_any_sensor(r2flow, tmp_path, sensor):
     asked = "--num", 1, "--sensor", sensor.name, "--seed", 4, "--format", "npy,ply", "--size", "16x64"
     assert "1 scan (npy, ply)" in r2flow("simulate", *asked, "--out", tmp_path).said
-    image = np.load(tmp_path / "000000.npy")
-    np.testing.assert_array_equal(image, simulate(sensor.resized(16, 64), 4, 0).image)
+    np.testing.assert_array_equal(np.load(tmp_path / "000000.npy"), simulate(sensor.resized(16, 64), 4, 0).image)
     assert read_manifest(tmp_path)["recipe"]["reading"]["sensor"]["name"] == sensor.name

@@ -62,8 +62,7 @@ def test_beside_the_street_the_ground_is_higher_by_the_kerb():
 
 def test_surfaces_are_strips_beside_a_street():
     ground = Ground(streets=(STRAIGHT._replace(lines=(0.0, 3.5)),))
-    y = np.array([3.0, 3.5, 3.9, 4.5, 5.9, 6.5])
-    label, _, _ = ground.surface(np.full(6, 10.0), y)
+    label, _, _ = ground.surface(np.full(6, 10.0), np.array([3.0, 3.5, 3.9, 4.5, 5.9, 6.5]))
     names = ["road", "lane-marking", "road", "sidewalk", "sidewalk", "terrain"]
     assert label.tolist() == [LABELS[name] for name in names]
 

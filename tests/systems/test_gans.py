@@ -217,8 +217,7 @@ def draws_of(count: int) -> BatchDraws:
 
 
 def test_augmentation_draws_the_published_distributions():
-    augment = AdaptiveAugment(initial=0.4)
-    draws = augment.draw(draws_of(20_000))
+    draws = AdaptiveAugment(initial=0.4).draw(draws_of(20_000))
     assert list(draws) == list(TRANSFORMATIONS)
     for name, draw in draws.items():
         assert draw[1].mean().item() == pytest.approx(0.4, abs=0.015), name

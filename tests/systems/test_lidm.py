@@ -450,7 +450,7 @@ def test_the_published_recipe_with_positions_starts_from_its_autoencoder(tmp_pat
         check(compose(["experiment=lidm", "stage.init=null", *common]))
     first = ["experiment=lidm_autoencoder", *common]
     check(compose([*first, "sensor.columns=1000"]))
-    assert "16 x 125 latents: stage=latent_diffusion takes at most 1 generator.unet.multipliers" in caplog.text
+    assert "16 x 125 latents: latent_diffusion takes at most 1 generator.unet.multipliers" in caplog.text
     parent = Parent(compose(first), tmp_path)
     config = check(compose(["experiment=lidm_ape", *common]), parent=parent)
     with torch.device("meta"):

@@ -1,7 +1,6 @@
 """Training of LiDM: an adversarial autoencoder, and the diffusion of its latents."""
 
 import logging
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -132,9 +131,9 @@ class LearnAutoencoder(Stage):
                 f"stage.discriminator judges images of at least {self.discriminator.smallest} rows and columns, found "
                 f"{rows} x {columns}; give it fewer layers, as stage.discriminator='{{layers: 1}}'."
             )
-        if odd := math.gcd(*latents) % 4:  # its U-Net halves them twice
-            most = (*latents, 2 - odd % 2)
-            log.warning("%d x %d latents: stage=latent_diffusion takes at most %d generator.unet.multipliers", *most)
+        if any(side % 4 for side in latents):  # its U-Net halves them twice
+            most = 2 - any(side % 2 for side in latents)
+            log.warning("%d x %d latents: latent_diffusion takes at most %d generator.unet.multipliers", *latents, most)
         self.adversarial_weight, self.codebook_weight = adversarial_weight, codebook_weight
         self.adversarial_start, self.inverted, self.mask_factor = adversarial_start, inverted, mask_factor
 
