@@ -15,8 +15,7 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import Bound, Registry, check_options, construct
 
-# Relative tolerance of range limits in decoding, for float32's rounding.
-LIMIT_TOLERANCE = 1e-5
+LIMIT_TOLERANCE = 1e-5  # relative, of closed range limits in decoding, for float32's rounding
 FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
 FAR = 300.0  # metres, above any scan's median range, unless its sensor has a larger limit
 
@@ -146,6 +145,9 @@ class Encoding:
         if self.limits == "open":
             r = r * self._between(r)
         y = self.format.forward(r)
+        if self.limits == "open":  # a return that the rounding of 2 y - 1 would drop moves inwards
+            kept, rounded = (self._between(self.format.inverse(z)) for z in (y, (2 * y - 1 + 1) / 2))
+            y = torch.where(kept & ~rounded, y + (0.5 - y).sign() * 2**-24, y)
         if self.reflectance:
             assert image.shape[-3] > 1, "the model has a reflectance channel and the scan has none"
             y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)
@@ -159,10 +161,7 @@ class Encoding:
         y = (x + 1) / 2
         near, far = self.sensor.min_range, self.sensor.max_range
         r = self.format.inverse(y[..., :1, :, :])
-        if self.limits == "open":
-            returned = self._between(r)
-        else:
-            returned = (r >= near * (1 - LIMIT_TOLERANCE)) & (r <= far * (1 + LIMIT_TOLERANCE))
+        returned = self._between(r)
         image = torch.where(returned, r.clamp(near * (1 + 1e-6), far * (1 - 1e-6)), 0.0)  # also their rounded points
         if self.reflectance:
             reflectance = y[..., 1:, :, :].clamp(0, 1)
@@ -172,7 +171,8 @@ class Encoding:
         return image
 
     def _between(self, r: Tensor) -> Tensor:
-        return (r > self.sensor.min_range) & (r < self.sensor.max_range)
+        slack = 0.0 if self.limits == "open" else LIMIT_TOLERANCE
+        return (r > self.sensor.min_range * (1 - slack)) & (r < self.sensor.max_range * (1 + slack))
 
 
 def wrong_with(image: Tensor, far: float = FAR) -> str | None:
