@@ -39,8 +39,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a worker for each core: more threads 
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-# A flow of 8 x 64.
-CONFIG: dict[str, Any] = {
+CONFIG: dict[str, Any] = {  # a flow of 8 x 64
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 64, "rays": "centre"},
     "encoding": {"format": "logscale", "reflectance": True},
     "backbone": {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},

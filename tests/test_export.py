@@ -15,7 +15,7 @@ from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
 from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.export import NOTES, compare, export, tableau
+from r2flow.model.export import NOTES, _traced, compare, export, tableau
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import ROOT, tiny_options
@@ -104,6 +104,11 @@ def test_a_sampler_of_more_evaluations_than_it_states_is_refused(monkeypatch, tm
     monkeypatch.setattr(type(sampler), "evaluations", lambda self, generator: 2)  # of 4
     with pytest.raises(InputError, match="`evaluations`"):
         export(flow("efficient_unet"), tmp_path / "flow.pt2", sampler)
+
+
+def test_a_network_that_torch_cannot_export_is_refused():
+    with pytest.raises(InputError, match="torch cannot export this Flatten: "):
+        _traced(torch.nn.Flatten(5), torch.tensor(0.5))
 
 
 def test_an_export_leaves_the_model_as_it_was_and_takes_a_samplers_name(tmp_path):

@@ -224,11 +224,11 @@ def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> list[Tensor]
 
 def _traced(module: nn.Module, *inputs: Tensor) -> tuple[torch.export.ExportedProgram, bool]:
     """Export the module for a free batch size; if torch cannot, for one scan."""
-    batch = torch.export.Dim("batch")
+    batch = torch.export.Dim("batch", max=1 << 31)  # torch 2.6 refuses a size without a limit
     module = module.cpu().eval()
     problem = ""
     for any_batch in (True, False):
-        examples = tuple(value if any_batch else value[:1] for value in inputs)
+        examples = tuple(value[:1] if value.ndim and not any_batch else value for value in inputs)
         dynamic_shapes = tuple({0: batch} if value.ndim and any_batch else {} for value in examples)
         try:
             with torch.no_grad():

@@ -50,8 +50,7 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
     for index in (0, 17, 49):
         x_0, x_1 = pairs[0, index]["x_0"], pairs[0, index]["x_1"]
         assert torch.equal(x_0, standard_normal(SHAPE, 0, "pairs", index))
-        # Half precision keeps 11 bits.
-        torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)
+        torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)  # half precision keeps 11 bits
     assert x_1.abs().max() > 1  # nothing is clamped
 
 

@@ -22,8 +22,7 @@ def test_s_is_that_of_the_exact_path(problem):
         velocities = torch.stack([problem(t, problem.solution(X_0, t)) for t in found.t.double()], 1)
         exact = (chord[:, None] - velocities).square().flatten(2).sum(2)
         off.append((found.s - exact).abs().max() / exact.max())
-    # Euler's path is off by O(1/n); halving the step halves the difference.
-    assert off[1] < 5e-3
+    assert off[1] < 5e-3  # Euler's path is off by O(1/n); halving the step halves the difference
     assert math.log2(off[0] / off[1]) == pytest.approx(1, abs=0.1)
     torch.testing.assert_close(found.squared_length, chord.square().flatten(1).sum(1), rtol=1e-2, atol=0)
 

@@ -19,8 +19,7 @@ def test_reference_figures(shared):
     seen = np.stack([birds_eye_histogram(points.numpy()) for points in case["point_clouds"]])
     np.testing.assert_array_equal(seen, case["hists"])
     real, generated = seen[:12].astype(float), seen[12:].astype(float)
-    # made of float32 histograms
-    assert given(JSD(), real, generated)["jsd"] == pytest.approx(case["jsd"], rel=1e-7)
+    assert given(JSD(), real, generated)["jsd"] == pytest.approx(case["jsd"], rel=1e-7)  # made of float32 histograms
     assert given(MMD(), real, generated)["mmd"] == pytest.approx(case["mmd_float64"], rel=1e-10)
     assert given(JSD(), real, real)["jsd"] == case["jsd_same"]
     assert given(MMD(), real, real)["mmd"] == pytest.approx(case["mmd_same"], abs=1e-15)

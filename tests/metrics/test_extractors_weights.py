@@ -83,8 +83,7 @@ def test_weights_that_are_added_are_those_that_are_loaded(pointnet, folder):
     x = torch.randn(1, 3, 50)
     assert torch.equal(loaded(x), network(x))
     assert not loaded.training
-    # The hash is the weights', not the file's.
-    torch.save({"state_dict": network.state_dict(), "epoch": 39}, path)
+    torch.save({"state_dict": network.state_dict(), "epoch": 39}, path)  # the hash is the weights', not the file's
     assert add("pointnet", path) == weights
     assert add("pointnet", folder / "pointnet.safetensors") == weights
     tensors = {name: value for name, value in network.state_dict().items() if "num_batches" not in name}
