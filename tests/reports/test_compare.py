@@ -73,6 +73,7 @@ def test_every_number_is_the_folder_s(tmp_path):
     assert run.label == "run"
     (folder / "config.yaml").unlink()
     torch.save({"config": CONFIG}, folder / "checkpoints" / "step-00000038.ckpt")
+    make_run(tmp_path / "cut", checkpoint=1).joinpath("config.yaml").unlink()  # one that cannot be read is left out
     assert [one.values for path in (folder, tmp_path) for one in read_runs([path])] == [found, found]
 
 
