@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from r2flow.config import flatten, rule
 from r2flow.errors import InputError, naming
-from r2flow.model.checkpoint import FOLDER, checkpoints_of, step_of
+from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.plugins import made_with
 from r2flow.reports.backbones import cost
 from r2flow.reports.pages import Page
@@ -53,11 +53,10 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     """
     runs: list[Path] = []
     for path in paths:
-        levels = [[*path.glob(level + CONFIG), *path.glob(level + FOLDER)] for level in ("", "*/", "*/*/")]
-        inside = [p.parent for level in levels for p in sorted(level) if p.name == CONFIG or read_config(p.parent)]
-        runs += [path] if path / CONFIG in levels[0] else [run for run in inside if not run.name.startswith(".")]
+        inside = [run.parent for level in ("", "*/", "*/*/") for run in sorted(path.glob(f"{level}{CONFIG}"))]
+        runs += [path] if path in inside else [run for run in inside if not run.name.startswith(".")]
     if wrong := [path for path in paths if not runs or not path.exists()]:
-        raise InputError(f"{wrong[0]} is not a run: it has no {CONFIG}, nor a checkpoint with one.")
+        raise InputError(f"{wrong[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
     return list({run.resolve(): run for run in runs}.values())  # a link and its run are one
 
 

@@ -98,7 +98,7 @@ def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool
     another row layout. A file without points, or with only rays without return, raises `NoPointsError`.
     """
     roles = {role: [np.asarray(columns[index]) for index in indices] for role, indices in find_roles(names).items()}
-    rows = roles["x"][0].shape[:1] or (1,)
+    rows = roles["x"][0].shape[:1]
     for role, candidates in roles.items():
         for column in candidates:
             right = column.shape == rows and column.dtype.kind in "fiub"

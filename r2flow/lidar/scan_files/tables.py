@@ -50,9 +50,9 @@ def read_npz(path: Path) -> Table:
         check_unpacked(path, sum(info.file_size for info in members.values()))
         lower = {name.lower(): name for name in members}
         alone = next(iter(members)) if len(members) == 1 else None
-        usual = () if {"x", "y", "z"} <= lower.keys() and members[lower["x"]].file_size not in (132, 136) else TABLES
-        table = next((lower[name] for name in usual if name in lower), alone)  # an x of 132 or 136 bytes is one number
-        others = [name for name in _named(members) if name != table and not (table and name.lower() in "xyz")]
+        usual = () if {"x", "y", "z"} <= lower.keys() else TABLES
+        table = next((lower[name] for name in usual if name in lower), alone)
+        others = [name for name in _named(members) if name != table]
         arrays = {}
         for name in [*([table] if table else []), *others]:
             with archive.open(members[name]) as file:
