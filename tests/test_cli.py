@@ -80,7 +80,7 @@ def test_every_verb_has_help_with_an_example(r2flow, verb, monkeypatch):
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"), "for 20.00 GiB more;"),
         (RuntimeError("can't allocate memory: you tried to allocate 96 bytes.\nx"), "96 bytes more"),
         (RuntimeError("not enough memory: you tried to allocate 96 bytes."), "for 96 bytes more;"),
-        (RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly"), "killed; is there memory for as many?"),
+        (RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly"), "unexpectedly; is there memory for as many"),
     ],
 )
 def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, words):

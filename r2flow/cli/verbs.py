@@ -77,7 +77,7 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
             more = f" for {size[1]} more" if size else ""
             message = f"the memory has no room{more}; give smaller batches or images, or more memory."
         elif "DataLoader worker (pid" in str(error):
-            message = "a process that reads scans was killed; is there memory for as many? The same command resumes."
+            message = f"{one_line(str(error)).rstrip('. ')}; is there memory for as many processes that read scans?"
         else:
             raise
     except USAGE_ERROR as error:

@@ -171,7 +171,7 @@ class Encoding:
         return image
 
     def _between(self, r: Tensor) -> Tensor:
-        slack = 0.0 if self.limits == "open" else LIMIT_TOLERANCE
+        slack = 0.0 if self.limits == "open" else max(LIMIT_TOLERANCE, torch.finfo(r.dtype).eps)
         return (r > self.sensor.min_range * (1 - slack)) & (r < self.sensor.max_range * (1 + slack))
 
 

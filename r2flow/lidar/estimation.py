@@ -135,7 +135,7 @@ def _family(name: str) -> str:
 def _distance(beams: np.ndarray, table: np.ndarray) -> float:
     """Distance in degrees: the 80th percentile over beams, paired in order at the best offset, as scans may be cropped.
 
-    With beams missing between, later pairs are wrong: then the median to the nearest of well spaced beams, if most fit.
+    With beams missing between, later pairs are wrong: then the median distance to the nearest beams, if most fit.
     """
     longer, shorter = (table, beams) if len(table) >= len(beams) else (beams, table)
     if len(longer) > 1.05 * len(table) + 1:

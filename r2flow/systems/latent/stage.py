@@ -84,7 +84,7 @@ LEAST = 1 / 255  # metres: shorter ranges are not returns
 
 
 def returns(x: Tensor, encoding: Encoding) -> Tensor:
-    """Mask of returns of images in model space, 1 or -1, (B, 1, H, W); up to 1e-6 above the limit, -1."""
+    """Mask of images in model space, (B, 1, H, W): 1 where a range exceeds `LEAST` (there by 1e-6), else -1."""
     return torch.where(encoding.format.inverse((x[:, :1] + 1 - 1e-6) / 2) < LEAST, -1.0, 1.0)
 
 
