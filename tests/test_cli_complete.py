@@ -365,7 +365,7 @@ def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path,
     for given, found in ((np.zeros(4), "(4,)"), (np.zeros((0, 2, 8, 64)), "(0, 2, 8, 64)"), (["a.bin"], "list")):
         with pytest.raises(InputError, match=rf"points \(N, 3 or 4\); found .*{re.escape(found)}"):
             r2flow.load(run).complete(given)
-    with pytest.raises(InputError, match="^points in memory: .*, in Python by sensor: .*beams cannot be told apart"):
+    with pytest.raises(InputError, match="^points in memory: .*, in Python by sensor: .*beams cannot be separated"):
         r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
 
 

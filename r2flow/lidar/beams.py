@@ -77,7 +77,7 @@ def _beams(scans: Sequence[Points]) -> Beams:
             "several scans in one file: they are no rows of a range image, which a spinning LiDAR makes"
         )
     raise InputError(
-        "the beams cannot be told apart: no ring numbers of beams, no known order of the points, and "
+        "the beams cannot be separated: no ring numbers of beams, no clear order of the points, and "
         "their elevations form no peaks. Are they scans of one sensor, in its own frame? If so, use a built-in one."
     )
 

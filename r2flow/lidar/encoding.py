@@ -142,12 +142,10 @@ class Encoding:
         A dropped ray, range 0, becomes exactly -1, or nearly under `shifted_log`; values are clipped to [-1, 1].
         """
         r = image[..., :1, :, :]
-        if self.limits == "open":
-            r = r * self._between(r)
-        y = self.format.forward(r)
-        if self.limits == "open":  # a return that the rounding of 2 y - 1 would drop moves inwards
+        y = self.format.forward(r * self._between(r) if self.limits == "open" else r)
+        if self.limits == "open":  # 2 y - 1 rounds y below 1/2, to the least y of a return or below it: keep these
             kept, rounded = (self._between(self.format.inverse(z)) for z in (y, (2 * y - 1 + 1) / 2))
-            y = torch.where(kept & ~rounded, y + (0.5 - y).sign() * 2**-24, y)
+            y = torch.where(kept & ~rounded, y + 2**-24, y)
         if self.reflectance:
             assert image.shape[-3] > 1, "the model has a reflectance channel and the scan has none"
             y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)

@@ -286,7 +286,7 @@ def test_a_part_of_the_view_is_enough(shared: Path):
 def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
     points = read_points(next((shared / "real" / "kitti360").rglob("*.bin")))
     lost = Points(np.random.default_rng(0).permutation(points.xyz))
-    with pytest.raises(InputError, match="cannot be told apart"):
+    with pytest.raises(InputError, match="cannot be separated"):
         find_beams(lost)
     assert other_sensor([lost], SENSORS["hdl64e"]) is None
     assert other_sensor([lost], SENSORS["vlp16"]).name is None

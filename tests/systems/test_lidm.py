@@ -230,7 +230,7 @@ def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
     x = encoding.encode(case["metres"][None])
     assert_near(x, case["model_space"], 1e-6)
     assert torch.equal(returns(x[None], encoding)[0], case["mask"])
-    edge = torch.tensor([0.0, 0.00392156, 0.005, 1.0])[None, None, None]  # published: r < 1 / 255 m is no return
+    edge = torch.tensor([0.0, 0.00392156, 0.005, 1.0])[None, None, None]  # published: r < 1 / 255 m is dropped
     for name, mask in (("metric", [-1, -1, 1, 1]), ("inverse", [-1, 1, 1, 1])):  # `inverse` clips to 1 m
         other = Encoding(sensor, name, reflectance=False)
         assert returns(other.encode(edge), other).flatten().tolist() == mask
