@@ -145,5 +145,5 @@ def _between_columns(rays: Rays, b: np.ndarray, w: np.ndarray, normal: Normal, a
     across = normal.y * rays.cos[w] - normal.x * rays.sin[w]  # d(n . d) / da
     turn = np.where(across * ahead > 0, firing, firing - 1) * (np.pi / rays.columns)
     other = ahead * cosine(turn) + across * sine(turn)
-    factor = ahead / np.where(np.abs(other) < 1e-3, ahead, other)
+    factor = np.divide(ahead, other, out=np.ones_like(ahead), where=np.abs(other) >= 1e-3)
     return np.where(normal.flat, np.clip(factor, 0.93, 1.0), 1).astype(np.float32)

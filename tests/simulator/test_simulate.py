@@ -68,7 +68,7 @@ def digest(sensor: Sensor, seed: int, index: int) -> str:
 def test_the_same_seed_and_index_give_the_same_scan_in_any_order():
     first = [digest(SMALL, 7, index) for index in range(4)]
     assert first == [digest(SMALL, 7, index) for index in reversed(range(4))][::-1]
-    assert len({*first, digest(SMALL, 8, 0)}) == 5
+    assert len({*first, digest(SMALL, 77, 964)}) == 5  # with a ray that only touches a round surface
 
 
 def test_other_instructions_and_threads_draw_the_same_scans():
