@@ -31,10 +31,10 @@ SAME = 5e-3  # largest distance of equal scans, whose files may be rounded; othe
 PAIRS = {"cpu": 1024, "cuda": 131072}  # pairs per block, by device: sized for the CPU's cache
 
 
-def described(scans: ScanSet, work: Work, device: str, doing: str) -> Iterator[Tensor]:
-    """Yield log-range averaged over cells, (B, h, w) per batch; NaN for a scan without returns."""
+def described(scans: ScanSet, training: ScanSet, work: Work, device: str, doing: str) -> Iterator[Tensor]:
+    """Yield log-range, as of training scans, averaged over cells, (B, h, w); NaN for a scan without returns."""
     rows, columns = (min(cells, size) for cells, size in zip(CELLS, scans.sensor.shape, strict=True))
-    encoding = Encoding(scans.sensor, reflectance=False)
+    encoding = Encoding(training.sensor, reflectance=False)  # a model's limits may be others
     with torch.no_grad(), bar(doing, len(scans)) as advance:
         for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
             batch = Scans(images.to(device), scans.sensor)
@@ -51,7 +51,7 @@ class Nearest:
     """
 
     def __init__(self, scans: ScanSet, training: ScanSet, work: Work, device: str) -> None:
-        x = torch.cat(list(described(scans, work, device, "describing")))
+        x = torch.cat(list(described(scans, training, work, device, "describing")))
         usable = x.isfinite().flatten(1).all(1)
         check(usable.any(), f"none of the {len(scans)} scans of {scans.label} has a return to compare.")
         self.scans, self.training, self.numbers = scans, training, np.flatnonzero(usable.cpu().numpy())
@@ -100,7 +100,7 @@ def find_nearest(sets: Mapping[str, ScanSet], training: ScanSet, work: Work, dev
     """Find the nearest training scan of each scan of several sets; reads training scans once, without storing them."""
     nearest = {name: Nearest(scans, training, work, device) for name, scans in sets.items()}
     first = 0
-    for y in described(training, work, device, "reading training scans"):
+    for y in described(training, training, work, device, "reading training scans"):
         for neighbours in nearest.values():
             neighbours.approach(y, first)
         first += len(y)

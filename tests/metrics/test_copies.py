@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +20,15 @@ from tests.conftest import SENSOR, folder, images
 def made() -> dict[str, np.ndarray]:
     """Training scans, generated ones of which the last three are copies, and held-out ones."""
     made = {"training": images(9, 1), "generated": images(6, 2), "held": images(7, 3)}
-    copies, training = made["generated"], made["training"]
-    copies[3] = training[5]
-    copies[4] = np.roll(training[6], 20, -1)
-    copies[5] = np.roll(training[7][..., ::-1], 13, -1)
+    training = made["training"]
+    made["generated"][3:] = training[5], np.roll(training[6], 20, -1), np.roll(training[7][..., ::-1], 13, -1)
     return made
 
 
 @pytest.fixture
 def sets(tmp_path: Path, made):
-    return {name: open_scans(str(folder(tmp_path / name, scans)), Reading(SENSOR)) for name, scans in made.items()}
+    reading = {"generated": Reading(replace(SENSOR, max_range=63.0))}  # samples of a model of other limits
+    return {n: open_scans(str(folder(tmp_path / n, x)), reading.get(n, Reading(SENSOR))) for n, x in made.items()}
 
 
 def log_range(image: np.ndarray) -> np.ndarray:
