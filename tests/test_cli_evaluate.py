@@ -142,8 +142,8 @@ def test_several_samplers_and_steps_make_a_set_each(points, r2flow, real, saved,
 
 
 def test_fields_in_a_sampler_s_text_count_and_make_a_set_each(points, saved):
-    rows, page = points(saved[0], "--sampler", "sde:steps=3:churn=0,sde:steps=3:churn=1,euler:grid=[0,0.5,1]")
-    assert [row["evaluations"] for row in rows] == [3, 3, 2]
+    rows, page = points(saved[0], "--sampler", "sde:steps=3:churn=0,sde:steps=3:churn=1,euler:grid=[0,0.5,1],euler")
+    assert [row["evaluations"] for row in rows] == [3, 3, 2, 16]
     assert all(f"churn={churn}" in page for churn in (0, 1))
 
 
@@ -245,10 +245,8 @@ def test_a_judged_set_may_have_the_name_of_a_baseline(r2flow, real, generated, t
     shutil.copytree(generated, tmp_path / "noise")
     sets = real, tmp_path / "noise", generated
     said = r2flow("evaluate", *sets, *QUICK, "--no-reference", "--json", tmp_path / "e.json").said
-    of = {}
-    for one in json.loads((tmp_path / "e.json").read_text())["comparisons"]:
-        (jsd,) = (metric["printed"]["JSD x 10^2"] for metric in one["metrics"] if metric["metric"] == "jsd")
-        of[one["kind"], one["comparison"]] = jsd
+    sets = json.loads((tmp_path / "e.json").read_text())["comparisons"]
+    of = {(one["kind"], one["comparison"]): one["metrics"][0]["printed"]["JSD x 10^2"] for one in sets}
     lines = {line.split("  ")[0]: line for line in said.splitlines()}
     assert f"{of['judged', 'noise']:#.4g}" in lines["noise"]
     assert f"{of['baseline', 'noise']:#.4g}" in lines["baseline: noise"]

@@ -218,11 +218,11 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
     if not samplers:
         samplers = [flow.generator.sampler]
         log.warning("%s is distilled for %s alone", label, *samplers)
-    plain = [str(sampler) for sampler in samplers]
+    plain, kinds = [*map(str, samplers)], [sampler.name for sampler in samplers]
     for sampler in samplers:
         line = f"{label}, {sampler.name}" if len(names) > 1 else label
-        count = getattr(sampler, "steps", None)
-        name = f"{line}, {count} step{'s' * (count > 1)}" if count and len(steps) > 1 else line
+        several = len(steps) > 1 or kinds.count(sampler.name) > 1
+        name = line + str(sampler).removeprefix(sampler.name) * several
         name = f"{label}, {sampler.text}" if plain.count(str(sampler)) > 1 else name
         sets[name] = sampled_set(flow, line, options.num or SAMPLED, sampler, options.seed, options.precision)
     return sets
