@@ -193,9 +193,8 @@ def completion(
     cost = sum(sampler.evaluations(model.generator) or 0 for model, sampler in ways.values()) * len(masks)
     with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
         shown = list(completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, progress=advance))
-    figure = pictured(truths[0], shown, first.sensor)
     about = f"{len(truths)} scans of {real} (at most {num}, --num), {answers} completions per scan."
-    page = completion_page([row for row, _ in shown], figure, about, seed, where)
+    page = completion_page([row for row, _ in shown], pictured(truths[0], shown, first.sensor), about, seed, where)
     finish(page, out, [about, *page.text[1:]])
 
 

@@ -71,6 +71,7 @@ def completion_rows(
             evaluations = float(torch.cat([result.evaluations for result in results]).float().mean())
             cost[name] = evaluations, sum(result.seconds for result in results) / num / len(results)
         firsts = {name: [images[0] for images in of_method] for name, of_method in answers.items()}
+        channels = min(len(images[0]) for images in firsts.values())  # the panels are means of the same lines
         cases = zip(truths, zip(*firsts.values(), strict=True), masks, strict=True)
         common = means([dict(zip(answers, common_mae(x, y, ~mask), strict=True)) for x, y, mask in cases])
         for name, of_method in answers.items():
@@ -80,7 +81,7 @@ def completion_rows(
             scans = list(zip(truths, of_method, masks, strict=True))
             off = means([means([errors(x, y, ~mask, sensor) for y in images]) for x, images, mask in scans])
             row |= {key: value for key, value in off.items() if not math.isnan(value)}
-            row["panel"] = mean_distance(distances(panel(np.stack(firsts[name]), sensor), reference))
+            row["panel"] = mean_distance(distances(panel(np.stack(firsts[name])[:, :channels], sensor), reference))
             if num > 1 and name in cost:
                 row |= means([spread_errors(x, images, ~mask) for x, images, mask in scans])
             yield row, firsts[name][0]

@@ -50,14 +50,13 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
 
     monkeypatch.setattr(type(checkpoint.generator), "forward", answer)
     ways = {"truth": (checkpoint, build_sampler("euler", steps=7))}
-    options = {"tasks": ["rows:4"], "num": 1}
-    *plain, (row, _) = completion_rows(truths, sensor, ways, **options)
+    *plain, (row, _) = completion_rows(truths, sensor, ways, ["rows:4"], 1)
     assert [one["method"] for one, _ in plain] == list(INTERPOLATIONS)
     assert row["evaluations"] == 7
     assert row["mae_m"] == pytest.approx(0, abs=1e-4)
     assert (row["drop_wrong"], row["panel"]) == (0, pytest.approx(0, abs=1e-3))
     by = 0.5
-    row, _ = list(completion_rows(truths, sensor, ways, **options))[-1]
+    row, _ = list(completion_rows(truths, sensor, ways, ["rows:4"], 1))[-1]
     assert (row["mae_m"], row["mae_common_m"]) == pytest.approx((0.5, 0.5), abs=1e-3)
     hidden = [~measured_by("rows:4", sensor, i) for i in range(3)]
     shares = np.mean([(x[0] > 0)[h].sum() / x[0].size for x, h in zip(truths, hidden, strict=True)])
@@ -65,11 +64,13 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
 
 
 def test_interpolations_are_judged_as_any_answer(checkpoint, truths):
-    rows = {row["method"]: row for row, _ in completion_rows(truths, checkpoint.sensor, {}, ["points:0.3"])}
-    expected = []
-    for number, truth in enumerate(truths):
-        mask = measured_by("points:0.3", checkpoint.sensor, number)
-        expected.append(errors(truth, interpolated(truth, mask), ~mask, checkpoint.sensor)["mae_m"])
+    config = {**checkpoint.config, "encoding": {**CONFIG["encoding"], "reflectance": False}}
+    ways = {"range": (Checkpoint(build_generator(config).eval(), config), checkpoint.generator.sampler)}
+    rows = {row["method"]: row for row, _ in completion_rows(truths, checkpoint.sensor, ways, ["points:0.3"])}
+    of_range, _ = next(completion_rows([truth[:1] for truth in truths], checkpoint.sensor, {}, ["points:0.3"]))
+    assert rows["nearest"]["panel"] == of_range["panel"]  # means of the lines that every method has
+    known = [(x, measured_by("points:0.3", checkpoint.sensor, number)) for number, x in enumerate(truths)]
+    expected = [errors(x, interpolated(x, mask), ~mask, checkpoint.sensor)["mae_m"] for x, mask in known]
     assert rows["linear, 1/r"]["mae_m"] == pytest.approx(np.mean(expected), rel=1e-4)
 
 
