@@ -122,11 +122,10 @@ def evaluation_page(
         for c in comparisons
         for side, s in (("real", c.real), ("generated", c.generated))
     ]
-    protocols = [result.protocol for result in comparisons[0].measured]
     used = [
         (p["metric"], p["representation"], "{:g} < r < {:g}".format(*p["mask"]), p["extractor"], p["weights"],
          p["layer"], words(p["settings"]), p["sizes"]["real_chosen"], p["sizes"]["generated"])
-        for p in protocols
+        for p in (result.protocol for result in comparisons[0].measured)
     ]  # fmt: skip
     text = [
         _protocol(comparisons),
@@ -233,10 +232,11 @@ def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         if comparison["kind"] != "judged" or comparison["generated"].get("kind") != "sampled":
             continue
         protocol, real = comparison["metrics"][0]["protocol"], comparison["real"]
+        chosen = [real[key] for key in ("split", "part") if real.get(key, "all") != "all"]
         row = {
             "flow": comparison["generated"]["set"], "weights": comparison["generated"]["weights"],
             "protocol": f"{protocol['name']}, {comparison['generated']['scans']} scans of "
-            f"{'x'.join(map(str, protocol['image']))} against {real['scans']} of {real['set']}",
+            f"{'x'.join(map(str, protocol['image']))} against {real['scans']} of {' in '.join([*chosen, real['set']])}",
         }  # fmt: skip
         for metric in comparison["metrics"]:
             short = "" if metric["metric"] == "speed" else f"{metric['metric']}/"

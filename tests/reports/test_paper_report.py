@@ -71,9 +71,9 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     figures = {"speed": {"evaluations": 1.0, "seconds": 0.1}, "jsd": {"jsd": 0.25}, "mmd": {"mmd": 1e-4}}
     metrics = [{"metric": name, "figures": values} for name, values in figures.items()]
     hashes = weights_hash(load_checkpoint(runs["1-RF"])), "another model"
-    sets = [{"kind": "sampled", "set": "a", "weights": weights, "scans": 5} for weights in hashes]
-    metrics[0]["protocol"] = {"name": "r2flow", "image": [8, 64]}
-    real = {"set": "held", "scans": 7}
+    sets = [{"kind": "sampled", "set": "a", "weights": weights, "scans": 10000} for weights in hashes]
+    metrics[0]["protocol"] = {"name": "paper", "image": [64, 1024]}
+    real = {"set": "kitti_360:x", "scans": 7, "split": "test"}
     comparisons = [{"kind": "judged", "real": real, "generated": one, "metrics": metrics} for one in sets]
     last, stage = "checkpoints/step-00000007.ckpt", {"name": "transfer"}
     unnamed = [write_run(tmp_path / name, network(), stage, 0.3 + i) / last for i, name in enumerate("ab")]
@@ -84,7 +84,7 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     command = "report", "paper", f"9-RF={runs['2-RF']}", runs["1-RF"], *unnamed, *options, "-o", tmp_path / "out"
     said = r2flow(*command).said
     assert all(f"({name})" in said for name in ("9-RF", f"a/{last}", f"b/{last}"))
-    assert "r2flow, 5 scans of 8x64 against 7 of held" in (tmp_path / "out" / "paper.md").read_text()
+    assert "10000 scans of 64x1024 against 7 of test in kitti_360:x." in (tmp_path / "out" / "paper.md").read_text()
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
     architecture, _ = content["architectures"]
