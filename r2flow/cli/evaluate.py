@@ -1,6 +1,7 @@
 """`r2flow evaluate`: compare generated with real scans."""
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -218,12 +219,11 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
     if not samplers:
         samplers = [flow.generator.sampler]
         log.warning("%s is distilled for %s alone", label, *samplers)
-    plain, kinds = [*map(str, samplers)], [sampler.name for sampler in samplers]
-    for sampler in samplers:
-        line = f"{label}, {sampler.name}" if len(names) > 1 else label
-        several = len(steps) > 1 or kinds.count(sampler.name) > 1
-        name = line + str(sampler).removeprefix(sampler.name) * several
-        name = f"{label}, {sampler.text}" if plain.count(str(sampler)) > 1 else name
+    curves = {sampler: re.sub(":steps=[0-9]+", "", sampler.text) for sampler in samplers}
+    for sampler, curve in curves.items():
+        alike = [text for other, text in curves.items() if other.name == sampler.name]
+        line = f"{label}, {curve if len({*alike}) > 1 else sampler.name}" if len(names) > 1 else label
+        name = line + str(sampler).removeprefix(sampler.name) * (len(steps) > 1 or len(alike) > 1)
         sets[name] = sampled_set(flow, line, options.num or SAMPLED, sampler, options.seed, options.precision)
     return sets
 
