@@ -219,9 +219,9 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
     if not samplers:
         samplers = [flow.generator.sampler]
         log.warning("%s is distilled for %s alone", label, *samplers)
-    curves = {sampler: re.sub(":steps=[0-9]+", "", sampler.text) for sampler in samplers}
-    for sampler, curve in curves.items():
-        alike = [text for other, text in curves.items() if other.name == sampler.name]
+    curves = [re.sub(":steps=[0-9]+", "", sampler.text) for sampler in samplers]
+    for sampler, curve in zip(samplers, curves, strict=True):
+        alike = [text for other, text in zip(samplers, curves, strict=True) if other.name == sampler.name]
         line = f"{label}, {curve if len({*alike}) > 1 else sampler.name}" if len(names) > 1 else label
         name = line + str(sampler).removeprefix(sampler.name) * (len(steps) > 1 or len(alike) > 1)
         sets[name] = sampled_set(flow, line, options.num or SAMPLED, sampler, options.seed, options.precision)

@@ -252,7 +252,7 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
         first.setdefault(name.split("/", 1)[0], name)
     flows = list(dict.fromkeys(row["flow"] for row in rows))
     figure = blank_figure(3.4 * len(first) + 0.6, 6.2)
-    figure.suptitle("figures against speed: of distances, lower left is better", fontsize=11)
+    figure.suptitle("quality against speed: lower left is better for distances", fontsize=11)
     panels = figure.subplots(2, len(first), squeeze=False)
     for (line, (x, label)), (column, name) in product(enumerate(AXES), enumerate(first.values())):
         axes = panels[line, column]
