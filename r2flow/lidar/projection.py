@@ -186,9 +186,8 @@ def image_to_points(
     if measured is not None:
         xyz = np.where(measured.any(axis=0), measured, xyz)
     reflectance = image[1] if len(image) > 1 else np.zeros_like(image[0])
-    columns = image.shape[-1]
-    # Azimuth decreases with w from +180 degrees: backwards from the middle, it increases from 0.
-    order = np.roll(np.arange(columns)[::-1], (columns + 1) // 2)
+    # By azimuth, not from the middle column: a ring of `reference` rays begins one column later.
+    order = torch.argsort(rays[1, 0] % (2 * math.pi)).cpu().numpy()
     xyz, reflectance, returned = xyz[..., order], reflectance[..., order], r[0, 0].numpy()[..., order] > 0
     return np.ascontiguousarray(xyz[:, returned].T), np.ascontiguousarray(reflectance[returned])
 

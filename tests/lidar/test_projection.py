@@ -220,8 +220,8 @@ def test_ring_numbers_keep_their_rows_whichever_rings_returned(how, first, missi
 def test_points_of_an_image_of_any_width_unfold_to_it(columns):
     sensor = SENSORS["vlp16"].resized(columns=columns)
     image = cloud(sensor, 5)[1][None]
-    xyz, _ = image_to_points(image, sensor.rays())
-    for points in (xyz, np.insert(xyz, range(len(xyz)), np.nan, axis=0)):
+    xyz, corners = (image_to_points(image, sensor.rays(rays))[0] for rays in ("centre", "reference"))
+    for points in (xyz, np.insert(xyz, range(len(xyz)), np.nan, axis=0), corners):
         np.testing.assert_allclose(project(points, None, sensor, "unfolding")[0], image[0], rtol=1e-6)
 
 
