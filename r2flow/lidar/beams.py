@@ -60,7 +60,7 @@ def _beams(scans: Sequence[Points]) -> Beams:
             return by_ring
     if count := _lasers_of_firings(elevations):
         middle = median_of_seen(np.concatenate([e.reshape(-1, count) for e in elevations]))
-        twice = count % 2 == 0 and np.nanmax(np.abs(middle[::2] - middle[1::2])) < SAME
+        twice = count % 2 == 0 and np.fmax.reduce(np.abs(middle[::2] - middle[1::2])) < SAME
         return _by_laser(elevations, [np.arange(len(e)) % count // (1 + twice) for e in elevations], FIRINGS)
     peaks = _by_elevation(elevations)
     if (rings := _rings(scans, elevations)) is not None:
