@@ -78,7 +78,7 @@ def read(path: Path) -> Points | None:
     assert time.perf_counter() - began < 5
     if points is None:
         assert str(path) in refusal
-        assert "\n" not in refusal
+        assert not re.search(r"\n|Warning", refusal)
         return None
     assert points.xyz.dtype == np.float32
     assert points.xyz.shape == (len(points.xyz), 3)
@@ -161,19 +161,19 @@ def test_bytes_behind_the_last_point_are_refused(tmp_path, originals, name, junk
 
 def layouts() -> dict[str, bytes]:
     """Bytes that are no KITTI rows, all of a size that rows of 16 bytes divide."""
-    nan_majority = np.where(np.arange(COUNT)[:, None] < 40, np.nan, TABLE).astype("<f4")
     return {
         "big-endian": TABLE.astype(">f4").tobytes(),
         "float64": TABLE.astype("<f8").tobytes(),
         "float16": TABLE.astype("<f2").tobytes(),
+        "half metres in int16": np.tile(TABLE * 2, (32, 1)).astype("<i2").tobytes(),
         "millimetres in int32": (TABLE * 1000).astype("<i4").tobytes(),
         "rows of 3": XYZ.tobytes(),
         "one byte aside": b"\n" + TABLE.tobytes()[:-1],
         "rows of 5": np.column_stack([TABLE, RING]).tobytes(),
-        "noise": np.random.default_rng(0).bytes(1024),
+        "noise": np.random.default_rng(0).bytes(1 << 16),
         "zeros": bytes(1024),
         "NaN": np.full((64, 4), np.nan, "<f4").tobytes(),
-        "mostly NaN": nan_majority.tobytes(),
+        "mostly NaN": np.where(np.arange(COUNT)[:, None] < 40, np.nan, TABLE).astype("<f4").tobytes(),
         "map coordinates": (TABLE + np.float32([450000, 5400000, 110, 0])).tobytes(),
         "text": b"1.25 3.50 -0.25 0.5\n" * 64,
     }

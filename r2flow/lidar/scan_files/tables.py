@@ -31,8 +31,8 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> list[np.ndarray]:
     table = np.frombuffer(content, "<f4").reshape(rows, width)
     for every in (2, 3, 4) if columns is None and rows >= 1000 else ():  # 8 to 16 floats a point, as in PCL's memory
         parts = table[every * np.random.default_rng(0).integers(rows // every, size=500) + np.c_[:every]]
-        below = [(part[:, :2] < 0).any(axis=1).mean() or not part.any() for part in parts]  # lost rays are zeros
-        names = ",".join([*"xyz", *"_" * int(np.ptp(parts[0, :, 3]) == 0), "intensity", *"_" * 16][: 4 * every])
+        below = [(part[:, :2] < 0).any(axis=1).mean() or (part == 0).all() for part in parts]  # lost rays are zeros
+        names = ",".join([*"xyz", *"_" * (len(np.unique(parts[0, :, 3])) == 1), "intensity", *"_" * 16][: 4 * every])
         check(all(below[1:]) or below[0] < 0.3, f"a point seems to be of {4 * every} floats: give --columns {names}.")
     return list(table.T)
 
