@@ -134,7 +134,7 @@ def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool
     )
     kept = np.flatnonzero(finite & (size <= FARTHEST))
     selected = kept if len(kept) < len(size) else slice(None)
-    ring = rings[0][selected] if rings else None
+    ring = rings[0][selected].astype(np.float64) if rings else None  # float16 has no 65535
     if ring is not None:
         whole = (ring >= 0) & (ring <= 65535) & (ring == np.floor(ring))
         check(whole.all(), "it has a ring number that is not a whole number from 0 to 65535. Is it damaged?")
