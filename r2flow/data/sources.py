@@ -230,7 +230,7 @@ class ScanFiles(ScanSource):
             advised = self.reading.on_bad_scan == "error" and self.described.get("kind", "file") != "file"
             with leaving_out(advised):
                 return read(Path(self.paths[index]))
-        for candidate in (*range(index, len(self)), *range(index)):
+        for candidate in ((index + i) % len(self) for i in range(len(self))):
             if candidate in self.bad:
                 continue
             try:
