@@ -16,6 +16,7 @@ from r2flow import noise
 from r2flow.data.loader import FlowDataset, Item, Permutations
 from r2flow.data.options import PairOptions
 from r2flow.errors import InputError, check
+from r2flow.files import telling
 from r2flow.flow.solvers import Solution
 from r2flow.generators import Flow, Generated, Generator, as_flow
 from r2flow.generators.base import autocast
@@ -184,7 +185,7 @@ class PairDataset(Dataset[Item]):
         k, index = key
         store, number = self.store, int(self.numbers[index])
         shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
-        with safe_open(store.files(shard)[0], framework="pt") as file:
+        with telling(path := store.files(shard)[0]), safe_open(path, framework="pt") as file:
             names = ("x_1", "knots") if store.knots else ("x_1",)
             states = {name: file.get_slice(name)[offset].float() for name in names}
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
@@ -196,10 +197,7 @@ class PairDataset(Dataset[Item]):
 
 
 def default_folder(checkpoint: Path) -> Path:
-    """The default folder of a flow's pairs: `pairs` in its run folder, or a folder next to its file.
-
-    The pairs of an installed model lie in `runs`, not in the folder of the package or of the models.
-    """
+    """The default folder of a flow's pairs: `pairs` in its run folder, else next to its file, in `runs` for a model."""
     if checkpoint.parent.name == "checkpoints":
         return checkpoint.parent.parent / "pairs"
     if name_of(checkpoint) is not None:

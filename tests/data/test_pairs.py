@@ -51,7 +51,6 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
         x_0, x_1 = pairs[0, index]["x_0"], pairs[0, index]["x_1"]
         assert torch.equal(x_0, standard_normal(SHAPE, 0, "pairs", index))
         torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)  # half precision keeps 11 bits
-    assert x_1.abs().max() > 1  # nothing is clamped
 
 
 def test_more_pairs_later_by_another_process_are_those_of_one_command(tmp_path: Path):
@@ -127,7 +126,6 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
     ]
     assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
     assert begun.stat().st_size == 50  # batches, each by one of the two
-    assert len(store_in(tmp_path / "pairs", num=200).usable()) == 200
     make_pairs(store_in(tmp_path / "one", num=200), grow)
     assert files(tmp_path / "pairs") == files(tmp_path / "one")
 
@@ -164,10 +162,12 @@ def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
     item = dataset[(70, 11)]
     assert torch.equal(item["x_0"], store.noise(11))
     assert item["k"] == 70
-    assert 0 <= float(item["u"]) < 1
     assert float(item["u"]) != float(dataset[(71, 11)]["u"])
     again = pickle.loads(pickle.dumps(dataset))  # as a loader's worker has it
     assert all(torch.equal(again[(70, 11)][key], item[key]) for key in item)
+    store.files(0)[0].write_bytes(b"damaged during the run")
+    with pytest.raises(InputError, match=r"pairs-000000.safetensors is not a readable .safetensors file"):
+        dataset[(70, 11)]
 
 
 def test_pairs_are_not_kept_among_scans_or_in_another_store(tmp_path: Path):
