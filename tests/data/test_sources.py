@@ -32,7 +32,7 @@ def test_skipping_takes_the_next_good_scan_of_the_same_block(numbered: Path, cap
     assert numbers(source.subset(range(9, 12))) == [9, 10, 9]
     # The same length and order in memory, or a run could not go on with other memory.
     kept = InMemory(source.batch(range(12)).numpy(), source.names)
-    assert numbers(kept.subset([2, 3])) == [2, 5]
+    assert [numbers(kept), numbers(kept.subset([2, 3]))] == [numbers(source), [2, 5]]
     for path in numbered.glob("*.bin"):
         path.write_bytes(b"")
     with pytest.raises(InputError, match="all 12 scans were left out"):
@@ -57,6 +57,7 @@ def test_reflectance_out_of_scale_names_the_key(tmp_path: Path):
 def test_the_held_out_block_is_contiguous_and_last():
     training, held = holdout_block(19, 0.1)
     assert (list(training), list(held)) == (list(range(17)), [17, 18])
+    assert [len(part) for part in holdout_block(3, 0.0)] == [3, 0]
     assert [len(part) for part in holdout_block(1, 0.5)] == [1, 0]  # something must be left to learn from
 
 
