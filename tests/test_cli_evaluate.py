@@ -185,7 +185,6 @@ def test_an_evaluation_resumes(points, saved, monkeypatch):
     assert len(measured) == 1
     assert second[1:] == first[::-1]
     assert [row["evaluations"] for row in second] == [4, 2, 1]
-    assert all(0 <= row["jsd/jsd"] <= math.sqrt(math.log(2)) for row in second)
     monkeypatch.setattr(comparing.measuring, "FORMAT", 0)  # of another version, whose figures may differ
     points(saved[0], "--steps", "1", "--batch-size", 2)
     assert len(measured) == 2

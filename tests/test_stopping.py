@@ -55,7 +55,7 @@ def test_told_to_stop_during_an_import(tmp_path: Path, command: str, argv: list[
 LOADER = """
 import os, time
 from torch.utils.data import DataLoader
-from r2flow.signals import end_with_parent
+from r2flow.signals import end_with_parent, heard_from_the_first_import
 
 def big(item):
     open(f"pid-{os.getpid()}", "w").close()
@@ -84,6 +84,12 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path, script: str):
         parent.wait()
     wait_until(lambda: is_gone(parent.pid), seconds=20)
     assert not list(tmp_path.glob(".*"))  # locks of a store
+
+
+def test_workers_of_a_failed_run_end_with_it(tmp_path: Path):
+    failed = "with heard_from_the_first_import(): pass"
+    script = LOADER.replace("end_with_parent", "outlive_the_signal").replace("time.sleep(100)", failed)
+    assert start(tmp_path, ["-c", script], [sys.executable]).communicate(timeout=25)[0] == ""
 
 
 def test_a_run_hears_the_signal_of_its_job_that_its_launcher_ignores():

@@ -118,7 +118,6 @@ def test_the_scale_of_files_of_points_is_not_that_of_range_images(tmp_path: Path
 
 def test_prepared_scans_are_the_raw_ones_to_the_stated_quantisation(clouds: Path, tmp_path: Path):
     raw, prepared = raw_of(clouds), prepared_in(make(tmp_path, plan_of(clouds)), SMALL)
-    assert len(prepared) == 10
     assert prepared.names == raw.names == [f"drive{i // 6}/{i:06d}.bin" for i in range(10)]
     for index in range(10):
         image, other = raw[index], prepared[index]

@@ -65,7 +65,6 @@ def test_a_sensor_is_found_again(name, how):
     assert found.beams.firing == (sensor.firing if how == FIRINGS else None)
 
 
-@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("share", [0.3, 0.0])  # of the rays with two returns
 def test_two_returns_of_each_ray_are_of_one_beam(share):
     points = scan(SENSORS["vlp16"].resized(columns=192), FIRINGS)

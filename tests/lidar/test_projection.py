@@ -68,7 +68,6 @@ def test_a_return_too_near_does_not_hide_what_is_behind_it():
     assert project(points, np.ones(2), HDL64E, convention="lidm")[0].max() == pytest.approx(30, rel=1e-6)
 
 
-@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("convention", ["centre", "reference", "lidargen", "lidm"])
 @pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
 def test_points_that_are_not_finite_are_no_returns(convention, lost):

@@ -100,7 +100,6 @@ def test_ply_binary_in_both_byte_orders_among_other_elements(tmp_path, order, na
     expect_rows(read_points(saved(tmp_path, "a.ply", header.encode() + body)), reflectance=[1, 0, 2], ring=RING)
 
 
-@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8", ">f8"])
 def test_npy_of_any_float_type_and_order(tmp_path, dtype):
     np.save(tmp_path / "a.npy", np.array(ROWS, [(name, dtype) for name in ("x", "y", "z", "i", "ring")]))

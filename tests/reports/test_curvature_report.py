@@ -68,8 +68,7 @@ def test_the_page_compares_the_flows():
     assert 0.9 / 3 < summary("slow", flows["slow"])["integral_normalised"] < 1.2 / 3
     for row in (summary(*one) for one in flows.items()):
         assert f"| {row['checkpoint']} | {row['integral']:.3g} | {row['integral_normalised']:.3g} |" in said
-    assert len(page.figures["curvature"].axes) == 2
-    assert len(page.figures["trajectories"].axes) == 2
+    assert [len(page.figures[name].axes) for name in ("curvature", "trajectories")] == [2, 2]
 
 
 def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
