@@ -105,9 +105,7 @@ def test_a_worker_does_not_hear_what_its_run_ignores(monkeypatch):
 
 
 WORKERS = """
-import os, signal, sys
-from functools import partial
-from types import SimpleNamespace
+import functools, os, signal, sys, types
 from r2flow.signals import Stopped, listening, stop_at_once
 from r2flow.store import Store
 
@@ -115,14 +113,15 @@ if __name__ != "__main__":
     os.killpg(0, {number})  # when a worker has started and imports this file
 else:
     from r2flow.data.sets import ScanSet
-    source = SimpleNamespace(drives={{}}, drawn=False, batch=lambda numbers: os.killpg(0, {number}))
+    signal.signal({number}, lambda *_: None)  # for the signal of the second worker
+    source = types.SimpleNamespace(drives={{}}, drawn=False, batch=lambda numbers: os.killpg(0, {number}))
     try:
         with listening(stop_at_once):
             {work}
     except Stopped as stop:
         sys.exit(stop.code)
 """
-MAKE = 'Store("out", "scans", {{}}).make(range(4), partial(print, bytes(2**20)), 2)  # more than a pipe takes'
+MAKE = 'Store("out", "scans", {{}}).make(range(4), functools.partial(print, bytes(2**20)), 2)  # more than a pipe takes'
 READ = 'list(ScanSet("", source, None).batches(range(99), 1, 2))'
 
 
