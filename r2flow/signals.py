@@ -94,7 +94,7 @@ def heard_from_the_first_import() -> Iterator[None]:
         finally:
             atexit.unregister(hear)
             # A failed run's loader is alive. Its workers would outlive multiprocessing's SIGTERM for 30 s.
-            atexit.register(lambda: [one.kill() for one in multiprocessing.active_children() if one.daemon])
+            atexit.register(lambda: [one.kill() for one in multiprocessing.active_children() if one.daemon])  # type: ignore[func-returns-value]
             atexit.register(signal.signal, signal.SIGCHLD, signal.SIG_DFL)  # torch's handler would report them
             atexit.register(hear, end_at_once)  # registered last, so that it is called first
 
