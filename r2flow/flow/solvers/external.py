@@ -54,7 +54,7 @@ class TorchDiffEqMethod:
         # From the state's type, since the velocity has not been evaluated yet.
         tolerance = attainable(limits, v.coarsest(x)) if self.adapts else limits.tolerance
         options = {} if self.adapts else {"grid_constructor": lambda field, start, span: grid}
-        scenes = [_Scene(v, start, limits, self.adapts) for start in x.split(1)]
+        scenes = [_Scene(v, start, limits if self.adapts else None) for start in x.split(1)]
         v.converged[:] = finite(x).cpu()
         for i in v.converged.nonzero()[0]:
             v.only(np.array([i]))
@@ -74,13 +74,13 @@ class TorchDiffEqMethod:
 class _Scene:
     """One scene's velocity, and the steps that torchdiffeq reports."""
 
-    def __init__(self, v: Evaluations, x: Tensor, limits: Limits, adapts: bool) -> None:
+    def __init__(self, v: Evaluations, x: Tensor, limits: Limits | None) -> None:
         self._v, self._limits, self.last = v, limits, x
-        if adapts:  # torchdiffeq warns about callbacks that a method does not call
+        if limits:  # adaptive; torchdiffeq warns about callbacks that a method does not call
             self.callback_reject_step = self._reject
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        return self._v.of_one(t, x, self._limits)
+        return self._v.of_one(t, x, self._limits) if self._limits else self._v(t, x)
 
     def callback_step(self, t: Tensor, x: Tensor, h: Tensor) -> None:
         """Called before each step."""
