@@ -144,7 +144,7 @@ class _Scene:
             along = self.product(f, torch.cat([end - self.u, end.new_full((1,), signed)]))[:-1]
             missed = self._filtered(f, 3, following - f - along - remainders[1], signed, scale)
             error = max(error, _error(missed / scale))
-        return (error if following.isfinite().all() else math.inf), h, end, following
+        return (error if torch.stack([end, following]).isfinite().all() else math.inf), h, end, following
 
     def _filtered(self, f: Tensor, order: int, start: Tensor, h: float, scale: Tensor) -> Tensor:
         """h phi_order(h J) times a vector: 0 if it is negligible, NaN if the Krylov space is too small."""
