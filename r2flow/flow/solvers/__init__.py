@@ -12,7 +12,7 @@ from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
 from r2flow.flow.solvers.exponential import ExponentialMethod
 from r2flow.flow.solvers.external import TORCHDIFFEQ, TorchDiffEqMethod
-from r2flow.flow.solvers.fixed import Adams3, FixedStep, build_grid, euler, heun2, midpoint, named_grid, rk4
+from r2flow.flow.solvers.fixed import Adams3, FixedStep, build_grid, euler, heun2, midpoint, named_grid, rk4, uniform
 from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity, finite, flat, selected, wide
 from r2flow.registry import Registry
 
@@ -90,9 +90,9 @@ def solve(
     v = Evaluations(velocity, len(x), progress)
     if t_0 == t_1 or not len(x):
         v.converged[:] = finite(x).cpu()
-        error = torch.zeros(len(x), dtype=torch.float64) if global_error else None
+        error = torch.zeros(len(x), dtype=torch.float64, device="cpu") if global_error else None
         return replace(v.solution(x, torch.stack([x] * knots, 1) if knots else None), global_error=error)
-    times = torch.tensor([t_0, t_1], dtype=torch.float64) if solver.adapts else build_grid(grid, t_0, t_1, steps)
+    times = uniform(t_0, t_1, 1) if solver.adapts else build_grid(grid, t_0, t_1, steps)
     even = isinstance(solver, FixedStep) and knots > 0 and (len(times) - 1) % (knots + 1) == 0
     check(even or knots == 0, f"{knots} knots need a fixed-step method of r2flow and a multiple of {knots + 1} steps.")
     limits = Limits(tolerance, max_evaluations, max_step=max_step, knots=knots)
@@ -100,7 +100,7 @@ def solve(
     if not (global_error and solver.adapts):
         return solution
     scenes = solution.converged.nonzero()[:, 0]
-    error = torch.full((len(x),), math.inf, dtype=torch.float64)
+    error = torch.full((len(x),), math.inf, dtype=torch.float64, device="cpu")
     extra = torch.zeros_like(solution.evaluations)
     if len(scenes):
         index, v = scenes.to(x.device), Evaluations(selected(velocity, scenes), len(scenes), progress)

@@ -114,4 +114,4 @@ class LatentDDIM(Sampler):
 def some_of(total: int, steps: int) -> Tensor:
     """Every (total // steps)-th number below total from 1, decreasing; more than `steps` if not divisible."""
     check(1 <= steps < total, f"a diffusion of {total} steps is sampled in 1 to {total - 1}, found {steps}.")
-    return torch.arange(1, total, total // steps).flip(0)
+    return torch.arange(1, total, total // steps, device="cpu").flip(0)
