@@ -142,7 +142,8 @@ class Conditioned:
 
     def __init__(self, flow: Flow, condition: Condition) -> None:
         self.flow, self.condition = flow, condition
-        self.precision = max((p.dtype for p in flow.parameters()), key=lambda kind: torch.finfo(kind).eps)
+        kinds = [p.dtype for p in flow.parameters() if p.is_floating_point()] or [torch.float64]  # without weights
+        self.precision = max(kinds, key=lambda kind: torch.finfo(kind).eps)
 
     def __call__(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         if s is None:

@@ -8,6 +8,8 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, consistency
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Straight
+from r2flow.generators.flow import Conditioned
+from tests.fields import Field
 
 TIMES = torch.tensor([0.0, 0.3, 0.55, 0.75, 0.9, 1.0], dtype=torch.float64)
 X_0 = torch.linspace(-2, 2, 12, dtype=torch.float64).view(3, 2, 2)
@@ -116,19 +118,13 @@ def test_consistency_ends_at_both_of_its_limits():
 def test_each_scan_is_asked_for_under_its_own_condition():
     """Of three scans whose velocities are 1, 2 and 3 everywhere, the second has s = t and is not asked."""
 
-    class Told:
-        def __init__(self, speeds: Tensor) -> None:
-            self.speeds = speeds
+    class Told(Field):  # without weights
+        def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition=None) -> Tensor:
+            return expand_time(condition["speed"], x).expand_as(x)
 
-        def __call__(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-            return expand_time(self.speeds, x).expand_as(x)
-
-        def select(self, rows: Tensor) -> "Told":
-            return Told(self.speeds[rows])
-
-    speeds = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    u = Conditioned(Told(exact_map, (2, 2)), {"speed": torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)})
     rho = torch.where(T == S, 1.0, torch.zeros_like(T))
-    _, target = consistency(Told(speeds), paths_of(lambda x, t: x + 7 * t, TIMES[[0, -1]]), T, S, rho)
+    _, target = consistency(u, paths_of(lambda x, t: x + 7 * t, TIMES[[0, -1]]), T, S, rho)
     torch.testing.assert_close(target, expand_time(torch.tensor([1.0, 7.0, 3.0]).double(), X_0).expand_as(X_0))
 
 
