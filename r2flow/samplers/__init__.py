@@ -46,7 +46,8 @@ class _Samplers(Registry[Any]):
 
     def name_of(self, kind: type[Sampler]) -> str:
         reference = lazy(f"{kind.__module__}:{kind.__qualname__}")
-        return next(name for name, entry in self._entries.items() if entry is kind or entry == reference)
+        names = (name for name, entry in self._entries.items() if entry is kind or entry == reference)
+        return next(names, kind.__name__)  # a sampler that is not registered runs, too
 
 
 SAMPLERS = _Samplers(

@@ -14,7 +14,7 @@ from r2flow.flow.solvers import named_grid
 from r2flow.generators import USUAL, build_generator
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
-from r2flow.samplers import build_sampler
+from r2flow.samplers import SDE, build_sampler
 from r2flow.samplers.stochastic import back, sde, sde_step
 from tests.fields import CONFIG, Field
 
@@ -111,6 +111,7 @@ def test_another_sampler_has_its_own_defaults_and_the_number_of_steps():
     assert flow.choose("dopri5") == build_sampler("dopri5")
     assert flow.choose("adams3", steps=8) == build_sampler("adams3", steps=8, grid="power:1.5", finish=1 / 32)
     assert flow.choose("euler", grid=(0.0, 0.5, 1.0), steps=None).times().tolist() == [0, 0.5, 1]
+    assert type("Own", (SDE,), {})(steps=9).text.startswith("Own:steps=9:")  # one that is not registered
 
 
 @pytest.mark.parametrize("method", ["sde", "mmps", "repaint:repeats=2"])
