@@ -14,6 +14,7 @@ from r2flow.backbones import build_backbone
 from r2flow.errors import InputError, check
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
+from r2flow.flow.solvers.solution import wide
 from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator
 from r2flow.generators.flow import Conditioned, Flow
 from r2flow.generators.surroundings import FEATURES, ROW, STEEP, RowFeatures, Surroundings, encoded, steps_of
@@ -199,7 +200,7 @@ class TransferFlow(Flow):
     def forward(self, noise: Tensor, condition: Condition | None = None, **how: Any) -> Generated:
         if condition is None:
             raise InputError("this model completes scans: give one of which a ray is known, as r2flow complete does.")
-        weight = next(self.parameters())
+        weight = wide(next(self.parameters()))  # known rays stay as they are for weights of half precision
         condition = {name: value.to(weight) for name, value in condition.items()}
         image, known = condition[IMAGE], condition[KNOWN]
         # Another sensor's intensities have another scale than those that the network has seen.
@@ -288,13 +289,10 @@ def scaled(image: Tensor, gain: Tensor) -> Tensor:
 
 def _within_reach(known: Tensor) -> Tensor:
     """Rows, (B, 1, H, 1), between measured rows or within their largest gap beyond them; `known` is (B, 1, H, W)."""
-    reach = []
-    for rows in known[:, 0].any(2):
-        measured = rows.nonzero()[:, 0]
-        number = torch.arange(len(rows), device=rows.device)
-        if len(measured) == 0:
-            reach.append(rows)
-            continue
-        gap = measured.diff().max() if len(measured) > 1 else len(rows)
-        reach.append((number > measured[0] - gap) & (number < measured[-1] + gap))
-    return torch.stack(reach)[:, None, :, None]
+    reach = known[:, 0].any(2)
+    number = torch.arange(known.shape[2], device=known.device)
+    for rows in reach:
+        if len(measured := rows.nonzero()[:, 0]):
+            gap = measured.diff().max() if len(measured) > 1 else len(rows)
+            rows.copy_((number > measured[0] - gap) & (number < measured[-1] + gap))
+    return reach[:, None, :, None]
