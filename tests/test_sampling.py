@@ -334,10 +334,13 @@ def test_a_seed_is_a_whole_number_of_python_or_numpy():
 @pytest.mark.parametrize("method", ["ddim", "ddpm"])
 def test_a_diffusion_walks_noise_of_half_precision_in_float32(method):
     walker = build_generator(compose(["experiment=r2dm", "size=small", "backbone.base_channels=8", *SIZE])).eval()
-    draws = Draws(0, range(2))
+    draws, seen = Draws(0, range(2)), []
     noise, how = draws.start(walker.noise_shape).bfloat16(), build_sampler(method, steps=4)
     half, full = (walker(one, sampler=how, draws=draws).x for one in (noise, noise.float()))
     assert torch.equal(half, full)
+    walker.double().backbone.register_forward_pre_hook(lambda _, given: seen.append(given[0].dtype))
+    walker(noise.double(), sampler=how, draws=draws)
+    assert seen == [torch.float64] * 4  # log-SNRs
 
 
 TINY = ["backbone=hdit_tiny", "backbone.base_channels=16", "backbone.num_heads=[1,2,4]"]

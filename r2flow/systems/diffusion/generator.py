@@ -54,7 +54,7 @@ class Diffusion(NetworkFlow):
 
     def predict(self, z: Tensor, log_snr: Tensor) -> Tensor:
         """y, (B, C, H, W), of states z and log-SNRs of shape () or (B,)."""
-        return self.backbone(log_snr.float(), z)
+        return self.backbone(log_snr, z)
 
     def denoise(self, z: Tensor, log_snr: Tensor) -> Tensor:
         """Expected data given z, clamped."""
