@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-dependencies = ["torch", "numpy", "safetensors", "yaml"]
+dependencies = ["torch", "numpy", "safetensors", "yaml", "filelock", "rich"]
 
 
 def street(device: str = "cpu"):
