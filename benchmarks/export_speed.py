@@ -1,6 +1,6 @@
 """Seconds a scan of an exported flow, beside the flow itself and its network compiled: medians, taken in turns.
 
-python benchmarks/export_speed.py street --steps 2 --repeats 7
+python benchmarks/export_speed.py street --sampler chord --steps 2 --repeats 7
 """
 
 import argparse
@@ -21,6 +21,7 @@ from r2flow.noise import Draws
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("flow")
+    parser.add_argument("--sampler", help="one that can be exported; the flow's for that many steps if left out")
     parser.add_argument("--steps", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--threads", type=int, default=2)
@@ -28,7 +29,7 @@ def main() -> None:
     torch.set_num_threads(given.threads)
     loaded = r2flow.load(given.flow)
     flow = loaded.generator
-    sampler = flow.choose(steps=given.steps)
+    sampler = flow.choose(given.sampler, steps=given.steps)
     noise = Draws(0, [0]).start(flow.noise_shape)
 
     def drawn(generator: torch.nn.Module) -> Callable[[], object]:
