@@ -42,21 +42,21 @@ def project(
     NumPy's order is chosen, and `lidm` applies the limits first, min_range < r < max_range.
 
     Args:
-        xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. Points that are not finite are rays without
-            return.
+        xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. Not finite: a ray without return.
         reflectance: (N,), or None.
         sensor: Rows, columns and range limits; or its name or YAML file.
-        ring: Ring number of each point, (N,), counted from 0 or 1, monotonic in elevation or in the sensor's firing
-            order.
+        ring: Ring number of each point, (N,), from 0 or 1, monotonic in elevation or in the sensor's firing order.
 
     Returns:
         Range in metres and reflectance, (2, H, W) float32; 0 without a return.
 
     Raises:
-        InputError: `xyz` has another shape, or the scan does not unfold into the sensor's rings.
+        InputError: `xyz` or `reflectance` has another shape, or the scan does not unfold into the sensor's rings.
     """
     sensor = named_sensor(sensor)
     hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
+    shape = (len(xyz),) if reflectance is None else np.shape(reflectance)
+    check(shape == (len(xyz),), f"reflectance must have the shape ({len(xyz)},) or be None, found {shape}.")
     return scatter(sensor, hit, [r, np.zeros_like(r) if reflectance is None else reflectance[chosen]])
 
 

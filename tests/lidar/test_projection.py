@@ -84,6 +84,8 @@ def test_coordinates_of_another_shape_are_refused(shape):
     for take in (lambda xyz: project(xyz, None, HDL64E), Points, lambda xyz: write_points("never.ply", xyz)):
         with pytest.raises(InputError, match=re.escape(f"(N, 3), found {shape}; ")):
             take(np.ones(shape, np.float32))
+    with pytest.raises(InputError, match=re.escape(f"reflectance must have the shape (2,) or be None, found {shape}.")):
+        project(np.ones((2, 3)), np.ones(shape), HDL64E)
 
 
 def test_points_out_of_view_are_dropped_not_clamped():
@@ -151,8 +153,7 @@ def cloud(sensor: Sensor, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def packet_order(sensor: Sensor, how: str) -> np.ndarray:
     """Row of laser 0, 1, ... of a file."""
     rows = np.arange(len(sensor.elevations))
-    firing = rows if sensor.firing is None else np.array(sensor.firing)
-    return {"top": rows, "bottom": rows[::-1], "firing": firing}[how]
+    return {"top": rows, "bottom": rows[::-1], "firing": np.array(sensor.firing or rows)}[how]
 
 
 @pytest.mark.parametrize("how", ["top", "bottom", "firing"])
@@ -227,10 +228,9 @@ def test_points_of_an_image_of_any_width_unfold_to_it(columns):
 def test_lost_rays_leave_every_point_its_beam(tmp_path):
     """Without ring numbers, in no order: rows of NaN are dropped, and are not counted."""
     sensor = SENSORS["vlp16"].resized(columns=480)
-    firings, _ = cloud(sensor)
     row = np.tile(np.arange(16), 480)
     mixed = np.random.default_rng(2).permutation(len(row))
-    xyz = firings.reshape(-1, 3)[mixed]
+    xyz = cloud(sensor)[0].reshape(-1, 3)[mixed]
     lost = ~xyz.any(axis=1)
     xyz[lost] = np.nan
     np.save(tmp_path / "0.npy", xyz)
