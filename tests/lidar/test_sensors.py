@@ -112,8 +112,9 @@ def test_every_sensor_has_a_config_and_every_config_builds():
     ],
 )
 def test_an_impossible_sensor_of_a_user_is_refused(options, words):
-    with refused("columns", "found 64.0"):
-        SENSORS["vlp16"].resized(8, 64.0)
+    for size, found in (((8, 64.0), ("columns", "found 64.0")), ((16.5, 64), ("rows", "found 16.5"))):
+        with refused(*found):
+            SENSORS["vlp16"].resized(*size)
     with refused(words):
         build_space({"sensor": {"name": "mine", **options}, "encoding": {}})
 
