@@ -47,7 +47,7 @@ export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
 export run --to onx # no export format named 'onx'; known: onnx, pt2, safetensors.
 export run --to safetensors --what network # --what network is for
-export run --what network --steps 4 # takes no sampler: leave sampler, steps
+export run --what network --steps 4 # a network or .safetensors takes no sampler: leave sampler, steps
 export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx
 export run --to pt2 --out empty/a.pt2 # --to pt2 writes a .pt2, found --out empty/a.pt2
 report backbones --size ²x²

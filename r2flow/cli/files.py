@@ -45,7 +45,7 @@ def export(
     check(not half or to == "safetensors", "--half is for --to safetensors.")
     check(what == "sampler" or to != "safetensors", "--what network is for --to onnx and --to pt2.")
     if (to == "safetensors" or what == "network") and how != SamplerOptions():
-        raise InputError(f"--to {to} --what {what} takes no sampler: leave sampler, steps, tolerance and grid out.")
+        raise InputError("a network or .safetensors takes no sampler: leave sampler, steps, tolerance and grid out.")
     loaded = load_checkpoint(checkpoint)
     if to == "safetensors":
         if out.exists() and out.samefile(loaded.path):
