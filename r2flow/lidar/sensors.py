@@ -103,7 +103,7 @@ class Sensor:
         if rows is None or rows == old:
             return sensor
         fits = hasattr(rows, "__index__") and 2 <= rows <= MOST_PIXELS // sensor.columns
-        check(fits, f"sensor {self.name!r}: rows: a whole number from 2, at most {MOST_PIXELS:,} pixels; found {rows}.")
+        check(fits, f"sensor {self.name!r}: rows must be whole, over 1, at most {MOST_PIXELS:,} pixels; found {rows}.")
         if rows > old and rays == "centre":
             e, beam = self.elevations, np.arange(-1, old + 1)  # with a step beyond the first and the last beam
             beams = [min(2 * e[0] - e[1], e[0] / 2 + 45), *e, max(2 * e[-1] - e[-2], e[-1] / 2 - 45)]

@@ -232,7 +232,7 @@ def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         if comparison["kind"] != "judged" or comparison["generated"].get("kind") != "sampled":
             continue
         protocol, real = comparison["metrics"][0]["protocol"], comparison["real"]
-        chosen = [real[key] for key in ("split", "part") if real.get(key, "all") != "all"]
+        chosen = [real[key] for key in ("part", "split") if real.get(key, "all") != "all"]
         row = {
             "flow": comparison["generated"]["set"], "weights": comparison["generated"]["weights"],
             "protocol": f"{protocol['name']}, {comparison['generated']['scans']} scans of "
