@@ -20,6 +20,10 @@ STOPPING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 LATER = 75  # exit code EX_TEMPFAIL of an unfinished run: the same command resumes
 
+# After torch's shutdown and before multiprocessing's SIGTERM, which workers of a failed run's loader outlive for 30 s:
+atexit.register(lambda: [one.kill() for one in multiprocessing.active_children() if one.daemon])  # type: ignore[func-returns-value]
+atexit.register(signal.signal, signal.SIGCHLD, signal.SIG_DFL)  # torch's handler would report them
+
 
 class Stopped(BaseException):
     """Work was stopped by a signal; `code` is the exit code of the process, as 130 after Ctrl-C: `code_of`.
@@ -93,9 +97,6 @@ def heard_from_the_first_import() -> Iterator[None]:
             yield
         finally:
             atexit.unregister(hear)
-            # A failed run's loader is alive. Its workers would outlive multiprocessing's SIGTERM for 30 s.
-            atexit.register(lambda: [one.kill() for one in multiprocessing.active_children() if one.daemon])  # type: ignore[func-returns-value]
-            atexit.register(signal.signal, signal.SIGCHLD, signal.SIG_DFL)  # torch's handler would report them
             atexit.register(hear, end_at_once)  # registered last, so that it is called first
 
 

@@ -55,7 +55,7 @@ def test_told_to_stop_during_an_import(tmp_path: Path, command: str, argv: list[
 LOADER = """
 import os, time
 from torch.utils.data import DataLoader
-from r2flow.signals import end_with_parent, heard_from_the_first_import
+from r2flow.signals import end_with_parent
 
 def big(item):
     open(f"pid-{os.getpid()}", "w").close()
@@ -87,8 +87,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path, script: str):
 
 
 def test_workers_of_a_failed_run_end_with_it(tmp_path: Path):
-    failed = "with heard_from_the_first_import(): pass"
-    script = LOADER.replace("end_with_parent", "outlive_the_signal").replace("time.sleep(100)", failed)
+    script = LOADER.replace("end_with_parent", "outlive_the_signal").replace("time.sleep(100)", "")
     assert start(tmp_path, ["-c", script], [sys.executable]).communicate(timeout=25)[0] == ""
 
 

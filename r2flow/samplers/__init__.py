@@ -46,8 +46,7 @@ class _Samplers(Registry[Any]):
 
     def name_of(self, kind: type[Sampler]) -> str:
         reference = lazy(f"{kind.__module__}:{kind.__qualname__}")
-        names = (name for name, entry in self._entries.items() if entry is kind or entry == reference)
-        return next(names, kind.__name__)  # a sampler that is not registered runs, too
+        return next((n for n, entry in self._entries.items() if entry is kind or entry == reference), kind.__name__)
 
 
 SAMPLERS = _Samplers(

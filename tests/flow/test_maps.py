@@ -118,11 +118,11 @@ def test_consistency_ends_at_both_of_its_limits():
 def test_each_scan_is_asked_for_under_its_own_condition():
     """Of three scans whose velocities are 1, 2 and 3 everywhere, the second has s = t and is not asked."""
 
-    class Told(Field):  # without weights
+    class Speeds(Field):  # without weights
         def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition=None) -> Tensor:
             return expand_time(condition["speed"], x).expand_as(x)
 
-    u = Conditioned(Told(exact_map, (2, 2)), {"speed": torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)})
+    u = Conditioned(Speeds(exact_map, (2, 2)), {"speed": torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)})
     rho = torch.where(T == S, 1.0, torch.zeros_like(T))
     _, target = consistency(u, paths_of(lambda x, t: x + 7 * t, TIMES[[0, -1]]), T, S, rho)
     torch.testing.assert_close(target, expand_time(torch.tensor([1.0, 7.0, 3.0]).double(), X_0).expand_as(X_0))

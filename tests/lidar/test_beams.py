@@ -72,7 +72,7 @@ def test_two_returns_of_each_ray_are_of_one_beam(share):
     xyz[1::2] *= 0.9 * (np.random.default_rng(1).random((len(points.xyz), 1)) < share)
     found = find_beams(Points(xyz))
     np.testing.assert_allclose(found.elevations, SENSORS["vlp16"].elevations, atol=1e-3)
-    assert found.firing == (SENSORS["vlp16"].firing if share else None)
+    assert not share or found.firing == SENSORS["vlp16"].firing
 
 
 @pytest.mark.parametrize("first", [0, 1])
