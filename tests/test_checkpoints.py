@@ -146,14 +146,11 @@ def test_weights_that_are_no_plain_numbers_are_refused(saved, kind):
 def test_weights_that_do_not_fit_name_the_first(saved):
     path, averaged = saved
     name = next(iter(averaged))
-    changed = {**averaged, name: torch.zeros(3)}
-    AtomicCheckpointIO().save_checkpoint({"state_dict": changed, "config": CONFIG}, path)
-    with pytest.raises(InputError, match="has shape"):
-        load_checkpoint(path)
-    del changed[name]
-    AtomicCheckpointIO().save_checkpoint({"state_dict": changed, "config": CONFIG}, path)
-    with pytest.raises(InputError, match="1 names missing"):
-        load_checkpoint(path)
+    missing = {other: value for other, value in averaged.items() if other != name}
+    for changed, problem in (({**averaged, name: torch.zeros(3)}, "has shape"), (missing, "1 names missing")):
+        AtomicCheckpointIO().save_checkpoint({"state_dict": changed, "config": CONFIG}, path)
+        with pytest.raises(InputError, match=problem):
+            load_checkpoint(path)
 
 
 def test_a_full_disk_is_one_line_and_loses_nothing(saved):
@@ -177,15 +174,17 @@ def test_published_weights_are_kept_bit_by_bit(shared, tmp_path: Path):
         save_checkpoint(published, tmp_path / "model.pth")
 
 
-def test_an_unfolding_checkpoint_brings_its_ring_angles(shared, tmp_path: Path):
+def test_an_unfolding_distilled_checkpoint_brings_its_ring_angles_and_steps(shared, tmp_path: Path):
     content = torch.load(shared / "oracle" / "published_format.pth", weights_only=True)
     content["cfg"]["data"]["projection"] = "unfolding-192"
+    content["cfg"]["finetuning"]["k_distil"] = 2  # as the published code writes it for a 2-TD
     rings = torch.tensor([2.0 - 1.7 * h - 0.01 * h**2 for h in range(16)]).deg2rad()
     content["weights"]["coords"][0, 0] = rings[:, None]
     torch.save(content, tmp_path / "unfolding.pth")
     loaded = load_checkpoint(tmp_path / "unfolding.pth")
     torch.testing.assert_close(loaded.sensor.rays()[0, :, 0], rings, rtol=0, atol=1e-6)
     torch.testing.assert_close(loaded.generator.backbone.coords[0, 0, :, 0], rings, rtol=0, atol=0)
+    assert (str(loaded.generator.sampler), loaded.generator.fixed) == ("euler, 2 steps", True)
 
 
 def test_published_rows_of_any_number_divide_the_view_evenly(shared):

@@ -266,14 +266,13 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
 
 
 def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
-    published = next((known for known in FORMATS.values() if known.holds(content)), None)
-    if published is not None:
+    if published := next((known for known in FORMATS.values() if known.holds(content)), None):
         converted = published.read(content, path, averaged)
         config, weights, step, kind = converted.config, converted.weights, converted.step, "published"
         if converted.elevations is not None:  # elevations of its own need a name of its own, as in `build_sensor`
             rings = torch.rad2deg(converted.elevations.double()).tolist()
             config["sensor"] |= {"name": "hdl64e_rings_published", "elevations": rings, "rays": "centre"}
-        drawing: Mapping[str, Any] = {"sampler": converted.sampler}
+        drawing: Mapping[str, Any] = {"sampler": converted.sampler, "fixed": converted.fixed}
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:
         state: Any = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"

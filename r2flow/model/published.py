@@ -28,6 +28,7 @@ class Published:
     step: int = 0  # optimiser steps taken
     sampler: Mapping[str, Any] | None = None  # published sampler, name and fields; None: the generator's default
     elevations: Tensor | None = None  # of the rows of unfolded scans in radians, (H,); None: the sensor's
+    fixed: bool = False  # whether it is distilled for this sampler alone
 
 
 class Format(NamedTuple):
@@ -44,12 +45,12 @@ def has_keys(*keys: str, but: str | None = None) -> Callable[[Any], bool]:
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
-    """Read a published R2Flow checkpoint, which has averaged weights only."""
-    weights = {BACKBONE + name: value for name, value in content["weights"].items()}
-    batch = content["cfg"].get("training", {}).get("batch_size", 1)
-    step = int(content.get("num_images", 0)) // max(int(batch), 1)
-    config = published_config(content["cfg"])
-    return Published(config, weights, step, {"name": "euler"}, rings_of(config, weights))
+    """Read a published R2Flow checkpoint, which has averaged weights only; a k-TD draws in its k Euler steps."""
+    cfg, weights = content["cfg"], {BACKBONE + name: value for name, value in content["weights"].items()}
+    step = int(content.get("num_images", 0)) // max(int(cfg.get("training", {}).get("batch_size", 1)), 1)
+    config = published_config(cfg)
+    k = cfg.get("finetuning", {}).get("k_distil")  # None: not distilled
+    return Published(config, weights, step, {"name": "euler", "steps": k}, rings_of(config, weights), k is not None)
 
 
 def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -> dict[str, Any]:
