@@ -15,7 +15,7 @@ from r2flow.registry import Registry
 class Rotary(ExactBuffers):
     """Rotary embedding by ray angles, theta = (e f_h, a f_w), with integer harmonics f.
 
-    For integers, azimuth +pi and -pi are the same rotation (paper, section III-B). N heads of D channels, a multiple of
+    For integers, azimuth +pi and -pi are the same rotation (paper, section III-C). N heads of D channels, a multiple of
     4, take in turn from the frequencies round(exp(linspace(0, ln M, N D / 4))) of an axis, with M its highest harmonic.
     """
 
