@@ -49,7 +49,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     cfg, weights = content["cfg"], {BACKBONE + name: value for name, value in content["weights"].items()}
     step = int(content.get("num_images", 0)) // max(int(cfg.get("training", {}).get("batch_size", 1)), 1)
     config = published_config(cfg)
-    k = cfg.get("finetuning", {}).get("k_distil")  # None: not distilled
+    k = config["stage"].get("steps")  # None: not distilled
     return Published(config, weights, step, {"name": "euler", "steps": k}, rings_of(config, weights), k is not None)
 
 
@@ -63,7 +63,9 @@ def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -
 def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
     """Convert a published checkpoint's `cfg` (data, model, flow, training, finetuning) to an r2flow config."""
     data, model = cfg["data"], cfg["model"]
+    k, start = (cfg.get("finetuning", {}).get(key) for key in ("k_distil", "init_ckpt"))
     return {
+        "stage": {"name": "distill", "steps": k} if k else {"name": "reflow" if start else "rectify"},
         "sensor": {**sensor_of("hdl64e", data["resolution"], data), "rays": "reference"},
         "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
         "backbone": backbone_of(model),

@@ -77,9 +77,8 @@ def paper_page(
     names = ", ".join(f"{run.label} ({run.role})" for run in runs)
     check(evaluated or not rows, f"the results are of other models or checkpoints than {names}: evaluate these.")
     architectures = architecture_rows(runs, evaluated, device)
-    protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
     text = [f"Generators: {names}.", "## Table I: methods and metrics", table_i(evaluated)]
-    if protocols:
+    if protocols := "; ".join(dict.fromkeys(row["protocol"] for row in evaluated)):
         text.append(f"Evaluated rows: {protocols}. Printed rows: {PROTOCOL} kitti_360. "
                     "Figures with * are of another protocol than printed ones, and not comparable.")  # fmt: skip
     if architectures:
@@ -183,8 +182,7 @@ def between_figure(checkpoint: Checkpoint, real: ScanSet) -> Figure:
 
 
 def _birds_eye(images: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
-    rays = checkpoint.sensor.rays()
-    return np.sum([birds_eye_histogram(image_to_points(image, rays)[0]) for image in images], axis=0)
+    return np.sum([birds_eye_histogram(image_to_points(image, checkpoint.sensor)[0]) for image in images], axis=0)
 
 
 def marginals_apart(a: np.ndarray, b: np.ndarray) -> float:
