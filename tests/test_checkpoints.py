@@ -145,9 +145,8 @@ def test_weights_that_are_no_plain_numbers_are_refused(saved, kind):
 
 def test_weights_that_do_not_fit_name_the_first(saved):
     path, averaged = saved
-    name = next(iter(averaged))
-    missing = {other: value for other, value in averaged.items() if other != name}
-    for changed, problem in (({**averaged, name: torch.zeros(3)}, "has shape"), (missing, "1 names missing")):
+    (name, _), *others = averaged.items()
+    for changed, problem in (({**averaged, name: torch.zeros(3)}, "has shape"), (dict(others), "1 names missing")):
         AtomicCheckpointIO().save_checkpoint({"state_dict": changed, "config": CONFIG}, path)
         with pytest.raises(InputError, match=problem):
             load_checkpoint(path)
@@ -189,6 +188,7 @@ def test_an_unfolding_distilled_checkpoint_brings_its_ring_angles_and_steps(shar
 
 def test_published_rows_of_any_number_divide_the_view_evenly(shared):
     cfg = torch.load(shared / "oracle" / "published_format.pth", weights_only=True)["cfg"]
+    assert published_config({**cfg, "finetuning": None})["stage"] == {}  # older files do not say it
     for rows in (16, 64, 100, 128):
         cfg["data"]["resolution"] = (rows, 64)
         space = build_space(published_config(cfg))

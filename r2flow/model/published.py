@@ -63,9 +63,10 @@ def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -
 def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
     """Convert a published checkpoint's `cfg` (data, model, flow, training, finetuning) to an r2flow config."""
     data, model = cfg["data"], cfg["model"]
-    k, start = (cfg.get("finetuning", {}).get(key) for key in ("k_distil", "init_ckpt"))
+    tuning = cfg.get("finetuning") or {}  # empty: of an older file, which does not say its stage
+    k, name = tuning.get("k_distil"), "reflow" if tuning.get("init_ckpt") else "rectify"
     return {
-        "stage": {"name": "distill", "steps": k} if k else {"name": "reflow" if start else "rectify"},
+        "stage": {"name": "distill", "steps": k} if k else {"name": name} if tuning else {},
         "sensor": {**sensor_of("hdl64e", data["resolution"], data), "rays": "reference"},
         "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
         "backbone": backbone_of(model),
@@ -135,10 +136,7 @@ def plain(value: Any) -> Any:
     """Convert an `Inert` config or node to a plain value; other values are returned unchanged."""
     if not isinstance(value, Inert):
         return value
-    state = vars(value)
-    if "_val" in state:
-        return state["_val"]
-    content = state.get("_content")
+    content = vars(value).get("_val", vars(value).get("_content"))
     if isinstance(content, dict):
         return {key: plain(node) for key, node in content.items()}
     return [plain(node) for node in content] if isinstance(content, list) else content
