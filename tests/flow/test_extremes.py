@@ -236,10 +236,9 @@ def test_a_velocity_may_edit_its_arguments_and_write_each_output_into_the_same_b
 @pytest.mark.parametrize("place", [0.31, 0.4567, 0.5, 0.6180339, 0.777])
 @pytest.mark.parametrize(("power", "tolerance"), [(1, 1e-2), (1, 1e-3), (1, 1e-4), (2, 1e-2), (2, 1e-4)])
 def test_no_solution_crosses_a_pole(place: float, power: int, tolerance: float):
-    solution = solve(
-        lambda t, x: ((t - place) ** -power).reshape(-1, 1) + 0 * x, X, method="dopri5", tolerance=tolerance
-    )
-    assert not solution.converged.item()
+    for x_0 in (X, X[0, :1]):  # a scene of 8 numbers, (1, 8), and of one, (1,)
+        solution = solve(lambda t, x: (t - place) ** -power + 0 * x, x_0, method="dopri5", tolerance=tolerance)
+        assert not solution.converged.item()
 
 
 def test_noise_in_a_velocity_is_no_jacobian():

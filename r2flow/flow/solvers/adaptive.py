@@ -14,7 +14,7 @@ from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.batched import norms, powered, rows, unpowered, weighted
 from r2flow.flow.solvers.defect import Tried, inspect
 from r2flow.flow.solvers.embedded import EmbeddedMethod
-from r2flow.flow.solvers.solution import Evaluations, Limits, finite
+from r2flow.flow.solvers.solution import Evaluations, Limits, finite, flat
 from r2flow.flow.solvers.step_size import StepController
 
 log = logging.getLogger(__name__)
@@ -77,8 +77,8 @@ def _step(control: StepController, x: Tensor, k_1: Tensor, tolerance: float) -> 
     if len(short):
         first, last, end = (rows(part.detach(), short) for part in (k[0], k[-1], y))
         displacement, length = last * expand_time(rows(h, short), last), 1 + end.abs()
-        share = displacement.flatten(1).norm(dim=1) / length.flatten(1).norm(dim=1)
-        back = (first * displacement * expand_time(rows(h, short), displacement)).flatten(1).sum(1) < 0
+        share = flat(displacement).norm(dim=1) / flat(length).norm(dim=1)
+        back = flat(first * displacement * expand_time(rows(h, short), displacement)).sum(1) < 0
         control.note_pole(short, rows(h, short).abs().cpu().numpy(), share.cpu().numpy(), back.cpu().numpy())
     if good.all():
         x, k_1 = y, k[-1]
