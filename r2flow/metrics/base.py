@@ -1,8 +1,8 @@
 """Base class of metrics between two sets of scans, and the protocol of their results."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -203,6 +203,6 @@ class ScanMetric(Metric):
             moved = value.to(self.device, copy=not rows)
             setattr(self, name, [moved.flatten()] if rows else moved)
 
-    def set_dtype(self, dst_type: str | torch.dtype) -> Self:
-        """Do nothing: states stay float64, since lower precision would lose digits."""
-        return self
+    def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = "") -> torch.nn.Module:
+        """Move alone: a change of dtype, as of a module around it, would round the sums and the network."""
+        return super()._apply(lambda x: x.to(fn(x).device), exclude_state)

@@ -54,7 +54,7 @@ class FeatureMetric(ScanMetric):
         network = self.extractor
         key = network if network.weights == "random" else (network.name, network.weights)
         if key not in scans.features:
-            with torch.no_grad():
+            with torch.no_grad(), torch.autocast(scans.images.device.type, enabled=False):  # of a trainer around it
                 scans.features[key] = network.features(scans)
         return scans.features[key]
 

@@ -85,11 +85,9 @@ def test_an_empty_scan_is_left_out_with_a_remark(build, sets):
 
 @pytest.mark.parametrize("case", ["all empty", "one alone", "none"])
 def test_a_figure_that_does_not_exist_comes_with_a_remark(build, sets, case):
-    few = {"all empty": 0 * sets["generated"].images, "one alone": sets["generated"].images[:1]}
-    chosen = {"real": sets["real"]}
-    if case != "none":
-        chosen["generated"] = Scans(few[case], SMALL)
-    metric = give(build(), chosen)
+    drawn = sets["generated"].images
+    few = {"all empty": 0 * drawn, "one alone": drawn[:1], "none": drawn[:0]}
+    metric = give(build(), {**sets, "generated": Scans(few[case], SMALL)})
     missing = [math.isnan(value) for value in metric.compute().values()]
     assert metric.remarks() or not any(missing)
     if case == "none":
@@ -226,9 +224,12 @@ def test_a_loaded_state_goes_on_where_the_saved_one_was(build, sets, tmp_path):
 
 def test_moving_and_setting_a_dtype_change_no_figure(build, sets):
     expected = give(build(), sets).compute()
-    metric = told(build(sensor=SMALL), sets).to("cpu").set_dtype(torch.float16).half()
+    metric = told(build(sensor=SMALL), sets).set_dtype(torch.float16).half()
+    torch.nn.ModuleList([metric]).to("cpu", torch.bfloat16)  # as a trainer does, which also computes in autocast
+    assert metric.compute() == expected
     metric.reset()
-    assert told(metric, sets).compute() == expected
+    with torch.autocast("cpu", torch.bfloat16):
+        assert told(metric, sets).compute() == expected
 
 
 def images(n=3):
