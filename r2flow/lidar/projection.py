@@ -78,8 +78,8 @@ def project_indices(
 
     Pixels with a return, h W + w, ascending; indices of their points in `xyz`; their ranges in metres: (M,) each.
     """
-    assert convention in get_args(Convention), convention
-    assert projection in get_args(Projection), projection
+    for name, known, found in (("convention", Convention, convention), ("projection", Projection, projection)):
+        check(found in get_args(known), f"a {name} is {' or '.join(get_args(known))}, found {found!r}.")
     xyz = np.asarray(xyz, dtype=np.float32)
     check_xyz(xyz)
     rows, columns = sensor.shape

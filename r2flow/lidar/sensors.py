@@ -86,7 +86,7 @@ class Sensor:
         if convention == "centre":
             elevation, shift = np.asarray(self.elevations, dtype=np.float64), 0.5
         else:
-            assert convention == "reference", convention
+            check(convention == "reference", f"rays are centre or reference, found {convention!r}.")
             elevation, shift = self.row_edges[:-1], 0.0
         azimuth = math.pi * (1 - 2 * (np.arange(self.columns) + shift) / self.columns)  # 0 exactly in the middle
         grid = np.stack(np.meshgrid(np.deg2rad(elevation), azimuth, indexing="ij"))

@@ -165,19 +165,19 @@ def test_whole_firings_unfold_whatever_their_order(name, how):
     np.testing.assert_allclose(project(xyz, None, sensor, "unfolding")[0], image, rtol=1e-6)
 
 
-def test_scans_whose_lasers_cannot_be_found_are_refused_in_one_line():
+def test_scans_whose_lasers_cannot_be_found_and_unknown_projections_are_refused_in_one_line():
     sensor = SENSORS["vlp32c"].resized(columns=64)
     xyz = cloud(sensor)[0][:, np.array(sensor.firing)].reshape(-1, 3)
-    with pytest.raises(InputError, match=r"neither ring after ring nor in whole firings of 32.*spherical") as error:
-        project(xyz[xyz.any(axis=1)], None, sensor, "unfolding")
-    assert "\n" not in str(error.value)
-    for ring, words in (
-        (np.tile(np.arange(64), 32), r"ring numbers up to 63, but sensor 'vlp32c' has 32 rows"),
-        (np.tile(np.arange(32) // 4, 64), r"ring numbers up to 7, but sensor 'vlp32c' has 32 rows"),
-        (np.random.default_rng(0).integers(0, 32, 2048), "follow neither the elevations"),
+    for wrong, words in (
+        ({"xyz": xyz[xyz.any(axis=1)]}, r"neither ring after ring nor in whole firings of 32.*spherical"),
+        ({"ring": np.tile(np.arange(64), 32)}, r"ring numbers up to 63, but sensor 'vlp32c' has 32 rows"),
+        ({"ring": np.tile(np.arange(32) // 4, 64)}, r"ring numbers up to 7, but sensor 'vlp32c' has 32 rows"),
+        ({"ring": np.random.default_rng(0).integers(0, 32, 2048)}, "follow neither the elevations"),
+        ({"projection": "unfold"}, "a projection is spherical or unfolding, found 'unfold'"),
     ):
-        with pytest.raises(InputError, match=words):
-            project(xyz, None, sensor, "unfolding", ring=ring)
+        with pytest.raises(InputError, match=words) as error:
+            project(**{"xyz": xyz, "reflectance": None, "sensor": sensor, "projection": "unfolding", **wrong})
+        assert "\n" not in str(error.value)
 
 
 def test_rings_stored_from_behind_on_are_refused():
