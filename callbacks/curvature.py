@@ -32,7 +32,6 @@ class Curvature(Periodic):
             return
         x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
         result = straightness(flow.velocity, x_0, self.steps)
-        values = {"s": result.s.mean().item(), "bend": result.s_normalised.mean().item()}
+        values = {"curvature/s": result.s.mean().item(), "curvature/bend": result.s_normalised.mean().item()}
         for logger in trainer.loggers:
-            # Lightning logs with the step before the one just finished
-            logger.log_metrics({f"curvature/{name}": value for name, value in values.items()}, trainer.global_step - 1)
+            logger.log_metrics(values, trainer.global_step - 1)  # the index of the step, as Lightning logs

@@ -23,14 +23,15 @@ class Progress(ProgressBar):
         self.is_enabled = False
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        shown = None if self.is_enabled else False
-        self._bar = Bar("training", trainer.max_steps, "steps", shown, every=self.seconds)
+        self._bar = Bar("training", trainer.max_steps, "steps", None if self.is_enabled else False, every=self.seconds)
         self._bar.live.transient = False
         self._bar.start()
         self._bar.set(trainer.global_step)
 
     def on_train_batch_end(self, trainer: L.Trainer, *given: Any) -> None:
         assert self._bar is not None
+        if trainer.global_step == self._bar.tasks[0].completed:
+            return  # within a step: the losses are those of a part of its batch
         if trainer.global_step >= trainer.max_steps:
             self._noted = self._bar.every = 0.0  # the last figures are always written
         note, now = None, time.monotonic()
