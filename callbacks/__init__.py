@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from lightning.pytorch.callbacks import Callback, EarlyStopping, GradientAccumulationScheduler
 
-from r2flow.errors import InputError, check
+from r2flow.errors import check
 from r2flow.registry import Registry, construct
 from r2flow.runs.lineage import drawn_by
 
@@ -34,15 +34,12 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
         return [Progress()] if config["trainer"]["enable_progress_bar"] else []
     for name in config["callbacks"]:
         CALLBACKS[name]
-    wanted = {name: options for name, options in config["callbacks"].items() if options is not None}
-    if {"ema", "half_life_ema"} <= wanted.keys():
-        raise InputError(
-            "a run keeps one average of its weights, found callbacks.ema and callbacks.half_life_ema; leave one out, "
-            "as callbacks.ema=null."
-        )
-    for name, key in (("checkpoint", "enable_checkpointing"), ("progress", "enable_progress_bar")):
-        if not config["trainer"][key]:
-            wanted.pop(name, None)
+    keys = {"checkpoint": "enable_checkpointing", "progress": "enable_progress_bar"}
+    off = {name for name, key in keys.items() if not config["trainer"][key]}
+    wanted = {name: options for name, options in config["callbacks"].items() if options is not None and name not in off}
+    averages = "callbacks.ema and callbacks.half_life_ema"
+    both = {"ema", "half_life_ema"} <= wanted.keys()
+    check(not both, f"a run keeps one average of its weights, found {averages}; leave one out, as callbacks.ema=null.")
     built: list[Callback] = []
     for name, registered in CALLBACKS.items():
         if name in wanted:

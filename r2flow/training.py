@@ -22,6 +22,7 @@ from typing import Annotated, Any, Literal
 import lightning as L
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.model_helpers import is_overridden
 
@@ -233,6 +234,8 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     if isinstance(interval := options["val_check_interval"], int):  # a short run is validated once, at its end
         options["val_check_interval"] = min(interval, options["max_steps"]) * options["accumulate_grad_batches"]
     callbacks = build_callbacks(config)
+    for key, kind in (("enable_checkpointing", Checkpoint), ("enable_progress_bar", ProgressBar)):
+        options[key] = bool(options[key]) and any(isinstance(one, kind) for one in callbacks)  # or Lightning adds one
     loggers = [LOGGERS[name](Path(config["run_dir"])) for name in config["loggers"] or ()]
     try:
         with _quiet():
