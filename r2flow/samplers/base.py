@@ -90,7 +90,7 @@ class Sampler(ABC):
         anew = self.draws and self.needs in ("velocity", "map")  # others know what their generator starts from
         check(drawn or not anew, f"{self.name} adds noise of N(0, 1); a {kind} starts from other: give jump.")
         if getattr(generator, "fixed", False) and self != generator.sampler:
-            raise InputError(f"this model is distilled for {generator.sampler} alone: leave sampler and steps out.")
+            raise InputError(f"this model is distilled for {generator.sampler} alone: use these, or its parent flow.")
 
     def knot_times(self, knots: int) -> Tensor:
         """Times of x_0, of the inner states that a solution keeps, and of x_1, (knots + 2,) float64."""

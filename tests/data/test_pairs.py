@@ -104,7 +104,7 @@ def test_one_and_one_point_nought_are_one_tolerance(tmp_path: Path):
 def test_a_distilled_flow_draws_pairs_by_its_own_steps_alone(tmp_path: Path):
     flow = Field(lambda t, x: x, SHAPE)
     flow.run_by(build_sampler("euler", steps=2, grid="power:3"), fixed=True)
-    with pytest.raises(InputError, match="distilled"):
+    with pytest.raises(InputError, match="distilled for euler, 2 steps alone: use these, or its parent flow"):
         make_pairs(store_in(tmp_path / "others"), flow)
     assert not (tmp_path / "others").exists()
     own = store_in(tmp_path / "own", sampler={"name": "euler", "steps": 2, "grid": "power:3"})
