@@ -162,13 +162,13 @@ def test_each_number_of_steps_takes_the_sampler_that_the_generator_has_for_it(po
 def test_a_distilled_model_keeps_its_steps(points, r2flow, real, tmp_path):
     generator = build_generator(CONFIG).eval()
     generator.run_by(build_sampler("euler", steps=2), fixed=True)
-    save_checkpoint(Checkpoint(generator, CONFIG), tmp_path / "td.safetensors")
-    rows, _ = points(tmp_path / "td.safetensors", "--steps", "1,2,4")
+    save_checkpoint(Checkpoint(generator, CONFIG), td := tmp_path / "td.safetensors")
+    rows, _ = points(td, "--steps", "1,2,4")
     assert [row["evaluations"] for row in rows] == [2]
-    quick = ("evaluate", real, tmp_path / "td.safetensors", "--num", 2, *QUICK, "--sampler")
+    quick = ("evaluate", real, td, "--num", 2, *QUICK, "--sampler")
     assert "td.safetensors is distilled for euler, 2 steps alone" in r2flow(*quick, "heun2")[2]
-    curvature = ("report", "curvature", tmp_path / "td.safetensors", "--out", tmp_path / "report")
-    assert "it has learned no other times" in r2flow(*curvature).refusal
+    for kind in ("curvature", "solvers"):
+        assert "it has learned no other times" in r2flow("report", kind, td, "--out", tmp_path / "report").refusal
 
 
 def test_an_adaptive_solver_is_one_set(points, saved):

@@ -98,6 +98,7 @@ def solvers(
     logging.getLogger("r2flow.flow").setLevel(logging.ERROR)  # the report counts failed scans
     if model is not None:
         loaded = load_checkpoint(model, where)
+        check(not loaded.generator.fixed, f"{model} is distilled for one sampler: it has learned no other times.")
         with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
             flow = measuring.checkpoint_subject(loaded, model, draw.num, draw.seed, draw.batch_size, progress=advance)
         subjects.append(flow)

@@ -96,8 +96,7 @@ def checkpoint_subject(
             rk4 = solve(flow.velocity, scan, method="rk4", steps=steps, progress=progress)
             dopri5 = solve(flow.velocity, scan, method="dopri5", tolerance=tolerance)
             ends.append(rk4.x)
-            solved = bool(rk4.converged.all() and dopri5.converged.all())
-            apart.append(rms(rk4.x - dopri5.x).item() if solved else math.inf)
+            apart.append(rms(rk4.x - dopri5.x).item() if (rk4.converged & dopri5.converged).all() else math.inf)
     return Subject(name, flow.velocity, x_0, torch.cat(ends), batch_size, 3 * max(apart), checkpoint.encoding)
 
 
