@@ -54,6 +54,7 @@ def holds_autoencoder(content: Any) -> bool:
 def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
     """Read a published latent diffusion."""
     state, notes = _state(content, averaged), _notes(path)
+    check(not _within(state, "cond_stage_model."), f"{path} is conditional: only LiDM's unconditional models are read.")
     weights = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
     params = (notes.get("model") or {}).get("params") or {}
     unet = params.get("unet_config", {}).get("params", {})
@@ -74,8 +75,7 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
             "steps": len(betas),
         },
     }
-    step = int(content.get("global_step", 0))
-    return Published(_config(generator, path, notes), weights, step, {"name": "latent_ddim"})
+    return Published(_config(generator, path, notes), weights, int(content.get("global_step", 0)))
 
 
 def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
