@@ -80,7 +80,7 @@ class TrainerRanges:
 
     max_steps: Annotated[int, Bound("of 1 to 10^15", lambda n: 1 <= n <= 10**15)]
     min_steps: Natural | None
-    max_epochs: Annotated[int, Bound("other than 0", lambda n: n != 0)] | None
+    max_epochs: Annotated[Literal[-1], Bound("(trainer.max_steps is the length of a run)", lambda n: True)] | None
     max_time: str | Mapping[str, Any] | None
     num_sanity_val_steps: Annotated[int, Bound("of at least -1", lambda n: n >= -1)] | None
     overfit_batches: Annotated[float, Bound("equal to 0 (data.scenes, data.drives choose few scans)", lambda n: n == 0)]

@@ -52,6 +52,7 @@ REFUSED = {
     "trainer.overfit_batches=1": "overfit_batches must be a finite number equal to 0 (data.scenes",
     "+callbacks.half_life_ema={half_life: 4, rampup: 1}": "one average of its weights, found callbacks.ema and",
     "trainer.limit_train_batches=0": "limit_train_batches must be null",
+    "trainer.max_epochs=3": "max_epochs must be -1 (trainer.max_steps is the length of a run) or null, found 3",
     "trainer.deterministic=foo": "deterministic must be true or false or 'warn' or null",
     "trainer.accelerator=tpu": "trainer: ",
     "seed=99999999999999999999": "seed must be a whole number of at least 0 and below 2^63",
@@ -97,8 +98,7 @@ REFUSED = {
 
 @pytest.mark.parametrize(("arguments", "words"), REFUSED.items(), ids=REFUSED)
 def test_a_wrong_value_is_refused(tmp_path: Path, arguments: str, words: str):
-    name = [] if arguments.startswith("name=") else ["name=bad"]
-    line = in_process(tmp_path, [*name, "trainer.accelerator=cpu", *arguments.split(" & ")], check=False).refusal
+    line = in_process(tmp_path, ["name=bad", "trainer.accelerator=cpu", *arguments.split(" & ")], check=False).refusal
     assert line.startswith("error: ")
     assert all(word in line for word in words.split(" | ")), line
     assert list(tmp_path.iterdir()) == []
@@ -197,12 +197,12 @@ def test_a_damaged_config_is_refused_in_one_line(tmp_path: Path, text: str):
 
 def test_a_lost_config_is_that_of_the_newest_checkpoint(tmp_path: Path):
     config = {"seed": 1, "trainer": {"max_steps": 4}}
-    content = {**dict.fromkeys(RESUMED), "config": config}
-    AtomicCheckpointIO().save_checkpoint(content, tmp_path / "checkpoints" / "step-00000004.ckpt")
+    newest = tmp_path / "checkpoints" / "step-00000004.ckpt"
+    AtomicCheckpointIO().save_checkpoint({**dict.fromkeys(RESUMED), "config": config}, newest)
     assert read_config(tmp_path) == config
     with refused("seed=1 there, 2 here"):
         open_run(tmp_path, {**config, "seed": 2})
-    assert open_run(tmp_path, config) == tmp_path / "checkpoints" / "step-00000004.ckpt"
+    assert open_run(tmp_path, config) == newest
     assert yaml.safe_load((tmp_path / CONFIG).read_text()) == config
 
 
