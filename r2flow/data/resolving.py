@@ -4,8 +4,8 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-from r2flow.data.opening import SOURCES, scale_of
-from r2flow.data.options import FOLDER, MIXED, PAIRS, Data, DataOptions, PartOptions, SourceOptions
+from r2flow.data.opening import SOURCES, Layout, Prepared, scale_of
+from r2flow.data.options import FOLDER, MIXED, PAIRS, SIMULATED, Data, DataOptions, PartOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.data.sources import made_here
 from r2flow.errors import InputError, check
@@ -35,15 +35,15 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     if run.name == MIXED:
         data["parts"] = [whole(part, reading) for part in _checked_parts(run)]
     if run.scans is not None:
-        _check_set("data.scans", SourceOptions, run.scans)
+        _check_set("data.scans", SourceOptions, run.scans, run)
         data["scans"] = whole(run.scans, {key: reading[key] for key in reading.keys() & {"projection", "convention"}})
     other = run.validation_options.data
     if other is not None and run.name != PAIRS:
-        held = {"name": run.name, "root": run.root, "scenes": run.scenes, **other}
-        _check_set("data.validation.data", SourceOptions, held, split=False)
+        held = {"name": run.name, "root": run.root, "split": None, "scenes": run.scenes, **other}
         if held["name"] != run.name:  # other files, with other columns and scale
             reading = {key: value for key, value in reading.items() if key not in ("columns", "reflectance_scale")}
             held["root"] = other.get("root")
+        _check_set("data.validation.data", SourceOptions, held, run)
         data["validation"] = {**data["validation"], "data": whole(held, reading)}
     return data
 
@@ -64,7 +64,7 @@ def _checked_parts(run: DataOptions) -> list[Data]:
     for number, part in enumerate(parts):
         if isinstance(name := part.get("sensor"), str):
             part["sensor"] = options_of_sensor(read_sensor(name)) if name.lower().endswith(ENDINGS) else {"name": name}
-        _check_set(f"data.parts[{number}]", PartOptions, part)
+        _check_set(f"data.parts[{number}]", PartOptions, part, run)
         if part.get("sensor") is not None:
             check_options(f"data.parts[{number}].sensor", build_sensor, part["sensor"])
     if len({part.get("weight") is None for part in parts}) > 1:
@@ -72,13 +72,16 @@ def _checked_parts(run: DataOptions) -> list[Data]:
     return parts
 
 
-def _check_set(what: str, kind: type[SourceOptions], options: Mapping[str, Any], split: bool = True) -> None:
-    """Refuse options that do not name a single set of scans or, with `split`, lack the split of a standard data set."""
+def _check_set(what: str, kind: type[SourceOptions], options: Mapping[str, Any], run: DataOptions) -> None:
+    """Refuse options that do not name a single set of scans, lack the split of a standard data set, or are ignored."""
     check_options(what, kind, options)
     name: Any = options.get("name")
     check(name not in (None, MIXED, PAIRS), f"{what} needs the name of a data set, found {name!r}.")
-    splits = ", ".join(SOURCES[name].splits)
-    if split and splits and "split" not in options:
+    source, splits = SOURCES[name], ", ".join(SOURCES[name].splits)
+    unread = ("root", "split", "drives") if name == SIMULATED else ("scenes",) * isinstance(source, Layout | Prepared)
+    wrong = ", ".join(f"{what}.{key}" for key in unread if options.get(key) not in (None, run.scenes))
+    check(not wrong, f"simulated scans are not files, and files no simulated scenes: leave {wrong} out.")
+    if splits and "split" not in options:
         raise InputError(f"{what}: {name} has a standard split: give split, one of {splits}, or null for all.")
 
 

@@ -47,8 +47,7 @@ def test_weights_are_shares_and_without_them_every_scan_counts_once(tmp_path: Pa
     order = data._order(data.training_source)
     assert sum(order[k] < 8 for k in range(2000)) / 2000 == pytest.approx(3 / 4, abs=0.05)
     data = mixed(tmp_path, weights=(None, None), validation={"share": 0})
-    order = data._order(data.training_source)
-    assert sorted(order[k] for k in range(12)) == list(range(12))
+    assert sorted(data._order(data.training_source)[k] for k in range(12)) == list(range(12))
 
 
 def test_the_fingerprint_knows_the_parts_of_a_mixture_and_not_where_they_lie(tmp_path: Path):
@@ -116,6 +115,8 @@ def mixture(part) -> dict:
         (mixture({**FOLDER, "weight": 1}), "every part a weight"),
         (mixture({"name": "simulated", "sensor": {"name": "vlp"}}), "no sensor named .vlp"),
         (mixture({**FOLDER, "weight": 0}), "weight must be a finite number above 0 or null, found 0"),
+        (mixture({**FOLDER, "scenes": 7}), r"no simulated scenes: leave data.parts\[0\].scenes out"),
+        ({"validation": {"data": {"name": "simulated", "root": 7, "drives": [1]}}}, "data.root, .*data.drives out"),
         (mixture("folder"), "a list, each a group of keys"),
         (mixture({"name": "simulated", "scenes": 2**31}), "scenes must be a whole number from 1 to 10,000,000"),
     ],

@@ -223,8 +223,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
         assert words in said
     parent = find_parent(path)
-    options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
-    chosen = PairOptions(**pairs_of(parent, options))
+    chosen = PairOptions(**pairs_of(parent, {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}))
     assert len(PairStore(folder, chosen, parent.checkpoint.encoding.shape).usable()) == 10
     assert "pairs/s" not in r2flow("pairs", path, *QUICK).said  # nothing was left to make
 
