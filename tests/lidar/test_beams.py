@@ -304,8 +304,7 @@ def test_sensors_of_one_s_own_are_judged_by_their_beams():
 def test_rows_between_the_beams_of_ones_own_sensor_are_no_other_sensors(tmp_path: Path, caplog):
     for beams, rows in ((SENSORS["vlp16"], 32), (SENSORS["vlp16"], 64), (MINE, 27)):
         write_points(tmp_path / "0.ply", scan(beams, RING_AFTER_RING).xyz)
-        mine = Sensor("my_own", beams.elevations).resized(rows)
-        warn_of_other_sensor([tmp_path / "0.ply"], Reading(mine), tmp_path)
+        warn_of_other_sensor([tmp_path / "0.ply"], Reading(Sensor("my_own", beams.elevations).resized(rows)), tmp_path)
         assert not caplog.text
     warn_of_other_sensor([tmp_path / "0.ply"], Reading(Sensor("my_own", SENSORS["vlp16"].elevations)), tmp_path)
     assert "give the right one" in caplog.text

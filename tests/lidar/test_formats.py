@@ -228,9 +228,12 @@ def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):
     same(read_points(tmp_path / "b.csv"), intensity=np.full(500, 7))
     (tmp_path / "c.csv").write_text("x,y,z,class\n" + "".join(f'"{x}","{y}","{z}","a car"\n' for x, y, z in F4))
     same(read_points(tmp_path / "c.csv"), intensity=None)
-    index = np.c_[np.arange(500), WIDE]  # of pandas, a column without a name
-    np.savetxt(tmp_path / "d.csv", index, "%.6g", ";", header=f";{';'.join(NAMES)}", comments="")
-    same(read_points(tmp_path / "d.csv"), RING)
+    np.savetxt(tmp_path / "d.csv", np.c_[np.arange(500), WIDE], "%.6g", ";", header=f";{';'.join(NAMES)}", comments="")
+    same(read_points(tmp_path / "d.csv"), RING)  # of pandas, a column without a name
+    for head in ("# range,azimuth,elevation,intensity", "x (mm),y (mm),z (mm),intensity", "# x [ft],y [ft],z [ft],i"):
+        np.savetxt(tmp_path / "e.csv", TABLE, delimiter=",", header=head, comments="")
+        with pytest.raises(InputError, match=r"no field x, y, z; it has: (range, azimuth|x \(mm\)|x \[ft\]), "):
+            read_points(tmp_path / "e.csv")
 
 
 def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Path):

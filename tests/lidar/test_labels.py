@@ -65,8 +65,7 @@ def test_labels_are_not_those_of_other_scans_next_to_the_folder(scan: Path, labe
 def test_each_pixel_has_the_label_of_its_nearest_return(scan: Path, label: Path):
     ranges, ids = np.array([20, 10, 30, 10, 20, 90, 0.5]), np.array([40, 70, 50, 10, 40, 50, 70])
     e, a = SENSOR.rays().numpy()[:, 3, [5, 5, 5, 9, 9, 2, 9]]  # three returns of a pixel, two of another in range
-    xyz = ranges * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    write_points(scan, xyz.T, np.zeros(7))
+    write_points(scan, (ranges * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])).T, np.zeros(7))
     label.write_bytes(ids.astype("<u4").tobytes())
     image, labels = read_labelled_scan(scan, label, Reading(SENSOR, reflectance=True))
     assert labels.dtype == np.uint16

@@ -33,8 +33,7 @@ def wall(firing: Sensor, lost=None, radius: float = RADIUS, jitter: float = 0.0)
     e = np.deg2rad(np.asarray(firing.elevations))[:, None]
     e, a = np.broadcast_arrays(e, azimuths(firing.columns, jitter))
     xyz = np.stack([radius * np.cos(a), radius * np.sin(a), radius * np.tan(e)], -1)
-    kept = np.ones(a.shape, bool) if lost is None else ~lost
-    return Points(xyz[kept].astype(np.float32))
+    return Points(xyz[np.ones(a.shape, bool) if lost is None else ~lost].astype(np.float32))
 
 
 def rows_with_beams(elevations, target: Sensor) -> set[int]:

@@ -105,7 +105,7 @@ def read_text(path: Path) -> Table:
     check("." in rows[-1] or not re.search(decimal, rows[-1], re.I), "it has decimal commas: write decimal points.")
 
     def words(line: str) -> list[str]:
-        return [re.sub(r"\s*[\[(].*", "", word.strip()) for word in line.lstrip("#/ ").split(apart)]
+        return [re.sub(r"\s*[\[(](?!([cmk]m|ft)\b).*", "", word.strip()) for word in line.lstrip("#/ ").split(apart)]
 
     names: list[str] | None
     if not any(map(_is_number, words(rows[0]))):
@@ -113,8 +113,7 @@ def read_text(path: Path) -> Table:
         check(rows, "it holds no line of numbers.")
     else:  # CloudCompare writes names after //, NumPy after #
         width, comments = len(words(rows[0])), [words(line) for line in lines if line[0] in "#/"]
-        named = (line for line in comments if len(line) == width and {"x", "y", "z"} <= {word.lower() for word in line})
-        names = next(named, None)
+        names = next((line for line in comments if len(line) == width and _named(line)), None)
     try:
         table = np.loadtxt(rows, delimiter=apart, comments=None, ndmin=2)
     except ValueError:
