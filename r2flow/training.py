@@ -175,17 +175,15 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     drawn = sorted(key for key in given if f"{key}.".startswith("data.pairs."))
     if drawn and config["data"]["name"] != PAIRS:
         raise InputError(f"data={config['data']['name']} has no pairs (data=pairs has): leave out {', '.join(drawn)}.")
-    for key, scans in (("data", config["data"]), ("data.scans", config["data"].get("scans"))):
-        if scans is not None:
-            _refuse_unread(key, scans, given)
+    _refuse_unread(config["data"], given)
     return config
 
 
-def _refuse_unread(key: str, data: Mapping[str, Any], given: Collection[str]) -> None:
-    """Refuse options that the set of scans under this key would ignore."""
+def _refuse_unread(data: Mapping[str, Any], given: Collection[str]) -> None:
+    """Refuse options that the run's set of scans would ignore; `resolve` does those of its parts."""
     name, defaults = data["name"], {**asdict(SourceOptions()), **resolve({})}
     options = defaults.keys() - {"name"}
-    scenes = {"scenes"} if key != "data" or "data.scenes" in given else set[str]()  # else an experiment's
+    scenes = {"scenes"} if "data.scenes" in given else set[str]()  # else an experiment's
     if name == SIMULATED:
         what, unread = "simulated scans are not files (data=folder for yours)", options - {"scenes"}
     elif name == PAIRS:
@@ -198,7 +196,7 @@ def _refuse_unread(key: str, data: Mapping[str, Any], given: Collection[str]) ->
     else:
         files = isinstance(SOURCES[name], Layout | Prepared)
         what, unread = "scans in files are no simulated scenes", scenes if files else set()
-    wrong = sorted(f"{key}.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option])
+    wrong = sorted(f"data.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option])
     if wrong:
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 

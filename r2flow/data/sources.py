@@ -227,7 +227,8 @@ class ScanFiles(ScanSource):
     def _first_usable(self, index: int, read: Callable[[Path], Read]) -> Read:
         """Read a file, or with `on_bad_scan="skip"` the first usable file from this index on."""
         if self.reading.on_bad_scan != "skip":
-            with leaving_out(self.reading.on_bad_scan == "error" and self.described.get("kind", "file") != "file"):
+            advised = self.reading.on_bad_scan == "error" and self.described.get("kind", "file") != "file"
+            with leaving_out(advised):
                 return read(Path(self.paths[index]))
         for candidate in ((index + i) % len(self) for i in range(len(self))):
             if candidate in self.bad:

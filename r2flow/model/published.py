@@ -103,7 +103,8 @@ def backbone_of(model: Mapping[str, Any]) -> dict[str, Any]:
 
 def rings_of(config: Mapping[str, Any], weights: Mapping[str, Tensor]) -> Tensor | None:
     """The elevations of the rows of unfolded scans, from the weights' `coords`, (1, 2, H, W)."""
-    return weights[BACKBONE + "coords"][0, 0, :, 0] if config["data"]["reading"]["projection"] == "unfolding" else None
+    unfolded = config["data"]["reading"]["projection"] == "unfolding"
+    return weights[BACKBONE + "coords"][0, 0, :, 0] if unfolded else None
 
 
 class Inert:
