@@ -154,21 +154,21 @@ def test_each_number_of_steps_takes_the_sampler_that_the_generator_has_for_it(po
     save_checkpoint(Checkpoint(generator, config), tmp_path / "map.safetensors")
     points(tmp_path / "map.safetensors", "--steps", "1,2")
     one, two = json.loads((tmp_path / "evaluation.json").read_text())["comparisons"]
-    assert [(c["generated"]["sampler"]["name"], c["comparison"]) for c in (one, two)] == [
-        ("chord", "map.safetensors, 1 step"), ("adams3", "map.safetensors, 2 steps"),
-    ]  # fmt: skip
+    names = {"map.safetensors, 1 step": "chord", "map.safetensors, 2 steps": "adams3"}
+    assert {c["comparison"]: c["generated"]["sampler"]["name"] for c in (one, two)} == names
 
 
 def test_a_distilled_model_keeps_its_steps(points, r2flow, real, tmp_path):
     generator = build_generator(CONFIG).eval()
     generator.run_by(build_sampler("euler", steps=2), fixed=True)
-    save_checkpoint(Checkpoint(generator, CONFIG), td := tmp_path / "td.safetensors")
-    rows, _ = points(td, "--steps", "1,2,4")
-    assert [row["evaluations"] for row in rows] == [2]
-    quick = ("evaluate", real, td, "--num", 2, *QUICK, "--sampler")
-    assert "td.safetensors is distilled for euler, 2 steps alone" in r2flow(*quick, "heun2")[2]
-    for kind in ("curvature", "solvers"):
-        assert "it has learned no other times" in r2flow("report", kind, td, "--out", tmp_path / "report").refusal
+    td = tmp_path / "td.safetensors"
+    save_checkpoint(Checkpoint(generator, CONFIG), td)
+    assert [row["evaluations"] for row in points(td, "--steps", "1,2,4")[0]] == [2]
+    warned = r2flow("evaluate", real, td, "--num", 2, *QUICK, "--sampler", "heun2")[2]
+    assert "td.safetensors is distilled for euler, 2 steps alone" in warned
+    for verb in ("report curvature", "report solvers", "view --times 2", f"interpolate {real} {real} -c"):
+        assert "needs all times; this flow is distilled for euler" in r2flow(*verb.split(), td, "-o", "a.html").refusal
+    assert "figure_7.png" in r2flow("report", "paper", td, "--real", real, "--num", 2, "-o", tmp_path / "paper").said
 
 
 def test_an_adaptive_solver_is_one_set(points, saved):

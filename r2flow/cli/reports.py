@@ -55,8 +55,7 @@ def curvature(
     where = choose_device(draw.device)
     loaded = {name: load_checkpoint(name, where) for name in dict.fromkeys(models)}
     for name, checkpoint in loaded.items():
-        flow = as_flow(checkpoint.generator, "curvature")
-        check(not flow.fixed, f"{name} is distilled for {flow.sampler} alone: it has learned no other times.")
+        as_flow(checkpoint.generator, f"{name}: curvature")
     check_folder(out)
     with Bar("measuring", len(loaded) * math.ceil(draw.num / draw.batch_size) * steps, "evaluations") as advance:
         flows = {
@@ -98,7 +97,6 @@ def solvers(
     logging.getLogger("r2flow.flow").setLevel(logging.ERROR)  # the report counts failed scans
     if model is not None:
         loaded = load_checkpoint(model, where)
-        check(not loaded.generator.fixed, f"{model} is distilled for one sampler: it has learned no other times.")
         with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
             flow = measuring.checkpoint_subject(loaded, model, draw.num, draw.seed, draw.batch_size, progress=advance)
         subjects.append(flow)

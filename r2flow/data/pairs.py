@@ -99,7 +99,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
     """
     if generator.noise_shape != store.noise_shape:
         raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")
-    flow, sampler = as_flow(generator, "a reflow pair"), store.sampler
+    flow, sampler = as_flow(generator, "a reflow pair", distilled=True), store.sampler
     sampler.check(flow)
     check(sampler.paired, f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
     usable, evaluations, start, seconds = list[bool](), 0, time.monotonic(), 0.0  # without waiting for others

@@ -178,8 +178,9 @@ def ode_sampler(flow: Flow) -> Sampler:
     return flow.sampler if isinstance(flow.sampler, ODESampler) else USUAL
 
 
-def as_flow(generator: Generator, what: str) -> Flow:
-    """The generator, if it is a flow."""
+def as_flow(generator: Generator, what: str, distilled: bool = False) -> Flow:
+    """The generator, if it is a flow; one distilled for the times of its steps only if `distilled`."""
     if not isinstance(generator, Flow) or not generator.draws:
         raise InputError(f"{what} needs the velocity of a flow from noise; a {type(generator).__name__} has none.")
+    check(distilled or not generator.fixed, f"{what} needs all times; this flow is distilled for {generator.sampler}.")
     return generator

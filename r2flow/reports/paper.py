@@ -84,7 +84,7 @@ def paper_page(
     if architectures:
         text += ["## Table II: velocity estimators", table(architectures, ARCHITECTURES)]
     figures: dict[str, Figure] = {}
-    flows = [run for run in runs if isinstance(run.checkpoint.generator, Flow)]
+    flows = [run for run in runs if isinstance(g := run.checkpoint.generator, Flow) and not g.fixed]
     if real is not None and len(real) > 1 and flows and flows[0].role not in SYSTEMS.values():
         figures["figure_3"] = between_figure(flows[0].checkpoint, real)
     tracked = track(runs, "sampling", "generators")
@@ -98,8 +98,8 @@ def paper_page(
         labelled = [{**row, "flow": f"{run_of[row['weights']].label} ({row['role']})"} for row in evaluated]
         figures["figure_6"] = speed_figure(labelled, metrics)
     figures["figure_7"] = scans_figure(runs, samples, scans)
-    if solvable := [run for run in flows if not run.checkpoint.generator.fixed]:
-        tracked = track(solvable, "following paths")
+    if flows:
+        tracked = track(flows, "following paths")
         paths = {run.label: measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4) for run in tracked}
         figures |= {"figure_8a": curvature_figure(paths), "figure_8b": trajectories_figure(paths)}
         text += ["## Figure 8: straightness", *curvature_text(paths)]
