@@ -86,6 +86,7 @@ evaluate scans scans --generated-split train # no split named 'train'
 evaluate simulated:3 scans --split test # simulated:3 has no split: leave 'test' out
 evaluate scans --reference --train-split test # --train; found none
 evaluate scans --reference --steps 4 # found none
+evaluate scans --reference --num 4 # --num is of GENERATED; found none
 evaluate scans a b c d --steps 4 # found a; b; c (and 1 more)
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans scans --json file.txt/a.json
@@ -93,6 +94,7 @@ evaluate scans scans --json image.npy # --json must be a file
 evaluate scans run --sampler euler,heun2 --tolerance 0.1 # tolerance
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
 report solvers -o out --problems none # nothing to measure
+report solvers -o out --seed 1 # --seed, --batch-size are of a model; found none
 report paper run -o out --results nowhere
 """
 
@@ -129,16 +131,14 @@ def wrong_values() -> Iterator[str]:
             if verb not in BASES or not options:
                 continue
             kinds = {annotation.__origin__, *get_args(annotation.__origin__)}
-            option = next(
-                (one for one in options[0].param_decls if one.startswith("--")), f"--{name.replace('_', '-')}"
-            )
+            long = [one for one in options[0].param_decls if one.startswith("--")] or [f"--{name.replace('_', '-')}"]
             values = ["nope"] if name in WORDS else []
             values += ["64"] if name == "size" else []
             values += ["a", "1.5"] if int in kinds else []
             values += ["a", "nan"] if float in kinds else []
             values += [] if options[0].min is None else [str(options[0].min - 1)]
             values += [] if options[0].max is None else [str(options[0].max + 1)]
-            yield from (f"{BASES[verb]} {option} {value}" for value in values)
+            yield from (f"{BASES[verb]} {long[0]} {value}" for value in values)
 
 
 TRAIN = """

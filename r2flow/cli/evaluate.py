@@ -78,6 +78,7 @@ class EvaluateOptions:
     def check(self, named: Sequence[str], sampled: Sequence[str]) -> None:
         """Refuse incompatible options before reading any scan."""
         check(named or self.reference or self.baselines, "nothing to compare with: give GENERATED or --reference.")
+        check(named or self.num is None, "--num is of GENERATED; found none. REAL has --real-num.")
         check(self.train or not self.train_split, "--train-split is of --train; found none.")
         if self.json is not None and (self.json.is_dir() or self.json.suffix.lower() != ".json"):
             raise InputError(f"--json must be a file that ends in .json, found {self.json}.")

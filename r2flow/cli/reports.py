@@ -87,6 +87,7 @@ def solvers(
     from r2flow.progress import Bar
     from r2flow.reports import solvers as measuring
 
+    check(model or draw == DrawOptions(device=draw.device), "--num, --seed, --batch-size are of a model; found none.")
     where = choose_device(draw.device)
     methods = samplers.split(",") if samplers else measuring.METHODS
     names = [] if problems == "none" else problems.split(",") if problems else list(PROBLEMS)
@@ -235,9 +236,7 @@ def paper(
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of runs (a chain, a sweep).")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for compare.md, .json and .png.")] = None,
-    group: Annotated[
-        bool, typer.Option("--group", help="Aggregate seeds of one configuration: mean ± spread.")
-    ] = False,
+    group: Annotated[bool, typer.Option("--group", help="Join the seeds of a configuration: mean ± spread.")] = False,
 ) -> None:
     """Compare runs: loss, bend, parameters, cost."""
     from r2flow.reports.compare import compare_page, group_runs, read_runs, tables
