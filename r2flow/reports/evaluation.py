@@ -266,7 +266,7 @@ def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fig
         # Labels of 1, 2 and 5 alone: nine would overlap.
         axes.xaxis.set(minor_locator=LogLocator(subs=(2, 5)), major_formatter="{x:g}", minor_formatter="{x:g}")
         axes.grid(True, which="major", color="0.88", lw=0.6)
-        axes.tick_params(labelsize=8)
+        axes.tick_params(which="both", labelsize=8)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     columns = min(len(flows), 4, max(1, int(16 * figure.get_figwidth() / (8 + max(map(len, flows))))))  # by letters
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8, frameon=False)

@@ -252,7 +252,7 @@ def _figure(panels: Sequence[tuple[str, Sequence[Row], str, str]], columns: int)
         axes.set(xscale="log", yscale="log", xlabel=LABELS[x], ylabel=LABELS[y])
         axes.set_title(title.replace("_", " "), fontsize=9)
         axes.grid(True, which="major", color="0.88", lw=0.6)
-        axes.tick_params(labelsize=8)
+        axes.tick_params(which="both", labelsize=8)
     handles = [Line2D([], [], **style, ms=5, lw=1.1, label=method) for method, style in methods.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return figure

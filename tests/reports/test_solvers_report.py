@@ -91,6 +91,8 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
     page = solvers_page(rows, None, [4, 8], {})
     assert "| stiff_1e4 | none |" in page.text[2]  # explicit steps of 1/4 end farther than x_0
     assert set(page.figures) == {"solvers_problems"}
+    axes = page.figures["solvers_problems"].axes[0]
+    assert {text.get_size() for text in axes.get_xticklabels(which="both")} == {8}  # larger ones overlap
 
 
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog):
@@ -103,10 +105,8 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     monkeypatch.setattr("r2flow.plugins._loaded", {"of/mine.py": "of/mine.py"})
     out = tmp_path / "reports"
-    said = r2flow(
-        "report", "solvers", saved[0], "-o", out, "--num", 2, "--samplers", "euler,heun2,dopri5",
-        "--budgets", "2,4", "--problems", "gaussian,rotating",
-    ).said  # fmt: skip
+    options = ["--num", 2, "--samplers", "euler,heun2,dopri5", "--budgets", "2,4", "--problems", "gaussian,rotating"]
+    said = r2flow("report", "solvers", saved[0], "-o", out, *options).said
     figures = {f"{name}.{end}" for name in ("solvers", "solvers_problems") for end in ("png", "pdf")}
     assert {path.name for path in out.iterdir()} == figures | {f"solvers.{end}" for end in ("json", "md")}
     assert f"**{saved[0]}**, 2 scans, against its reference solution" in said
