@@ -54,7 +54,7 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
         check(not any(isinstance(one, kind) for one in built), f"leave the {kind.__name__} out, and give {instead}.")
     if config["loggers"]:
         built.append(LearningRates("step"))
-    return built
+    return sorted(built, key=lambda one: isinstance(one, Stopping))  # it saves the state of all others, plug-ins' too
 
 
 # In the order of execution.

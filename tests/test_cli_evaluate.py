@@ -49,9 +49,8 @@ def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_p
     assert jsd["printed"]["JSD x 10^2"] == pytest.approx(100 * jsd["figures"]["jsd"])
     assert mmd["printed"]["MMD x 10^4"] == pytest.approx(1e4 * mmd["figures"]["mmd"])
     assert jsd["protocol"]["mask"] == [0.5, 63.0]
-    assert jsd["protocol"]["sizes"] == {
-        "real": 12, "real_chosen": "all 12", "real_empty": 0, "generated": 10, "generated_empty": 0
-    }  # fmt: skip
+    sizes = {"real": 12, "real_chosen": "all 12", "real_empty": 0, "generated": 10, "generated_empty": 0}
+    assert jsd["protocol"]["sizes"] == sizes
     assert content["origin"]["versions"].keys() == {"r2flow", "torch", "python"}
     assert "images 8x64 of hdl64e, " in said  # the sensor that scans are compared under
     for words in ("JSD x 10^2", "MMD x 10^4", f"{100 * jsd['figures']['jsd']:#.4g}", "(10 : 12)"):
@@ -132,9 +131,8 @@ def points(r2flow, real, tmp_path):
 
 def test_several_samplers_and_steps_make_a_set_each(points, r2flow, real, saved, tmp_path):
     rows, page = points(saved[0], "--sampler", "euler,heun2", "--steps", "1,2")
-    assert [(row["flow"].partition(", ")[2], row["evaluations"]) for row in rows] == [
-        ("euler", 1), ("euler", 2), ("heun2", 2), ("heun2", 4),
-    ]  # fmt: skip
+    found = [(row["flow"].partition(", ")[2], row["evaluations"]) for row in rows]
+    assert found == [("euler", 1), ("euler", 2), ("heun2", 2), ("heun2", 4)]
     assert all(row["jsd/jsd"] > 0 and row["seconds"] > 0 for row in rows)
     assert f"{saved[0].name}, heun2, 2 steps" in page
     assert "no sampler named ''" in r2flow("evaluate", real, saved[0], "--sampler", "euler,").refusal

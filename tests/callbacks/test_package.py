@@ -5,7 +5,7 @@ import lightning as L
 import pytest
 from lightning.pytorch.callbacks import EarlyStopping, GradientAccumulationScheduler
 
-from r2flow.callbacks import CALLBACKS, build_callbacks
+from r2flow.callbacks import CALLBACKS, Stopping, build_callbacks
 from r2flow.errors import InputError
 from r2flow.runs.composing import compose
 from tests.conftest import ROOT
@@ -28,7 +28,9 @@ def test_a_second_copy_is_refused(monkeypatch):
     ],
 )
 def test_callbacks_that_a_run_does_not_support_are_refused(monkeypatch, callback, option: str, message: str):
-    monkeypatch.setattr(CALLBACKS, "_entries", dict(CALLBACKS._entries))
-    CALLBACKS.add("theirs", callback)
+    monkeypatch.setitem(CALLBACKS._entries, "theirs", callback)
     with pytest.raises(InputError, match=message):
         build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", f"+callbacks.theirs.{option}"]))
+    monkeypatch.setitem(CALLBACKS._entries, "theirs", L.Callback)
+    *_, theirs, _, last = build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.theirs={}"]))
+    assert (type(theirs), type(last)) == (L.Callback, Stopping)  # which saves their state after the step

@@ -19,7 +19,7 @@ from tests.training.conftest import TINY, hold_at, in_process, let_go, run_train
 
 HELD = Path("held")  # in the folder that a chain is started from
 CHAIN = ["experiment=demo", "preview=null", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8",
-         "data.pairs.batch_size=4", "trainer.max_steps=8", "samples.num=0", *hold_at(5, HELD)]  # fmt: skip
+         "data.pairs.batch_size=4", "trainer.max_steps=8", "samples.num=0", *hold_at(6, HELD)]  # fmt: skip
 LINKS = ("rf1", "rf2", "td2")
 
 

@@ -150,7 +150,7 @@ def srun(
 @pytest.mark.slow
 def test_a_job_told_to_leave_is_queued_again_and_ends_as_the_one_left_alone(alone, scans, tmp_path):
     run = tmp_path / "runs" / "queued"
-    command = ["name=queued", "data.workers=1", *hold_at(3, tmp_path / "held")]
+    command = ["name=queued", "data.workers=1", *hold_at(4, tmp_path / "held")]
     [(code, said)] = srun(tmp_path, scans, *command, leave_after=tmp_path / "held")
     assert code == LATER, said
     assert (tmp_path / "scontrol.log").read_text() == "requeue 4711\n"

@@ -100,7 +100,7 @@ def test_a_killed_run_ends_as_the_one_left_alone(train: Run, alone: tuple[Path, 
 )
 def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(train, alone, scans, tmp_path, by, code):
     options = ["name=stopped", "data.workers=2", "callbacks.checkpoint={every: 4, keep: 3}"]
-    options += ["data.memory_gib=0", *hold_at(5, tmp_path / "held")]
+    options += ["data.memory_gib=0", *hold_at(6, tmp_path / "held")]
     found, said = stop_held(tmp_path / "held", by, tiny(scans, *options))
     assert found == code, said
     assert lines_of(said) == ["stopped at step 6; the same command resumes from the last checkpoint"]
