@@ -116,18 +116,18 @@ def test_langevin_dynamics_draws_from_the_score_s_distribution():
     assert end.std().item() == pytest.approx(1, abs=0.1)
 
 
-def test_known_pixels_pull_in_every_step_and_once_more_at_the_end():
-    # Without a score and without noise a known pixel's distance to its value shrinks by 1 - 0.1 in every step. The
-    # last denoising repeats the pull of the step before, 0.1 of the distance before it; then it shrinks once more.
-    generator = build_generator(TINY)
-    for weight in generator.network.end_conv.parameters():
-        torch.nn.init.zeros_(weight)
+@pytest.mark.parametrize(("options", "p"), [({}, 1.0), ({"pull": 0.1}, 0.1)])  # published: anneal by grad_ref = 1
+def test_known_pixels_pull_in_every_step_and_once_more_at_the_end(options: dict, p: float):
+    # Without a score and without noise a known pixel's distance to its value shrinks by 1 - p in every step. The
+    # last denoising repeats the pull of the step before, p of the distance before it; then it shrinks once more.
+    generator = build_generator({**TINY, "generator": {**TINY["generator"], **options}})
+    generator.network.forward = lambda x, labels: torch.zeros_like(x)
     start = torch.zeros(1, *generator.noise_shape)  # the middle of the range of images
     known = start.clone()
     known[:, :, ::4] = 1
     still = SimpleNamespace(step=lambda shape, j: torch.zeros(1, *shape))
     made = generator(start, {"image": start + 0.5, "known": known}, draws=still, sampler=Langevin(steps=2)).x
-    distance = 0.5 * (0.9**6 - 0.1 * 0.9**5) * 0.9
+    distance = 0.5 * ((1 - p) ** 6 - p * (1 - p) ** 5) * (1 - p)
     torch.testing.assert_close(made, torch.where(known > 0, 0.5 - distance, 0.0))
 
 

@@ -90,7 +90,7 @@ class ScoreModel(Generator):
 
     Args:
         rate: Rate of `step_sizes`.
-        pull: Strength of the pull to known pixels per step.
+        pull: Strength of the pull to known pixels per step; 1 as in the published densification.
         width: Width of the network, see `RefineNet`.
         sigma_first, sigma_last, levels, spacing: The noise levels, see `noise_levels`.
     """
@@ -102,7 +102,7 @@ class ScoreModel(Generator):
         space: ModelSpace,
         backbone: Mapping[str, Any],
         rate: Positive = 6.2e-6,
-        pull: Positive = 0.1,
+        pull: Positive = 1.0,
         width: Count = 128,
         sigma_first: Positive = 50.0,
         sigma_last: Positive = 0.01,
