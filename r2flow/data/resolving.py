@@ -78,8 +78,9 @@ def _check_set(what: str, kind: type[SourceOptions], options: Mapping[str, Any],
     name: Any = options.get("name")
     check(name not in (None, MIXED, PAIRS), f"{what} needs the name of a data set, found {name!r}.")
     source, splits = SOURCES[name], ", ".join(SOURCES[name].splits)
-    unread = ("root", "split", "drives") if name == SIMULATED else ("scenes",) * isinstance(source, Layout | Prepared)
-    wrong = ", ".join(f"{what}.{key}" for key in unread if options.get(key) not in (None, run.scenes))
+    unread: dict[str, Any] = {"scenes": run.scenes} if isinstance(source, Layout | Prepared) else {}  # with its default
+    unread = dict.fromkeys(("root", "split", "drives")) if name == SIMULATED else unread
+    wrong = ", ".join(f"{what}.{key}" for key, usual in unread.items() if options.get(key) not in (None, usual))
     check(not wrong, f"simulated scans are not files, and files no simulated scenes: leave {wrong} out.")
     if splits and "split" not in options:
         raise InputError(f"{what}: {name} has a standard split: give split, one of {splits}, or null for all.")

@@ -116,7 +116,7 @@ def mixture(part) -> dict:
         (mixture({"name": "simulated", "sensor": {"name": "vlp"}}), "no sensor named .vlp"),
         (mixture({**FOLDER, "weight": 0}), "weight must be a finite number above 0 or null, found 0"),
         (mixture({**FOLDER, "scenes": 7}), r"no simulated scenes: leave data.parts\[0\].scenes out"),
-        ({"validation": {"data": {"name": "simulated", "root": 7, "drives": [1]}}}, "data.root, .*data.drives out"),
+        ({"validation": {"data": {"name": "simulated", "root": 512, "drives": [1]}}}, "data.root, .*data.drives out"),
         (mixture("folder"), "a list, each a group of keys"),
         (mixture({"name": "simulated", "scenes": 2**31}), "scenes must be a whole number from 1 to 10,000,000"),
     ],
