@@ -68,7 +68,7 @@ def test_two_models_of_one_role_are_both_drawn(runs):
 
 
 def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
-    figures = {"speed": {"evaluations": 1.0, "seconds": 0.1}, "jsd": {"jsd": 0.25}, "mmd": {"mmd": 1e-4}}
+    figures = {"speed": {"evaluations": 64.0, "seconds": 1}, "jsd": {"jsd": 0.25}, "frd": {"frd": 200.0}}
     metrics = [{"metric": name, "figures": values} for name, values in figures.items()]
     hashes = weights_hash(load_checkpoint(runs["1-RF"])), "another model"
     sets = [{"kind": "sampled", "set": "a", "weights": weights, "scans": 10000} for weights in hashes]
@@ -88,6 +88,7 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
     architecture, _ = content["architectures"]
+    assert (architecture["frd"], architecture["frd_marked"]) == (200.0, "200*")  # of a part of kitti_360
     assert architecture["parameters"] == sum(p.numel() for p in network().generator.backbone.parameters())
     written = {path.stem for path in (tmp_path / "out").glob("*.png")}
     assert written == {"figure_3", "figure_5", "figure_6", "figure_7", "figure_8a", "figure_8b"}
