@@ -280,10 +280,12 @@ def test_a_figure_by_which_a_baseline_is_nearer_than_real_scans_ranks_nothing(no
 
 
 def test_the_verdict_is_of_the_panel_if_measured():
-    results = [MetricResult(name, {name: value}, {}, True) for name, value in (("jsd", 5.0), ("panel", 7.0))]
+    sizes = {"sizes": {"generated_empty": 3}}
+    results = [MetricResult(name, {name: value}, sizes, True) for name, value in (("jsd", 5.0), ("panel", 7.0))]
     named = (("a", "judged"), ("real halves", "reference"))
     both = [Comparison(name, range(200), range(200), results, kind) for name, kind in named]
     assert verdict(both)[0].startswith("a: panel 7 (reference: real halves 7): not distinguishable")
+    assert verdict(both)[0].endswith("; 3 of its scans are empty and not compared.")
     few = [replace(one, real=range(20), generated=range(20)) for one in both]
     assert "not above the real halves; too few" in verdict(few)[0]
     assert verdict([replace(one, measured=[MetricResult("kid_x", {"kid_x": 5.0}, {}, False)]) for one in both]) == []
