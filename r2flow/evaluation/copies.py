@@ -111,12 +111,13 @@ def find_nearest(sets: Mapping[str, ScanSet], training: ScanSet, work: Work, dev
 def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
     """Median distance to the nearest training scan, and P(a scan's distance < a real scan's), 0.5 by chance.
 
-    The test, one-sided Mann-Whitney U, leaves out real scans that are training scans. A small p does not prove copying:
+    Real scans that are training scans are left out. A small p of the one-sided Mann-Whitney U does not prove copying:
     scans that resemble training streets are nearer without being copies, and frames of one drive are not independent.
     """
     from scipy.stats import mannwhitneyu
 
-    d, others = judged.distances, real.distances[real.distances >= SAME]
+    others = real.distances[real.distances >= SAME]
+    d = others if judged is real and len(others) else judged.distances
     figures, remarks = {"copies": float(np.median(d))}, []
     if judged is not real and len(others) < len(real.distances):
         same = len(real.distances) - len(others)
