@@ -119,8 +119,7 @@ def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
     others = real.distances[real.distances >= SAME]
     d = others if judged is real and len(others) else judged.distances
     figures, remarks = {"copies": float(np.median(d))}, []
-    if judged is not real and len(others) < len(real.distances):
-        same = len(real.distances) - len(others)
+    if judged is not real and (same := len(real.distances) - len(others)):
         remarks.append(f"copies: {same} of {len(real.distances)} real scans are training scans, and left out.")
     if judged is not real and len(others):
         test = mannwhitneyu(others, d, alternative="greater")

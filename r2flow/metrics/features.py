@@ -221,12 +221,11 @@ class TwoSample(FeatureMetric):
         if any(self.count(side) < self.fewest for side in SIDES):
             return dict.fromkeys(names, float("nan")), [f"{self.name} needs {self.fewest} or more scans of each set."]
         sides = [self.kept(side).double() for side in SIDES]
-        halves, judged = [(x[: len(x) // 2], x[len(x) // 2 :]) for x in sides], []
+        halves, value = [(x[: len(x) // 2], x[len(x) // 2 :]) for x in sides], 0.0
         for turn in (1, -1):
             (learn_real, judge_real), (learn_made, judge_made) = (both[::turn] for both in halves)
             score = _classifier(learn_real, learn_made)
-            judged.append(area(score(judge_real), score(judge_made)))
-        value = sum(judged) / 2
+            value += area(score(judge_real), score(judge_made)) / 2
         return dict(zip(names, (value, *interval(value, *(len(x) // 2 for x in sides))), strict=True)), []
 
 

@@ -74,8 +74,7 @@ def test_real_scans_that_are_training_scans_are_left_out_of_the_test(r2flow, tmp
         assert ("2 of 9 real scans are training scans" in said) == (name == "mixed")
         comparisons = json.loads((tmp_path / "e.json").read_text())["comparisons"]
         found[name] = {one["comparison"]: one["metrics"][-1] for one in comparisons}
-    for name in ("generated", "real halves"):
-        assert found["mixed"][name]["figures"] == found["held"][name]["figures"]
+    assert all(found["mixed"][n]["figures"] == found["held"][n]["figures"] for n in ("generated", "real halves"))
     assert found["own"]["generated"]["figures"].keys() == {"copies"}
     nearest = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work())
     for name, one in (("generated", nearest["generated"]), ("real halves", nearest["held"])):
