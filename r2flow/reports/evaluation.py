@@ -101,10 +101,11 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
             judgement = "higher than between the real halves"
         else:
             judgement = "not distinguishable from real scans by this figure"
-        bounds = [f"in as many scans as the halves {compared * factor:.3g}"] * (as_many is not None)
-        bounds += [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
-        empty = comparison.measured[0].protocol.get("sizes", {}).get("generated_empty", 0)
-        judgement += f"; {empty} of its scans are empty and not compared" * (empty > 0)
+        if empty := comparison.measured[0].protocol.get("sizes", {}).get("generated_empty"):
+            judgement += f"; {empty} of its scans are empty and not compared"
+        bounds = [f"{c.title} {v * factor:.3g}" for v, c in ((reference, halves), *baselines[:1])]
+        if as_many:
+            bounds.insert(0, f"in as many scans as the halves {compared * factor:.3g}")
         lines.append(f"{comparison.name}: {title} {value * factor:.3g} ({', '.join(bounds)}): {judgement}.")
     return lines
 
