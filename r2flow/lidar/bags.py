@@ -31,7 +31,7 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points
 
     old = path.suffix.lower() == ".bag" and path.is_file()
     folder = path.parent if path.suffix.lower() == ".db3" and path.is_file() else path  # a .db3 is a part of a bag
-    check(path.is_dir() or path.is_file(), f"{path} is not a .mcap, .db3 or .bag file, nor the folder of a ROS 2 bag.")
+    check(path.is_dir() or path.is_file(), f"{path} does not exist: give a .mcap, .db3, .bag or a ROS 2 bag's folder.")
     if folder.is_dir():
         whole = (folder / "metadata.yaml").is_file()
         check(whole, f"{folder} has no metadata.yaml: give a .mcap, or make it by ros2 bag reindex {folder}")

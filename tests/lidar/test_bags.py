@@ -121,10 +121,9 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
         (whole, "has no topic of point clouds"),
         (cut, "not a readable .mcap file"),
         (other, "not a readable .bag file"),
-        (tmp_path / "missing.mcap", "is not a .mcap"),
+        (tmp_path / "missing.mcap", "does not exist"),
         (tmp_path, "no metadata.yaml"),
-        (lone.parent, "ros2 bag reindex"),
-        (lone, "ros2 bag reindex"),
+        *((part, "ros2 bag reindex") for part in (lone.parent, lone)),
     ):
         assert words in r2flow("unpack", path, "--out", tmp_path / "out").refusal
     assert not (tmp_path / "out").exists()
