@@ -64,7 +64,7 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     path = Path(path)
     check_columns(columns)
     ending = scan_ending(path.name)
-    if not ending:
+    if not ending and path.exists():
         unknown = f"has no ending of a scan file; known: {', '.join(SCAN_ENDINGS)}. Convert or rename it"
         advice = next((advice for other, advice in ELSEWHERE.items() if path.name.lower().endswith(other)), unknown)
         raise InputError(f"{path} {advice.format(path=path)}.")
