@@ -11,6 +11,7 @@ import torch
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
 from r2flow.runs.folder import RESUMED, check_run, contradictions, open_run, read_config, run_lock
+from tests.conftest import small_disk
 
 CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10}}
 
@@ -90,3 +91,5 @@ def test_the_lock_names_its_holder_and_ends_when_that_is_killed(tmp_path: Path):
         holder.wait()
     with run_lock(tmp_path, patience=0):
         assert f"pid {os.getpid()}" in (tmp_path / ".lock.holder").read_text()
+    with small_disk(1), pytest.raises(OSError, match=r"\.lock\.holder"), run_lock(tmp_path, patience=0):
+        pass

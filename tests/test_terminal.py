@@ -152,8 +152,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 def new_pages(**settings: str) -> int:
     """Pages that the kernel had to give for a block that is taken and freed again and again."""
     own = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")} | settings
-    done = subprocess.run([sys.executable, "-c", PROGRAM], env=own, capture_output=True, check=True)
-    return int(done.stdout)
+    return int(subprocess.run([sys.executable, "-c", PROGRAM], env=own, capture_output=True, check=True).stdout)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")

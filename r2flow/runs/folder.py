@@ -38,7 +38,7 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
         raise InputError(f"{run} is trained by another process ({owner}). Wait for it, or give name=OTHER.") from None
     with lock:
         # Not in the lock file itself, which other processes may truncate when they try to lock it.
-        holder.write_text(f"pid {os.getpid()} on {platform.node()}", encoding="utf-8")
+        write_file(holder, f"pid {os.getpid()} on {platform.node()}")
         yield
 
 

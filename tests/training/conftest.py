@@ -149,8 +149,7 @@ def train(scans: Path, tmp_path: Path) -> Run:
 @pytest.fixture(scope="session")
 def alone(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     cwd = tmp_path_factory.mktemp("alone")
-    done = run_train(cwd, scans, "name=alone")
-    return cwd / "runs" / "alone", done.stdout
+    return cwd / "runs" / "alone", run_train(cwd, scans, "name=alone").stdout
 
 
 @pytest.fixture

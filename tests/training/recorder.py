@@ -51,8 +51,7 @@ save, item = AtomicCheckpointIO.save_checkpoint, FlowDataset.__getitem__
 
 
 def save_recorded(self, checkpoint, path, storage_options=None) -> None:
-    rank = os.environ.get("LOCAL_RANK", "0")
-    (FOLDER / f"wrote-{rank}-{Path(path).name}").touch()
+    (FOLDER / f"wrote-{os.environ.get('LOCAL_RANK', '0')}-{Path(path).name}").touch()
     save(self, checkpoint, path, storage_options)
 
 
