@@ -89,8 +89,7 @@ def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, word
 
 
 def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_path):
-    broken = Mock(side_effect=RuntimeError("shapes do not match"))
-    monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", broken)
+    monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", Mock(side_effect=RuntimeError("shapes differ")))
     with pytest.raises(RuntimeError, match="shapes"):
         r2flow("sample", "-o", tmp_path)
 

@@ -4,6 +4,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -95,7 +96,7 @@ def finish(run: Path, samples: Mapping[str, Any], seed: int, device: str, max_st
     write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"], replace=True)
     during = f"; during training: {run / 'pictures'}" if (run / "pictures").is_dir() else ""
     logged = [str(run / "loss.png")] if curves else []
-    logged += [f"tensorboard --logdir {run / 'tensorboard'}"] if (run / "tensorboard").is_dir() else []
+    logged += [f"tensorboard --logdir {quote(str(run / 'tensorboard'))}"] if (run / "tensorboard").is_dir() else []
     print(
         f"""
 checkpoint    {checkpoint.path}

@@ -162,8 +162,7 @@ def test_what_is_behind_a_near_return_of_the_same_sensor_was_not_measured():
 
 
 def test_a_range_image_says_all_its_rays():
-    image = np.array([[[5.0, 0.0, 0.7, 90.0]], [[1.2, 0.0, 0.2, 1.3]]], np.float32)
-    seen = image_of_same(image, TARGET)
+    seen = image_of_same(np.array([[[5.0, 0.0, 0.7, 90.0]], [[1.2, 0.0, 0.2, 1.3]]], np.float32), TARGET)
     assert seen.state.tolist() == [[Ray.RETURN, Ray.EMPTY, Ray.UNKNOWN, Ray.EMPTY]]
     assert seen.image.tolist() == [[[5.0, 0, 0, 0]], [[1.0, 0, 0, 0]]]
 

@@ -51,8 +51,7 @@ def test_coverage_is_nominal_where_the_truth_is_one_more_answer(dropped):
     random = np.random.default_rng(0)
     draws = random.normal(20, 3, (9, 1, 200, 200)).astype(np.float32)
     draws[random.random(draws.shape) < dropped] = 0
-    hidden = np.ones((200, 200), dtype=bool)
-    found = spread_errors(draws[0], draws[1:], hidden)
+    found = spread_errors(draws[0], draws[1:], np.ones((200, 200), dtype=bool))
     assert found["nominal"] == 7 / 9
     assert found["coverage"] == pytest.approx(7 / 9, abs=4 * math.sqrt(7 / 9 * 2 / 9 / 40000))
     if not dropped:  # CRPS of N(m, s) against a draw of the same: s / sqrt(pi)

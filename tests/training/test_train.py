@@ -78,8 +78,9 @@ def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
 
 
 def test_a_run_from_weights_begins_with_their_validation_loss(train: Run, alone: tuple[Path, str], tmp_path: Path):
-    train("name=more", f"stage.init={alone[0]}", "trainer.max_steps=3")
-    before, after = (read_curves(run)["val/loss"][1] for run in (alone[0], tmp_path / "runs" / "more"))
+    said = train("name='a b'", f"stage.init={alone[0]}", "loggers=[csv,tensorboard]", "trainer.max_steps=3").stdout
+    assert "tensorboard --logdir 'runs/a b/tensorboard'\n" in said
+    before, after = (read_curves(run)["val/loss"][1] for run in (alone[0], tmp_path / "runs" / "a b"))
     assert len(after) == 2
     assert after[0] == pytest.approx(before[-1], rel=1e-5)
 
