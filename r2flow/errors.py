@@ -44,10 +44,11 @@ def check_folder(folder: Path) -> None:
     check(usable, f"{there} is not a folder that can be written to; give another one.")
 
 
-# System errors of files and disks, for the user to act on; others (a lost connection) keep their traceback.
+# System errors of files, disks and limits, for the user to act on; others (a lost connection) keep their traceback.
 MENDABLE = {
     errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP, errno.ESTALE, errno.EIO,
+    errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM,
 }  # fmt: skip
 
 
@@ -83,8 +84,7 @@ def explain_mistake(error: InputError | OSError) -> str:
             raise error
         if error.errno in (errno.ENOTDIR, errno.EEXIST) and error.filename:
             given = Path(os.fsdecode(error.filename))
-            file = next((path for path in (given, *given.parents) if path.exists() and not path.is_dir()), None)
-            if file is not None:
+            if file := next((path for path in (given, *given.parents) if path.exists() and not path.is_dir()), None):
                 return one_line(f"{file} is a file, not a folder; give another name.")
         where = f"{error.filename}: " if error.filename else ""
         return one_line(f"{where}{error.strerror or error}")

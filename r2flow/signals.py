@@ -104,8 +104,7 @@ def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exi
     """End a worker when its parent process ends, since it would wait forever for a reader of its results."""
 
     def wait() -> None:
-        parent = multiprocessing.parent_process()
-        if parent is not None:
+        if parent := multiprocessing.parent_process():
             parent.join()
             end()
 

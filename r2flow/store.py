@@ -101,11 +101,10 @@ class Store:
 
     def has(self, item: int) -> bool:
         """Whether an item exists; reads only the header of its file."""
-        try:
+        with suppress(FileNotFoundError, Damaged):
             self.head(item)
-        except (FileNotFoundError, Damaged):
-            return False
-        return True
+            return True
+        return False
 
     def missing(self, items: Iterable[int]) -> list[int]:
         return [item for item in items if not self.has(item)]

@@ -196,8 +196,7 @@ def _refuse_unread(data: Mapping[str, Any], given: Collection[str]) -> None:
     else:
         files = isinstance(SOURCES[name], Layout | Prepared)
         what, unread = "scans in files are no simulated scenes", scenes if files else set()
-    wrong = sorted(f"data.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option])
-    if wrong:
+    if wrong := sorted(f"data.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option]):
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 
 
@@ -323,6 +322,8 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     except MisconfigurationException as error:  # as of limit_val_batches, with few scans
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     except RuntimeError as error:
+        if isinstance(error.__context__, OSError) and error.__cause__ is None:  # Lightning's own hides the error
+            raise error.__context__ from None
         if run.trainer.world_size > 1 and stopping.told is None and re.search(PEER_LOST, str(error)):
             if any(map(_failed, getattr(run.trainer.strategy.launcher, "procs", ()))):
                 raise InputError("a process of this run on another device ended with an error.") from error

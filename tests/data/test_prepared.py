@@ -87,8 +87,7 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
 
 @pytest.mark.parametrize("levels", [256, 100, 255])
 def test_reflectance_in_levels_is_kept_to_the_bit_and_the_levels_are_found(levels: int):
-    steps = np.arange(min(levels + 1, 256))
-    reflectance = np.array([step / levels for step in steps], dtype=np.float32)
+    reflectance = np.array([step / levels for step in np.arange(min(levels + 1, 256))], dtype=np.float32)
     assert find_levels(reflectance) == levels
     codes = reflectance_codes(levels)
     assert np.array_equal(codes.values[codes.encode(reflectance)], reflectance)

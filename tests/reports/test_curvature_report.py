@@ -87,8 +87,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):
     path, out = saved[0], tmp_path / "reports"
     copy = path.with_name("step-00000009.ckpt")
     copy.write_bytes(path.read_bytes())
-    how = ("-o", out, "--steps", 4, "--num", 2)
-    said = r2flow("report", "curvature", path, copy, *how).said
+    said = r2flow("report", "curvature", path, copy, "-o", out, "--steps", 4, "--num", 2).said
     figures = {f"{name}.{end}" for name in ("curvature", "trajectories") for end in ("png", "pdf")}
     assert {file.name for file in out.iterdir()} == figures | {"curvature.json", "curvature.md"}
     assert str(out / "curvature.md") in said

@@ -123,8 +123,7 @@ def test_a_usual_scan_takes_about_130_kb():
 
 
 def test_no_text_is_read_as_html():
-    labels = np.full((1, *SENSOR.shape), 600)
-    parsed = Parsed(page([Panel(ATTACK, images(1), RAYS, labels, [ATTACK])], ATTACK))
+    parsed = Parsed(page([Panel(ATTACK, images(1), RAYS, np.full((1, *SENSOR.shape), 600), [ATTACK])], ATTACK))
     assert [attributes.get("type") for attributes, _ in parsed.all("script")] == ["application/json", "module"]
     assert not parsed.all("img")
     assert parsed.data["scans"][0]["caption"] == parsed.data["frames"][0] == ATTACK

@@ -263,6 +263,11 @@ def test_too_few_scans_for_a_share_of_the_validation_are_one_line(train: Run):
     assert "trainer: You requested" in train("trainer.limit_val_batches=0.1", check=False).refusal
 
 
+def test_a_reader_that_cannot_start_is_one_line(train: Run, monkeypatch):
+    monkeypatch.setattr("multiprocessing.Process.start", Mock(side_effect=OSError(24, "Too many open files")))
+    assert train("data.workers=1", check=False).refusal == "error: Too many open files"
+
+
 @pytest.mark.parametrize(("precision", "kind"), [("bf16-mixed", torch.float32), ("64-true", torch.float64)])
 def test_the_average_has_the_precision_of_the_weights(train: Run, tmp_path: Path, precision, kind):
     train(f"trainer.precision={precision}", "trainer.max_steps=4", "name=other")
