@@ -94,7 +94,7 @@ def _refuse_another_config(run: str | Path, old: Mapping[str, Any], new: Mapping
         more_steps = f", stage.init={last} name=OTHER to learn on from its weights" if length else ""
         raise InputError(
             f"{run} holds a run of another config: {at_most_three(differing)}. "
-            f"Give the same command to resume it{more_steps}, or name=OTHER for a new one."
+            f"Give the same settings and scans to resume it{more_steps}, or name=OTHER for a new one."
         )
 
 
