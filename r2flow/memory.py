@@ -2,7 +2,6 @@
 
 import ctypes
 import os
-import sys
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 LARGEST, KEPT = 1 << 30, 2**31 - 1  # bytes
@@ -17,8 +16,8 @@ def prepare_process() -> None:
     """
     os.environ["MPLBACKEND"] = "agg"  # a notebook's shell has the notebook's, which may not be installed here
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # 1.4 to 2.5 times faster next to other programs
-    if sys.platform != "linux" or any(name.startswith(("MALLOC_MMAP_", "MALLOC_TRIM_")) for name in os.environ):
+    if any(name.startswith(("MALLOC_MMAP_", "MALLOC_TRIM_")) for name in os.environ):
         return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl does not have it
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # macOS and musl do not have it
     if mallopt is not None and mallopt(M_MMAP_THRESHOLD, LARGEST):
         mallopt(M_TRIM_THRESHOLD, KEPT)

@@ -61,13 +61,12 @@ def export(
     batch = "any batch" if written.any_batch else "batch of one scan (torch could not export a variable batch)"
     content = "the network v(t, x)" if what == "network" else sampler
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {content}, {batch}")
-    if what == "network":
-        return
-    difference = writing.compare(loaded, written, sampler)
-    print(
-        f"compared with the flow: range within {difference.metres:.2g} m, reflectance within "
-        f"{difference.reflectance:.2g}, {difference.rays} rays differ in ray-drop"
-    )
+    if what == "sampler":
+        difference = writing.compare(loaded, written, sampler)
+        print(
+            f"compared with the flow: range within {difference.metres:.2g} m, reflectance within "
+            f"{difference.reflectance:.2g}, {difference.rays} rays differ in ray-drop"
+        )
 
 
 @app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")

@@ -118,8 +118,7 @@ def expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray
     count = np.maximum(count, 0)
     k = np.repeat(np.arange(len(count), dtype=np.int32), count)
     start = np.cumsum(count) - count
-    j = np.arange(len(k), dtype=np.int32) - (start - first)[k].astype(np.int32)
-    return k, j
+    return k, np.arange(len(k), dtype=np.int32) - (start - first)[k].astype(np.int32)
 
 
 def column_windows(azimuth: np.ndarray, half: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:

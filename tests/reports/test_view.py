@@ -76,8 +76,7 @@ def unpacked(data: dict, number: int, frame: int = 0) -> list[np.ndarray]:
     shape = rays["rows"], rays["columns"]
     raw = np.frombuffer(zlib.decompress(base64.b64decode(one["frames"][frame])), np.uint8)
     high, low, *others = raw.reshape(-1, *shape).astype(np.int64)
-    codes = np.cumsum(256 * high + low, axis=1) % 65536
-    return [codes * data["metres"], *others]
+    return [np.cumsum(256 * high + low, axis=1) % 65536 * data["metres"], *others]
 
 
 @pytest.mark.parametrize("farthest", [80.0, 900.0], ids=["80 m", "900 m"])

@@ -199,8 +199,7 @@ def test_a_closure_clears_the_gradients_of_all_weights():
     """Lightning hands the whole of a step over as a closure; gradients of earlier steps must not stay."""
     model, other = network(), network()
     ours, theirs = (Muon(net.parameters(), RATE, **ADAMW) for net in (model, other))
-    rng = torch.Generator().manual_seed(0)
-    for x in torch.randn(3, 2, 2, 5, 5, generator=rng):
+    for x in torch.randn(3, 2, 2, 5, 5, generator=torch.Generator().manual_seed(0)):
 
         def closure(x: torch.Tensor = x) -> float:
             ours.zero_grad()

@@ -275,8 +275,7 @@ def test_a_published_file_is_a_generator(shared: Path, name: str, averaged: bool
 
 
 def test_sensor_and_angles_of_a_published_file_are_its_own_also_when_saved(shared: Path, tmp_path: Path):
-    path = shared / "oracle_baselines" / "dusty2_published.pth"
-    checkpoint = load_checkpoint(path)
+    checkpoint = load_checkpoint(shared / "oracle_baselines" / "dusty2_published.pth")
     rays = checkpoint.sensor.rays()
     torch.testing.assert_close(checkpoint.generator.angle[0], rays, rtol=0, atol=1e-4)
     assert math.degrees(float(rays[0, 0, 0])) == pytest.approx(math.degrees(0.05), abs=1e-3)

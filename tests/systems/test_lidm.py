@@ -329,8 +329,7 @@ def test_options_are_read_off_the_names_and_shapes_of_weights(first: dict[str, A
         (_autoencoder, autoencoder, {**first, "legacy": True}, usual[0]),
         (_unet, unet, second, usual[1]),
     ):
-        found = read(model.state_dict())
-        for name, value in found.items():
+        for name, value in read(model.state_dict()).items():
             assert value == json.loads(json.dumps({**known, **given}[name])), name  # lists for tuples
 
 
