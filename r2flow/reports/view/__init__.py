@@ -57,7 +57,7 @@ def page(panels: Sequence[Panel], title: str = "r2flow") -> str:
     sensors: dict[bytes, tuple[int, dict[str, Any]]] = {}
     labelled = [p.labels[p.labels > 0] for p in panels if p.labels is not None]
     classes = class_colours(np.concatenate(labelled), most=255) if labelled else {}
-    step = max(STEP, max(float(p.images[:, 0].max(initial=0)) for p in panels) / (CODES - 1))
+    step = max(STEP, max(float(np.nan_to_num(p.images[:, 0], posinf=0).max(initial=0)) for p in panels) / (CODES - 1))
     scans = []
     for caption, images, rays, labels, _ in panels:
         assert images.shape[1] in (1, 2)
