@@ -44,15 +44,14 @@ def show(
         check(not inside or options.name != FOLDER, f"{out} is in the folder of the scans; give another --out.")
     names: list[str] = []
     readings = one_scale({spec: how.reading([spec], estimate_scale=True) for spec in scans}, most)
-    panels = (panel for spec in scans for panel in scan_panels(spec, readings[spec], most, labelled=False))
-    for caption, (image,), rays, *_ in panels:
+    for _, (caption, (image,), rays, *_) in scan_panels(readings, most, labelled=False):
         file = Path(caption)
         names.append(next(s for n in count(1) if (s := file.stem if n == 1 else f"{file.stem}_{n}") not in names))
         path = out / f"{names[-1]}.{format}"
         if format == "npy":
             save_array(path, image)
         else:
-            save_figure(scan_figure(image, rays, file.name), path)
+            save_figure(scan_figure(image, rays, caption), path)
         print(path)
 
 
@@ -99,9 +98,8 @@ def view(
     scans = [spec for spec in what if spec not in models]
     if not models and (steps or times or seed or device != "auto"):
         raise InputError("--steps, --times, --seed and --device are of a run, a checkpoint or a model; found none.")
-    if not scans and (sequence or how != ReadingOptions()):
-        names = "--sensor, --size, --projection, --convention, --reflectance-scale and --columns"
-        raise InputError(f"--sequence, {names} are of scans; found none.")
+    names = "--sensor, --size, --projection, --convention, --reflectance-scale and --columns"
+    check(scans or not (sequence or how != ReadingOptions()), f"--sequence, {names} are of scans; found none.")
     check(not (sequence and times), "--sequence and --times both use the slider; give one of them.")
     counts = numbers("steps", steps) if steps else []
     check(not times or len(counts) <= 1, f"--times takes one number of --steps, found {steps}.")
@@ -110,15 +108,16 @@ def view(
     first = None if how.sensor or how.size else next(iter(loaded.values()), None)
     each = [how.reading([spec], None if own_reading(spec) else first, estimate_scale=True) for spec in scans]
     readings = one_scale(dict(zip(scans, each, strict=True)), num or SCANS)
+    apart = [{spec: reading} for spec, reading in readings.items()] if sequence else [readings]  # frames share captions
+    drawn = [pair for together in apart for pair in scan_panels(together, num or SCANS)]
     for spec in what:
         if spec in readings:
-            new = list(scan_panels(spec, readings[spec], num or SCANS))
-            new = [in_turn(new, spec)] if sequence and len(new) > 1 else new
+            new = [panel for of, panel in drawn if of == spec]
+            panels += [in_turn(new, spec)] if sequence and len(new) > 1 else new
         elif times:
-            new = way_panels(loaded[spec], spec, num or SAMPLES, seed, counts[0] if counts else None, times)
+            panels += way_panels(loaded[spec], spec, num or SAMPLES, seed, counts[0] if counts else None, times)
         else:
-            new = sample_panels(loaded[spec], spec, num or SAMPLES, seed, counts)
-        panels += new
+            panels += sample_panels(loaded[spec], spec, num or SAMPLES, seed, counts)
     content = page(panels, ", ".join(Path(spec).name or spec for spec in what))  # may be refused or stopped
     path = out or Path(mkdtemp(prefix="r2flow-"), "view.html")
     write_file(path, content)

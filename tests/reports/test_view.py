@@ -163,12 +163,16 @@ class TestTheVerb:
         e = SENSORS["hdl64e"].rays()[0].numpy()
         np.testing.assert_allclose(r[40:60], (-1.73 / np.sin(e))[40:60], atol=0.003)
 
-    @pytest.mark.parametrize("given", [["."], ["a.ply", "b.ply"]], ids=["a folder", "two files"])
-    def test_what_is_shown_together_has_one_scale_of_reflectance(self, r2flow, tmp_path, given):
+    @pytest.mark.parametrize("given", [["."], ["a", "b"], ["a/data/0.ply", "b/data/0.ply"]])
+    def test_what_is_shown_together_has_one_scale_of_reflectance_and_differs_in_caption(self, r2flow, tmp_path, given):
         for name, highest in (("a", 80), ("b", 204)):
-            write_points(tmp_path / "in" / f"{name}.ply", np.array([[10.0, 0, 0]]), np.array([highest]))
-        assert r2flow("show", *(tmp_path / "in" / n for n in given), "--format", "npy", "-o", tmp_path / "out")[0] == 0
-        assert [np.load(tmp_path / "out" / f"{name}.npy")[1].max() for name in "ab"] == pytest.approx([80 / 255, 0.8])
+            write_points(tmp_path / "in" / name / "data" / "0.ply", np.array([[10.0, 0, 0]]), np.array([highest]))
+        scans = [tmp_path / "in" / name for name in given]
+        assert r2flow("show", *scans, "--format", "npy", "-o", tmp_path)[0] == 0
+        assert [np.load(tmp_path / f"{n}.npy")[1].max() for n in ("0", "0_2")] == pytest.approx([80 / 255, 0.8])
+        assert r2flow("view", *scans, "-o", tmp_path / "a.html")[0] == 0
+        data = Parsed((tmp_path / "a.html").read_text()).data
+        assert [one["caption"] for one in data["scans"]] == ["a/data/0.ply", "b/data/0.ply"]
 
     def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path, monkeypatch):
         monkeypatch.setenv("HOME", str(tmp_path))

@@ -1,10 +1,9 @@
 """Panels of a page of `r2flow.reports.view`: scans of files and sets, samples of a generator and their states x_t."""
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import Reading, estimated_scale, read_labelled_scan
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, readable, spread, warn_of_other_sensor
-from r2flow.errors import InputError
+from r2flow.errors import check
 from r2flow.generators import as_flow
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.labels import labels_beside
@@ -42,30 +41,33 @@ def one_scale(readings: Mapping[str, Reading], most: int) -> dict[str, Reading]:
     return {**readings, **{spec: replace(readings[spec], reflectance_scale=scale) for spec in unknown}}
 
 
-def scan_panels(spec: str, reading: Reading, most: int, labelled: bool = True) -> Iterator[Panel]:
-    """A panel for each of up to `most` scans of a set (`open_scans`), evenly spread; `labelled`: with semantic ids.
+def scan_panels(readings: Mapping[str, Reading], most: int, labelled: bool = True) -> Iterator[tuple[str, Panel]]:
+    """Sets and a panel for each of up to `most` scans of them (`open_scans`), evenly spread; `labelled`: with ids.
 
-    The caption is the file name, with the folder where names are ambiguous. Files not written by r2flow are opened one
-    by one, since sizes of range images and reflectance may differ.
+    The caption is the file name, with the folders in which files of equal names differ. Files not written by r2flow
+    are opened one by one, since sizes of range images and reflectance may differ.
     """
-    reading = replace(reading, on_bad_scan="error")
-    options, file = parse(spec)
-    if own_reading(spec) is None and options.name == FOLDER:
-        chosen, count = scans_of(file or options.folder, most)
-        warn_of_other_sensor(chosen, reading, spec)
-        views = [(path, open_scans(path, reading, own_size=True), 0) for path in chosen]
-    else:
-        opened = open_scans(spec, reading)
-        count = 0 if options.name == SIMULATED else len(opened)  # simulated sets have any size
-        scans = opened.spread(most)
-        views = [(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
-    if count > most:
-        print(f"{spec}: {most} of its {count:,} scans, evenly spread (--num)")
-    counts = Counter(path.name for path, *_ in views)
-    for path, scans, number in views:
+    views: list[tuple[str, Path, ScanSet, int]] = []
+    for spec, reading in readings.items():
+        reading = replace(reading, on_bad_scan="error")
+        options, file = parse(spec)
+        if own_reading(spec) is None and options.name == FOLDER:
+            chosen, total = scans_of(file or options.folder, most)
+            warn_of_other_sensor(chosen, reading, spec)
+            views += [(spec, path, open_scans(path, reading, own_size=True), 0) for path in chosen]
+        else:
+            opened = open_scans(spec, reading)
+            total = 0 if options.name == SIMULATED else len(opened)  # simulated sets have any size
+            scans = opened.spread(most)
+            views += [(spec, options.folder / name, scans, i) for i, name in enumerate(scans.source.names)]
+        if total > most:
+            print(f"{spec}: {most} of its {total:,} scans, evenly spread (--num)")
+    for spec, path, scans, number in views:
         image, labels = _labelled(scans.source, number) if labelled else (scans.source[number], None)
-        caption = path.name if counts[path.name] == 1 else f"{path.parent.name}/{path.name}"
-        yield Panel(caption, image[None], scans.sensor.rays(), None if labels is None else labels[None])
+        alike = {other.parts for _, other, *_ in views if other.name == path.name}
+        depth = next(n for n in count(1) if len({parts[-n:] for parts in alike}) == len(alike))
+        caption = "/".join(path.parts[-depth:])
+        yield spec, Panel(caption, image[None], scans.sensor.rays(), None if labels is None else labels[None])
 
 
 def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -83,10 +85,9 @@ def in_turn(panels: Sequence[Panel], caption: str) -> Panel:
     """Combine panels as frames of one."""
     captions, images, rays, labels, _ = zip(*panels, strict=True)
     for name, image, ray, label, _ in panels[1:]:
-        alike = image.shape == images[0].shape and (label is None) == (labels[0] is None)
-        if not alike or not torch.equal(ray, rays[0]):
-            raise InputError(f"{name} and {captions[0]} differ in size, sensor, reflectance or labels: "
-                             "they cannot be frames of one sequence; leave --sequence out.")  # fmt: skip
+        alike = image.shape == images[0].shape and (label is None) == (labels[0] is None) and torch.equal(ray, rays[0])
+        check(alike, f"{name} and {captions[0]} differ in size, sensor, reflectance or labels: "
+                     "they cannot be frames of one sequence; leave --sequence out.")  # fmt: skip
     numbers = None if labels[0] is None else np.concatenate(labels)
     return Panel(caption, np.concatenate(images), rays[0], numbers, captions)
 
