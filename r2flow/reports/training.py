@@ -46,7 +46,7 @@ def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> Figure:
     """Plot one panel per logged curve of `CURVES`, one line per run; runs of one label share a style."""
     names = [name for name in CURVES if any(name in curves for _, curves in runs)]
     styles = {label: STYLES[i % len(STYLES)] for i, label in enumerate(dict.fromkeys(label for label, _ in runs))}
-    figure = blank_figure(5.5 * len(names), 3.8)
+    figure = blank_figure(5.5 * len(names), 3.8 + 0.18 * len(styles) * (len(styles) <= len(STYLES)))
     for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
         for label, curves in runs:
             if name in curves:
@@ -57,9 +57,9 @@ def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> Figure:
         if 0 < 3 * shown.min() < shown.max():  # else its labels would be 1.11 x 10^0
             axes.set_yscale("log")
         axes.grid(alpha=0.25)
-        if len(styles) <= len(STYLES):  # more labels share styles, and a legend that hides the curves
-            handles = {line.get_label(): line for line in axes.lines}
-            axes.legend(handles.values(), handles, fontsize=8).set_in_layout(False)
+    if len(styles) <= len(STYLES):  # more labels share styles
+        handles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
+        figure.legend(handles=handles.values(), fontsize=8, loc="outside lower left")  # labels may be long
     return figure
 
 
