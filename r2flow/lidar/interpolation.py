@@ -23,20 +23,20 @@ def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse"
     if not done.all():
         columns = image.shape[2]
         ring = np.concatenate([filled] * 3, axis=2), np.concatenate([done] * 3, axis=1)
-        wide = _along(*ring, rule, extend=True)[0][..., columns : 2 * columns]
+        wide = _along(*ring, rule)[0][..., columns : 2 * columns]
         filled, empty = np.where(done, filled, wide), ~done.any(1)
         rows = np.flatnonzero(~empty)  # a row without known rays takes the nearest filled row
         filled[:, empty] = filled[:, rows[np.abs(np.flatnonzero(empty)[:, None] - rows).argmin(1)]]
     return filled.astype(np.float32)
 
 
-def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Values and known mask of lines, (C, lines, positions), between their known positions, `extend`: also beyond."""
+def _along(values: np.ndarray, known: np.ndarray, rule: Rule) -> tuple[np.ndarray, np.ndarray]:
+    """Values and known mask of lines, (C, lines, positions), between their known positions; 0 beyond."""
     count = known.shape[1]
     at, lines = np.arange(count), np.arange(len(known))[:, None]
     left, right = nearest_known(known)
-    fillable = (left >= 0) | (right < count) if extend else (left >= 0) & (right < count)
-    nearest = np.where((left < 0) | ((right < count) & (right - at < at - left)), right, left).clip(0, count - 1)
+    fillable = (left >= 0) & (right < count)
+    nearest = np.where(right - at < at - left, right, left).clip(0, count - 1)
     returned = known & (values[0] > 0)
     back = returned[lines, nearest]
     if rule == "nearest":

@@ -73,6 +73,8 @@ def test_interpolation_keeps_what_is_measured_and_fills_the_rest(rule):
     assert ((found[0] > 0) == (image[0] > 0)).mean() > 0.9
     assert np.allclose(found[1][found[0] > 0], 0.3)
     assert not interpolated(image, np.zeros(SHAPE, dtype=bool), rule).any()  # nothing is guessed from nothing
+    line = np.float32([4, 0, 0, 0, 0, 0, 8]).reshape(1, 7, 1)  # in its middle a ray came back empty
+    assert (interpolated(line, np.c_[:7] % 3 == 0, rule)[0, :, 0] > 0).tolist() == [1, 1, 0, 0, 0, 1, 1]
 
 
 @pytest.mark.parametrize("rule", ["linear", "inverse"])
