@@ -65,8 +65,7 @@ def points_through(points: Points, source: Sensor, target: Sensor, reflectance: 
         if r >= 0:
             empty[r, _columns(_without_return(azimuth[members], source.columns), target.columns)] = True
     stored = len(points.xyz) + points.dropped
-    many = points.dropped > stored / 100  # a few damaged rows are not lost rays
-    lost = many or bool((beam < 0).any() and (~points.xyz.any(axis=1)).any())
+    lost = points.dropped > stored / 100 or not points.xyz.any(axis=1).all()  # a few damaged rows are not lost rays
     if not lost or stored < WHOLE * math.prod(source.shape):
         empty[:, _blind(azimuth[beam >= 0], target.columns, 3 * 360 / source.columns)] = False
     chosen = np.flatnonzero((beam >= 0) & (row[beam] >= 0))
