@@ -91,7 +91,7 @@ def project_indices(
     row = unfolded_rows(xyz, sensor, convention, ring) if unfolding else _rows(xyz, r, sensor, convention)
     pixel = row * columns
     pixel += _columns(xyz, columns, convention)
-    within = finite & (r >= sensor.min_range) & (r <= sensor.max_range)
+    within = (r >= sensor.min_range) & (r <= sensor.max_range)
     if convention != "centre":
         if convention == "lidm":
             finite = within = (r > sensor.min_range) & (r < sensor.max_range)
