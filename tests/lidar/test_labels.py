@@ -15,9 +15,8 @@ from tests.conftest import refused
 SENSOR = SENSORS["hdl64e"].resized(8, 16)
 COUNT = 200
 RNG = np.random.default_rng(3)
-XYZ = np.column_stack([RNG.uniform(5, 40, (COUNT, 1)) * [1, 0, 0], np.zeros((COUNT, 1))])[:, :3].astype(np.float32)
-XYZ[:, 1], XYZ[:, 2] = RNG.uniform(-30, 30, COUNT), RNG.uniform(-2, 0, COUNT)
-IDS = RNG.choice([0, 10, 40, 70, 252], COUNT).astype(np.uint32)
+XYZ = RNG.uniform([5, -30, -2], [40, 30, 0], (COUNT, 3)).astype(np.float32)
+IDS = RNG.choice([0, 10, 40, 70, 258], COUNT).astype(np.uint32)
 INSTANCES = np.where(IDS == 10, RNG.integers(1, 300, COUNT), 0).astype(np.uint32)
 WHOLE = (IDS | INSTANCES << 16).astype("<u4").tobytes()
 

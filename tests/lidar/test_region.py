@@ -14,15 +14,11 @@ SENSOR = SENSORS["hdl64e"].resized(16, 72)  # columns of 5 degrees
 def test_the_columns_are_those_that_the_sector_touches_from_left_to_right(sector):
     columns = region(SENSOR.shape, sector).columns
     assert (columns.diff() % 72 == 1).all()  # through the seam
-    chosen = set(columns.tolist())
     begin, width = sector[0], (sector[1] - sector[0]) % 360
     for column in range(72):
         # by the definition of a column: it spans the azimuths 180 - 5 w down to 175 - 5 w
-        touched = any(
-            (azimuth - begin) % 360 < width
-            for azimuth in (180 - 5 * (column + share / 100) for share in range(1, 100))
-        )  # fmt: skip
-        assert (column in chosen) == touched
+        touched = any((180 - 5 * (column + share / 100) - begin) % 360 < width for share in range(1, 100))
+        assert (column in columns) == touched
 
 
 def test_rounding_goes_outward_to_whole_units():
@@ -33,6 +29,7 @@ def test_rounding_goes_outward_to_whole_units():
     assert outer.widened((4, 8)) == outer
     nearly_all = Region((16, 72), 0, 16, 4, 70).widened((4, 8))
     assert (nearly_all.left, nearly_all.width, nearly_all.share) == (0, 72, 1)
+    assert region((16, 360), (-74, -50)) == Region((16, 360), 0, 16, 230, 24)  # 180 + 50 and 180 + 74, whole columns
 
 
 def test_the_whole_image_keeps_its_order():
@@ -60,6 +57,7 @@ def test_a_margin_widens_what_is_generated_and_not_what_is_asked_for():
     shape = (8, 64)
     asked = region(shape, (-45, 45), (0, 3), margin=22.5)
     assert asked.widened((1, 1)) == region(shape, (-67.5, 67.5), (0, 3))
+    assert region(shape, (-45, 45), margin=6).margin == 2  # columns of 5.625 degrees
     assert asked.crop(torch.zeros(shape)).shape == (4, 16)
     assert region(shape, (135, -135), margin=45).widened((1, 1)) == region(shape, (90, -90))
     assert region(shape, (-100, 100), margin=90).widened((1, 1)) == region(shape)

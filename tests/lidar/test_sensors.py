@@ -43,7 +43,7 @@ def test_more_rows_than_beams_see_the_ground_where_the_beams_meet_it(rows):
     assert len(xyz) == 7 * 1024
     np.testing.assert_allclose(xyz[:, 2], -1.8, atol=1e-4)
     assert min(fine.row_edges[0], -fine.row_edges[-1]) > 15.2
-    assert abs(Sensor("dome", (89.0, 0.0)).resized(rows).row_edges).max() < 90
+    assert abs(Sensor("dome", (89.0, 0.0, -89.0)).resized(rows).row_edges).max() < 90
 
 
 @pytest.mark.parametrize(
