@@ -72,4 +72,4 @@ def test_whole_drives_are_held_out_where_they_come_within_half_of_the_share():
     assert held(0.1, [0, 50, 70]) == 10  # 30 is too much: the end of the last drive
     assert held(0.1, [0, 98]) == 10
     assert held(0.0, [0, 99]) == 0
-    assert held(0.9, [0, 10]) == 90
+    assert (held(0.9, [0, 10]), held(0.7, [0])) == (90, 70)  # never all
