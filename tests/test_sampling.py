@@ -319,9 +319,9 @@ def test_a_samplers_name_may_have_fields_as_on_the_command_line():
 
 def test_settings_may_be_numpy_s_and_torch_s():
     own = build_sampler("euler", steps=2)
-    times = torch.tensor([0.0, 0.25, 1.0])
-    assert own.changed(steps=np.int64(4)) == build_sampler("euler", steps=4)
-    assert own.changed(grid=times) == own.changed(grid=times.numpy()) == own.changed(grid=[0, 0.25, 1])
+    assert own.changed(steps=np.int64(4)) == build_sampler("euler", steps=np.int64(4)) == own.changed(steps=4)
+    for grid in (torch.tensor([0.0, 0.25, 1.0]), np.array([0, 0.25, 1])):
+        assert own.changed(grid=grid) == build_sampler("euler", grid=grid) == own.changed(grid=[0, 0.25, 1])
 
 
 def test_a_seed_is_a_whole_number_of_python_or_numpy():

@@ -15,7 +15,7 @@ from typing import Any
 from r2flow.errors import InputError, check
 from r2flow.flow.solvers import SOLVERS, usual_grid
 from r2flow.registry import Registry, lazy
-from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _with_steps
+from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _plain
 from r2flow.samplers.maps import Chord, Jump, Refine, Renoise, Transport
 from r2flow.samplers.ode import Adaptive, FixedSteps, ODESampler, TorchDiffEq
 from r2flow.samplers.posterior import MMPS, Posterior, Repaint, Replace
@@ -89,4 +89,4 @@ def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
     """Build a sampler from name and fields, or from a text (`parse_sampler`). `steps` follows from a grid of times."""
     options = parse_sampler(options) if isinstance(options, str) else options
     check(isinstance(options, Mapping), f"a sampler needs a 'name' and its fields, found {options!r}.")
-    return SAMPLERS.build(_with_steps({k: v for k, v in {**options, **fields}.items() if v is not None}))
+    return SAMPLERS.build(_plain({**options, **fields}))

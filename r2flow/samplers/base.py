@@ -37,8 +37,7 @@ class Generated:
     def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:
         """Scans after as many evaluations each; `converged`, (B,) bool, is whether x is finite by default."""
         counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
-        x = wide(x)
-        return cls(x, counted, finite(x) if converged is None else converged)
+        return cls(wide(x), counted, finite(x) if converged is None else converged)
 
 
 def last_of(states: Iterable[Tensor], progress: Call) -> Tensor:
@@ -98,12 +97,12 @@ class Sampler(ABC):
 
     def changed(self, **options: Any) -> Self:
         """A copy with the options that are not None."""
-        options = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
+        options = _plain(options)
         check_options(f"sampler '{self.name}'", type(self), {**self._fields(), **options})
         grid = getattr(self, "grid", None)
         if isinstance(grid, tuple) and options.get("steps", len(grid) - 1) != len(grid) - 1:
             options.setdefault("grid", options_of(type(self))["grid"])
-        return replace(self, **_with_steps(options))  # type: ignore[type-var]
+        return replace(self, **options)  # type: ignore[type-var]
 
     def asdict(self) -> dict[str, Any]:
         """Name and fields as plain values, as stored in a config or a checkpoint."""
@@ -145,7 +144,8 @@ class OnGrid(Sampler):
         return build_grid(self.grid, 0.0, 1.0, self.steps)
 
 
-def _with_steps(options: dict[str, Any]) -> dict[str, Any]:
-    """Add `steps` to options whose grid is a list of times."""
-    grid = options.get("grid")
-    return options if not isinstance(grid, list | tuple) else {"steps": len(grid) - 1, **options}
+def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that are not None, with plain values for NumPy's and torch's, and `steps` of a grid of times."""
+    plain = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
+    grid = plain.get("grid")
+    return plain if not isinstance(grid, list | tuple) else {**plain, "steps": plain.get("steps", len(grid) - 1)}
