@@ -322,7 +322,7 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     except MisconfigurationException as error:  # as of limit_val_batches, with few scans
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     except RuntimeError as error:
-        if isinstance(error.__context__, OSError) and error.__cause__ is None:  # Lightning's own hides the error
+        if isinstance(error.__context__, OSError) and re.search("combined_loader|Too many open", str(error)):  # hide it
             raise error.__context__ from None
         if run.trainer.world_size > 1 and stopping.told is None and re.search(PEER_LOST, str(error)):
             if any(map(_failed, getattr(run.trainer.strategy.launcher, "procs", ()))):

@@ -266,6 +266,10 @@ def test_too_few_scans_for_a_share_of_the_validation_are_one_line(train: Run):
 def test_a_reader_that_cannot_start_is_one_line(train: Run, monkeypatch):
     monkeypatch.setattr("multiprocessing.Process.start", Mock(side_effect=OSError(24, "Too many open files")))
     assert train("data.workers=1", check=False).refusal == "error: Too many open files"
+    (error := RuntimeError("of a plug-in")).__context__ = OSError(2, "what it was about")
+    monkeypatch.setattr(Progress, "on_train_batch_end", Mock(side_effect=error))
+    with pytest.raises(RuntimeError, match="of a plug-in"):
+        train()
 
 
 @pytest.mark.parametrize(("precision", "kind"), [("bf16-mixed", torch.float32), ("64-true", torch.float64)])
