@@ -197,8 +197,7 @@ class TestExtremes:
     def test_points_out_of_view_are_an_empty_scan_and_no_points_a_clear_error(self, real, tmp_path):
         write_points(tmp_path / "g" / "0.ply", np.array([[0, 0, 9.0]]), np.array([0.5]))
         assert not open_scans(str(tmp_path / "g"), READING).source[0].any()
-        found = measured(*(open_scans(str(one), READING) for one in (real, tmp_path / "g")))
-        for one in found:
+        for one in measured(*(open_scans(str(one), READING) for one in (real, tmp_path / "g"))):
             assert any(math.isnan(value) for value in one.figures.values()) <= bool(one.remarks)
             assert "single" in " ".join(one.remarks)
 
@@ -264,8 +263,7 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
     ]
     first, second = verdict(comparisons)
     same = f"in as many scans as the halves {equal:g}, " if equal is not None else ""
-    known = f"{same}reference: real halves 10, baseline: noise 50"
-    assert first.startswith(f"a: {metric} {value:g} ({known}): ")
+    assert first.startswith(f"a: {metric} {value:g} ({same}reference: real halves 10, baseline: noise 50): ")
     assert words in first
     assert second.startswith(f"b: {metric} {value + 1:g} ")
 

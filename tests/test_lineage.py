@@ -23,7 +23,7 @@ def parent(tmp_path: Path) -> Path:
 
 
 def child(parent: Path, reflectance) -> dict:
-    encoding = {"format": "logscale", "reflectance": reflectance}
+    encoding = {"format": "logscale", "reflectance": reflectance, "limits": "open"}  # not in the parent
     return {**CONFIG, "encoding": encoding, "stage": {"name": "rectify", "init": str(parent)}}
 
 

@@ -129,8 +129,7 @@ def test_half_precision_rounds_large_weights_alone(saved, tmp_path):
     assert (tmp_path / "half.safetensors").read_bytes() == (tmp_path / "again.safetensors").read_bytes()
     with safe_open(tmp_path / "half.safetensors", framework="pt") as file:
         kinds = {name: file.get_tensor(name).dtype for name in file.keys()}  # noqa: SIM118
-    named = original.generator.named_parameters()
-    large = {name for name, value in named if value.ndim > 1 and value.numel() > 256}
+    large = {name for name, value in original.generator.named_parameters() if value.ndim > 1 and value.numel() > 256}
     assert {name for name, kind in kinds.items() if kind == torch.float16} == large != set()
     read = load_checkpoint(tmp_path / "half.safetensors").generator.state_dict()
     for name, value in original.generator.state_dict().items():

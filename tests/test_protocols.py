@@ -26,8 +26,7 @@ H, W = SENSOR.shape
 def angles(shift_down: np.ndarray | float, shift_right: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """Elevation and azimuth within each bin, both shifts from 0 (upper left corner) to 1, radians."""
     h, w = np.indices((H, W))
-    elevation = np.deg2rad(3 - 28 * (h + shift_down) / H)
-    return elevation, math.pi - 2 * math.pi * (w + shift_right) / W
+    return np.deg2rad(3 - 28 * (h + shift_down) / H), math.pi - 2 * math.pi * (w + shift_right) / W
 
 
 def points(r: np.ndarray, elevation: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
@@ -56,8 +55,7 @@ def from_above(clouds: list[np.ndarray]) -> np.ndarray:
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
     p, q = a.ravel() / a.sum(), b.ravel() / b.sum()
-    m = (p + q) / 2
-    entropy = [-(x[x > 0] * np.log(x[x > 0])).sum() for x in (p, q, m)]
+    entropy = [-(x[x > 0] * np.log(x[x > 0])).sum() for x in (p, q, (p + q) / 2)]
     return math.sqrt(entropy[2] - (entropy[0] + entropy[1]) / 2)
 
 

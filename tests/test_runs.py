@@ -20,9 +20,10 @@ def changed(**new) -> dict:
     return CONFIG | {key: {**CONFIG.get(key, {}), **one} if isinstance(one, dict) else one for key, one in new.items()}
 
 
-def checkpoint(run: Path, step: int) -> Path:
+def checkpoint(run: Path, step: int, lacking: str = "") -> Path:
     path = run / "checkpoints" / f"step-{step:08d}.ckpt"
     content = {**dict.fromkeys(RESUMED), "global_step": step, "state_dict": {"weights": torch.zeros(100)}}
+    content.pop(lacking, None)
     AtomicCheckpointIO().save_checkpoint(content, path)
     return path
 
@@ -42,6 +43,9 @@ def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert read_config(tmp_path) == changed(trainer={"devices": 4})  # what runs now, and not what was refused
     with pytest.raises(InputError, match=r"max_steps=10 there, 9 here\. Give the same .* to resume it, or name="):
         check_run(tmp_path, changed(trainer={"max_steps": 9}))  # of a link, which has a stage.init of its own
+    for lacking in ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step"):
+        checkpoint(tmp_path, 6, lacking)
+        assert open_run(tmp_path, CONFIG) == newest
 
 
 def test_a_finished_run_keeps_its_sampler(tmp_path: Path):

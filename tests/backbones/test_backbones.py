@@ -204,8 +204,7 @@ def test_a_rolled_ring_gives_a_rolled_velocity_without_position(name):
 def test_a_narrow_ring_computes_what_a_ring_of_many_turns_does(turns):
     model, x = tiny("local").double(), image()[..., :4].double()
     many = model.velocity(torch.tensor([0.4]), x.repeat(1, 1, 1, 32))
-    found = model.velocity(torch.tensor([0.4]), x.repeat(1, 1, 1, turns))
-    torch.testing.assert_close(found, many[..., : 4 * turns])
+    torch.testing.assert_close(model.velocity(torch.tensor([0.4]), x.repeat(1, 1, 1, turns)), many[..., : 4 * turns])
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -257,8 +256,7 @@ def test_every_configuration_builds_for_every_sensor(config):
 )
 def test_backbones_of_an_ablation_are_of_one_size_or_one_cost(names, count):
     with torch.device("meta"):
-        rays = build_sensor("hdl64e").rays()
-        counts = [count(build_backbone(configurations()[name], rays, 2)) for name in names]
+        counts = [count(build_backbone(configurations()[name], build_sensor("hdl64e").rays(), 2)) for name in names]
     assert max(counts) <= 1.1 * min(counts)
 
 

@@ -34,8 +34,7 @@ def test_the_path_sees_single_pixels():
 
 @pytest.mark.parametrize("s", [0.3, 1.0])
 def test_input_and_target_of_the_network_have_unit_variance(s):
-    rng = torch.Generator().manual_seed(0)
-    x_0, x_1 = torch.randn(2, 200_000, dtype=torch.float64, generator=rng)
+    x_0, x_1 = torch.randn(2, 200_000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     x_1 = s * x_1
     for t in T:
         into, skip, out = (factor.flatten() for factor in precondition(t[None], s))

@@ -31,8 +31,7 @@ def test_spherical_harmonics_are_orthonormal():
     z, w = np.polynomial.legendre.leggauss(16)
     nodes, weights = torch.from_numpy(np.arcsin(z)), torch.from_numpy(w)
     azimuth = torch.arange(32, dtype=torch.float64) * (2 * math.pi / 32)
-    rays = torch.stack(torch.meshgrid(nodes, azimuth, indexing="ij"))[None]
-    y = SphericalHarmonics((16, 32))(rays)[0].flatten(1)
+    y = SphericalHarmonics((16, 32))(torch.stack(torch.meshgrid(nodes, azimuth, indexing="ij"))[None])[0].flatten(1)
     area = (weights[:, None] * (2 * math.pi / 32)).expand(16, 32).flatten()
     torch.testing.assert_close((y * area) @ y.T, torch.eye(25, dtype=torch.float64), rtol=0, atol=1e-12)
 

@@ -39,8 +39,7 @@ def test_training_reaches_the_second_time(name):
     x, t, s = image(), torch.tensor([0.2, 0.7]), torch.tensor([0.9, 0.8])
     zero = [p for n, p in two.named_parameters() if n in two.second_time_names() and not p.any()]
     assert len(zero) == 1
-    new = [p for n, p in two.named_parameters() if n in two.second_time_names()]
-    for reached in (zero, new):
+    for reached in (zero, [p for n, p in two.named_parameters() if n in two.second_time_names()]):
         two.zero_grad()
         two(t, x, s).square().mean().backward()
         assert all(p.grad.isfinite().all() and p.grad.any() for p in reached)

@@ -83,8 +83,7 @@ def exact(a: float, n: int) -> tuple[float, float]:
 
 
 def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
-    ema = EMA(decay=0.5, every=1, warmup_steps=0)
-    fit(tmp_path, [ema, Curvature(seed=7, every=2, num=2, steps=4)], steps=3)
+    fit(tmp_path, [EMA(decay=0.5, every=1, warmup_steps=0), Curvature(seed=7, every=2, num=2, steps=4)], steps=3)
     curves = read_curves(tmp_path, ("curvature/s", "curvature/bend", "train/loss"))
     assert curves["curvature/s"][0].tolist() == [2, 3]  # every second step, and the last
     assert curves["train/loss"][0].tolist() == [1, 2, 3]
@@ -122,8 +121,7 @@ def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_pat
     real = pictures.contact_sheet
     monkeypatch.setattr("r2flow.callbacks.periodic.contact_sheet", lambda *given: sheets.append(given) or real(*given))
     callbacks = [EMA(decay=0.5, every=1, warmup_steps=0), SamplePictures(tmp_path / "p", 7, every=2, num=2, steps=4)]
-    logger = TensorBoardLogger(tmp_path, name="tensorboard", version="")
-    fit(tmp_path, callbacks, steps=3, logger=logger)
+    fit(tmp_path, callbacks, steps=3, logger=TensorBoardLogger(tmp_path, name="tensorboard", version=""))
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == ["step-00000002.png", "step-00000003.png"]
     noise = torch.stack([standard_normal(SPACE.shape, 7, "evaluation", i) for i in range(2)])
     for a, (images, _, titles) in zip(AVERAGES, sheets, strict=True):

@@ -1,10 +1,12 @@
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from r2flow import noise
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.resolving import reflectance_levels, resolve_reflectance
@@ -156,11 +158,17 @@ def test_scans_are_projected_as_the_run_says(numbered: Path):
         module(name="folder", root=str(numbered), reading={"projection": "unfolding"})
 
 
-def test_validation_is_never_augmented(numbered: Path):
+def test_validation_is_never_augmented_nor_drawn_anew_and_ranks_share_it(numbered: Path):
     options = {"name": "folder", "root": str(numbered), "validation": {"share": 0.5}}
     plain = next(iter(module(**options).val_dataloader()))
-    augmented = next(iter(module(**options, augment={"flip": True, "roll": True}).val_dataloader()))
+    data = module(**options, augment={"flip": True, "roll": True})
+    data.seed, data.further = 5, lambda x, sensor, draws: {"drawn": torch.tensor(draws.integers(2**40))}
+    augmented = next(iter(data.val_dataloader()))
     assert torch.equal(plain["x_1"], augmented["x_1"])
+    assert augmented["drawn"].tolist() == [noise.generator(0, "condition", k).integers(2**40) for k in range(6)]
+    for ranks, seen in ((1, [0, 1, 2, 3, 4, 5]), (4, [1]), (6, [1]), (7, [0, 1, 2, 3, 4, 5])):  # two are left over
+        data.trainer = SimpleNamespace(global_rank=1 % ranks, world_size=ranks)
+        assert [k for batch in data.val_dataloader() for k in batch["k"].tolist()] == seen
 
 
 class TestReflectance:

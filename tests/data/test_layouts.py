@@ -31,9 +31,12 @@ def test_drives_are_taken_by_number_and_by_name(kitti_360: Path):
 
 
 def test_kitti_raw_and_odometry(tmp_path: Path):
-    write_scan(tmp_path / "raw/2011_09_26/2011_09_26_drive_0005_sync/velodyne_points/data/0000000000.bin", 0)
-    write_scan(tmp_path / "raw/2011_09_28/2011_09_28_drive_0001_sync/velodyne_points/data/0000000000.bin", 0)
-    assert names(find_drives("kitti_raw", tmp_path / "raw")) == ["0005", "0001"]
+    for day, drive in ((26, "0005"), (28, "0001"), (28, "0005")):
+        name = f"2011_09_{day}/2011_09_{day}_drive_{drive}_sync"
+        write_scan(tmp_path / "raw" / name / "velodyne_points/data/0000000000.bin", 0)
+    assert names(find_drives("kitti_raw", tmp_path / "raw")) == ["0005", "0001", "0005"]
+    with pytest.raises(InputError, match="2 drives named '5'; known: 2011_09_26_drive_0005_sync, "):
+        find_drives("kitti_raw", tmp_path / "raw", drives=[5])
     assert names(find_drives("kitti_raw", tmp_path / "raw/2011_09_26")) == ["0005"]
     for sequence in ("00", "08", "11"):
         write_scan(tmp_path / f"odo/dataset/sequences/{sequence}/velodyne/000000.bin", 0)

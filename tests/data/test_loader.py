@@ -31,8 +31,7 @@ def test_a_late_start_continues_the_same_order():
 
 @pytest.mark.parametrize("ranks", [2, 4])
 def test_ranks_share_every_global_batch(ranks):
-    parts = [keys(rank=rank, ranks=ranks) for rank in range(ranks)]
-    for whole, *shares in zip(keys(), *parts, strict=True):
+    for whole, *shares in zip(keys(), *(keys(rank=rank, ranks=ranks) for rank in range(ranks)), strict=True):
         assert sorted(k for share in shares for k in share) == sorted(whole)
         assert len({len(share) for share in shares}) == 1
 

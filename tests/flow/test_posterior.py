@@ -102,8 +102,7 @@ def test_mmps_has_the_posterior_s_own_velocity_on_any_gaussian(t):
 
 def test_with_an_exact_flow_map_steps_are_jumps():
     prior, x_0 = gaussian(), randn(2, WIDTH)
-    nothing = torch.zeros_like(x_0, dtype=torch.bool)
-    jumped = sample_posterior(map_of(prior), x_0, x_0, nothing, "replace", times(3))
+    jumped = sample_posterior(map_of(prior), x_0, x_0, torch.zeros_like(x_0, dtype=torch.bool), "replace", times(3))
     torch.testing.assert_close(jumped, prior.solution(x_0, 1.0))
 
 

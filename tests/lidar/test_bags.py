@@ -36,8 +36,7 @@ def message(store, xyz: np.ndarray, order: str = "<", extra: int = 0, time: tupl
     table["intensity"], table["ring"] = fields(len(xyz))
     rows = table.view(np.uint8).reshape(2, -1) if len(xyz) else np.zeros((2, 0), np.uint8)
     data = np.concatenate([rows, np.zeros((2, extra), np.uint8)], 1)
-    stamp = types["builtin_interfaces/msg/Time"](*time)
-    header = {"stamp": stamp, "frame_id": "lidar"}
+    header = {"stamp": types["builtin_interfaces/msg/Time"](*time), "frame_id": "lidar"}
     if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__:
         header["seq"] = 0
     described = [

@@ -111,6 +111,7 @@ def test_the_scale_of_reflectance_is_estimated(values, scale):
     assert full_reflectance([Points(points.xyz)]) is None
     if scale:
         assert scaled_reflectance("a.bin", points, scale).max() == pytest.approx(min(values.max() / scale, 1))
+    assert scaled_reflectance("a.bin", Points(np.ones((3, 3)), np.float32([0, 0.5, 1])), 255).tolist() == [0, 0.5, 1]
 
 
 def test_range_limits_include_all_but_stray_returns():

@@ -126,8 +126,7 @@ def test_the_nearest_return_of_each_quarter_is_that_of_a_search(share, ring):
     found = nearest_returns(returned, STEPS, ring)
     apart = torch.linalg.vector_norm(found * STEPS.T[None, :, :, None, None], dim=1)
     for image in range(2):
-        expected = by_search(returned[image].numpy(), STEPS[image].numpy(), ring)
-        assert np.allclose(apart[:, image], expected, rtol=1e-5)
+        assert np.allclose(apart[:, image], by_search(returned[image].numpy(), STEPS[image].numpy(), ring), rtol=1e-5)
     # Offsets lead to returns, on the side that is asked for.
     there = found.isfinite().all(1)
     down, aside = torch.where(there[:, None], found, 0).long().unbind(1)

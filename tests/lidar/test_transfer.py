@@ -79,8 +79,7 @@ def test_a_ray_that_did_not_come_back_is_empty_and_one_that_was_not_fired_is_unk
     lost[8] = True  # a beam without any return
     seen = points_through(Points(np.repeat(wall(firing, lost, jitter=jitter).xyz, returns, 0)), firing, TARGET)
     column = np.floor((1 - azimuths(steps, jitter) / math.pi) / 2 * 256).astype(int) % 256
-    rows = rows_of(firing.elevations, TARGET)
-    for beam, row in enumerate(rows):
+    for beam, row in enumerate(rows_of(firing.elevations, TARGET)):
         if row < 0:
             continue
         if beam == 8:  # where its rays went is not known exactly, but that they did not come back is
@@ -145,6 +144,9 @@ def test_a_scan_of_the_same_sensor_is_measured_everywhere_but_where_it_was_cut()
     assert (seen.state[:, 1:126] == Ray.UNKNOWN).all()
     assert (seen.state[3] == Ray.EMPTY).sum() >= 3
     assert (np.delete(seen.state, 3, axis=0)[:, 130:] == Ray.RETURN).all()
+    for gap, state in ((65, Ray.EMPTY), (66, Ray.UNKNOWN)):  # gap + 1 of 2,000 steps; three of 90 columns are 66.7
+        cut = wall(firing, np.broadcast_to(np.arange(2000) >= 2000 - gap, (32, 2000)))
+        assert (points_of_same(cut, TARGET.resized(32, 90)).state[:, 1] == state).all()
 
 
 def test_what_is_behind_a_near_return_of_the_same_sensor_was_not_measured():

@@ -50,8 +50,7 @@ def cells(points, size, depth=(1.0, 56.0)):
 def test_jsd_of_the_other_toolbox_counts_scans_that_hold_a_cell():
     def shares(scans):
         held = [cells(p.numpy(), 0.05) for p in scans.points]
-        every = set().union(*held)
-        counts = {cell: sum(cell in one for one in held) for cell in every}
+        counts = {cell: sum(cell in one for one in held) for cell in set().union(*held)}
         total = sum(counts.values())
         return {cell: n / total for cell, n in counts.items()}
 

@@ -140,5 +140,4 @@ def test_parameters_have_torchsparse_s_names_and_shapes():
     }.items():
         assert shapes[name] == shape
     assert "stage1.1.downsample.0.kernel" not in shapes  # 16 to 16: nothing to change
-    own = {name for name in shapes if not name.startswith("point_transforms.")}
-    assert own == set(MinkowskiNet().state_dict())
+    assert {name for name in shapes if not name.startswith("point_transforms.")} == set(MinkowskiNet().state_dict())

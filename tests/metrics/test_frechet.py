@@ -41,8 +41,7 @@ def test_equal_and_degenerate_gaussians():
 
 
 def test_reference_figures(shared):
-    cases = torch.load(shared / "oracle" / "distribution_metrics.pt", weights_only=True)
-    for case in cases.values():
+    for case in torch.load(shared / "oracle" / "distribution_metrics.pt", weights_only=True).values():
         found = frechet_distance(*gaussian(case["f1"]), *gaussian(case["f2"]))
         assert found == pytest.approx(case["frechet"], rel=1e-9)
 

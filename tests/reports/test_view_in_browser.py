@@ -236,8 +236,7 @@ def test_only_what_is_there_can_be_coloured(opened):
 @pytest.mark.parametrize(("size", "count"), [(DESKTOP, 16), (PHONE, 6)])
 def test_everything_fits_and_the_rest_is_turned_to(opened, size, count):
     shown = opened(*(panel(lone(), caption=str(number)) for number in range(20)), size=size)
-    boxes = [one.bounding_box() for one in shown.locator("figure, button:visible").all()]
-    for box in boxes:
+    for box in [one.bounding_box() for one in shown.locator("figure, button:visible").all()]:
         for start, length in (("x", "width"), ("y", "height")):
             assert box[start] >= 0
             assert box[start] + box[length] <= size[length]

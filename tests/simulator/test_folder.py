@@ -25,6 +25,8 @@ def write_folder(folder: SimulatedFolder, items, workers: int) -> int:
 def test_files_hold_what_the_simulator_draws(tmp_path):
     folder = SimulatedFolder(tmp_path / "a", SMALL, 3, ("bin", "npy"), labels=True)
     assert write_folder(folder, range(5, 7), workers=1) == 2
+    (folder.folder / "000006.label").unlink()  # the last file of a scan, as after a kill
+    assert write_folder(folder, range(5, 7), workers=1) == 1
     names = {f"{index:06d}.{ending}" for index in (5, 6) for ending in ("bin", "npy", "label")}
     assert set(files(folder.folder)) == {*names, "manifest.json"}
     scan = simulate(SMALL, 3, 6)

@@ -450,8 +450,7 @@ def test_the_published_recipe_with_positions_starts_from_its_autoencoder(tmp_pat
     first = ["experiment=lidm_autoencoder", *common]
     check(compose([*first, "sensor.columns=1000"]))
     assert "16 x 125 latents: latent_diffusion takes at most 1 generator.unet.multipliers" in caplog.text
-    parent = Parent(compose(first), tmp_path)
-    config = check(compose(["experiment=lidm_ape", *common]), parent=parent)
+    config = check(compose(["experiment=lidm_ape", *common]), parent=Parent(compose(first), tmp_path))
     assert [config["data"][key] for key in ("name", "split", "drives")] == ["kitti_360", "train", None]  # the paper's
     with torch.device("meta"):
         assert sum(p.numel() for p in build_generator(config).parameters()) == 15_070_361 + 257_751_560 + 524_288

@@ -173,8 +173,7 @@ FORMATS = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric
 def test_metres_and_model_space_are_the_published(shared, name):
     data = load_case(shared, "r2dm_data.pt")
     case = data[f"{name}_1.45_80.0"]
-    sensor = SENSORS["hdl64e"].resized(16, 64)
-    encoding = Encoding(sensor, FORMATS[name], reflectance=False, limits="open")
+    encoding = Encoding(SENSORS["hdl64e"].resized(16, 64), FORMATS[name], reflectance=False, limits="open")
     assert_near(encoding.encode(case["metres"]), case["model_space"], 1e-5)
     assert_near(encoding.decode(2 * case["normalised_in"] - 1), case["reverted"], 1e-5)
     assert_near(encoding.decode(encoding.encode(case["metres"])), case["round_trip"], 1e-5)
@@ -277,8 +276,7 @@ def test_a_diffusion_is_the_flow_of_its_own_data(exact):
     """The straight flow of N(m, s^2) carries x_0 to m + s x_0; the schedule ends where sigma is 6e-4."""
     noise = Draws(0, [0]).start(exact.noise_shape)
     for sampler in (build_sampler("dopri5", tolerance=1e-7), build_sampler("ddim", steps=1000)):
-        found = exact(noise, sampler=sampler)
-        torch.testing.assert_close(found.x, exact.mean + exact.std * noise, rtol=0, atol=2e-3)
+        torch.testing.assert_close(exact(noise, sampler=sampler).x, exact.mean + exact.std * noise, rtol=0, atol=2e-3)
 
 
 @torch.no_grad()

@@ -87,8 +87,7 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
 def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):
     run = Path(shutil.copytree(chained[0], tmp_path / "runs" / "it's"))
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")}
-    done = run_train(tmp_path, scans, *CHAIN, 'name="it\'s"')
-    assert done.stdout.count(": finished before") == 4  # the report too
+    assert run_train(tmp_path, scans, *CHAIN, 'name="it\'s"').stdout.count(": finished before") == 4  # the report too
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")} == before
 
 
