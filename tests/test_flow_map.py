@@ -132,7 +132,7 @@ def test_refined_samples_follow_the_path_then_renoise(exact, monkeypatch):
         assert {draws.step((2,), 1).device.type, build_sampler("refine").times().device.type} == {"cpu"}
     end = type("End", (), {"x": torch.zeros(2, device="meta"), "converged": torch.ones(2, dtype=torch.bool)})
     monkeypatch.setattr("r2flow.samplers.maps.solve", lambda *_, **__: end)  # solvers note convergence on the CPU
-    assert build_sampler("refine").start(exact, end.x, None, lambda: None)[2].device == end.x.device
+    assert build_sampler("refine")(exact, end.x, None, lambda j: end.x, lambda: None).converged.device == end.x.device
 
 
 OWN = build_sampler("adams3", steps=16, grid="power:1.75")

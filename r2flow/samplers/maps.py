@@ -35,7 +35,7 @@ class Jump(OnGrid):
         first, x, alive = self.start(generator, noise, condition, progress)
         u, times = generator.map(condition), self.times().to(noise)[first:]
         for j, (t, s) in enumerate(pairwise(times), start=1):
-            e = draws(j) if draws and self.draws and s < 1 else x.new_zeros(())
+            e = draws(j) if draws and self.draws and j < len(times) - 1 else x.new_zeros(())
             x, alive = stepped(x, self.step(u, t, x, s, e), alive)
             progress()
         return Generated.after(x, self.steps, alive)
