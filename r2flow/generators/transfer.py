@@ -134,9 +134,9 @@ class TransferFlow(Flow):
             output[:, -2] = self.backbone(t, raised).float()[:, -2]
         logits, shifts, scales = output[:, :-2].chunk(3, 1)
         returns, strength = output[:, -2:].split(1, 1)
-        bias = output.new_tensor([0, 0, 0, 0, 2, 1, 0])[:, None, None]
+        logits = torch.cat([logits[:, :4], logits[:, 4:5] + 2, logits[:, 5:6] + 1, logits[:, 6:]], 1)
         present = torch.cat([about.there, torch.ones_like(about.there[:, :1])], 1)
-        logits = (logits + bias).masked_fill(~present, NEVER).log_softmax(1)
+        logits = logits.masked_fill(~present, NEVER).log_softmax(1)
         ranges = torch.cat([about.ranges + SHIFT * shifts[:, :6], about.guess + FREE * shifts[:, 6:]], 1)
         scales = (scales - 4).clamp(max=2).exp() + 1e-3  # of Laplace densities on log r
         nearest = about.strengths.gather(1, about.there.int().argmax(1, keepdim=True))
