@@ -1,6 +1,6 @@
 """Choice of the device."""
 
-from r2flow.errors import InputError
+from r2flow.errors import check
 
 
 def choose_device(name: str, option: str = "--device") -> str:
@@ -13,10 +13,8 @@ def choose_device(name: str, option: str = "--device") -> str:
         device = torch.device(name)
     except RuntimeError:
         device = torch.device("meta")
-    if device.type not in ("cpu", "cuda", "mps", "xpu") or (device.type == "cpu" and device.index):
-        raise InputError(f"{option} must be auto, cpu, cuda, cuda:1, ...; found {name!r}.")
-    module = {"cuda": torch.cuda, "mps": torch.mps, "xpu": torch.xpu}.get(device.type)
-    if module is not None and (device.index or 0) >= module.device_count():
-        number = f"{module.device_count()} of them" if module.device_count() else "no GPU"
-        raise InputError(f"{option} {name}, but torch sees {number} here; use {option} cpu.")
+    check(device.type in ("cpu", "cuda", "mps", "xpu"), f"{option} must be auto, cpu, cuda, cuda:1, ..., not {name!r}.")
+    count = getattr(torch, device.type).device_count()
+    number = f"{count} of them" if count else "no GPU"
+    check((device.index or 0) < count, f"{option} {name}, but torch sees {number} here; use {option} cpu.")
     return name

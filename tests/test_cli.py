@@ -80,10 +80,11 @@ def test_every_verb_has_help_with_an_example(r2flow, verb, monkeypatch):
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"), "for 20.00 GiB more;"),
         (RuntimeError("can't allocate memory: you tried to allocate 96 bytes.\nx"), "96 bytes more"),
         (RuntimeError("not enough memory: you tried to allocate 96 bytes."), "for 96 bytes more;"),
+        (TypeError("Cannot convert a MPS Tensor to float64, as the MPS framework doesn't support float64."), "GPU"),
         (RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly"), "unexpectedly; is there memory for as many"),
     ],
 )
-def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, words):
+def test_what_a_machine_cannot_do_is_one_line(r2flow, monkeypatch, tmp_path, error, words):
     monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", Mock(side_effect=error))
     assert words in r2flow("sample", "-o", tmp_path).refusal
 
@@ -96,9 +97,8 @@ def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_pat
 
 @pytest.mark.parametrize("device", ["nope", "meta", "cpu:3", "cuda:99", None])
 def test_a_model_is_loaded_on_a_device_that_is_here(saved, device):
-    with pytest.raises(InputError, match="^device") as refused:
+    with pytest.raises(InputError, match=f"^device.*{device}"):
         load(saved[0], device)
-    assert str(device) in str(refused.value)
 
 
 def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, tmp_path):

@@ -69,13 +69,15 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
         return 130
     except (InputError, OSError) as error:
         message = explain_mistake(error)
-    except (ImportError, MemoryError, RuntimeError) as error:
+    except (ImportError, MemoryError, RuntimeError, TypeError) as error:
         if "home directory" in str(error):
             message = "~ stands for nothing here: write the path in full, or set HOME; for the cache, XDG_CACHE_HOME."
         elif isinstance(error, MemoryError) or any(words in str(error) for words in FULL):
             size = re.search(r"allocate ([\d.]+ \w+)", str(error))
             more = f" for {size[1]} more" if size else ""
             message = f"the memory has no room{more}; give smaller batches or images, or more memory."
+        elif "MPS framework doesn't support float64" in str(error):
+            message = "Apple's GPU has no float64, which this needs: use --device cpu."
         elif "DataLoader worker (pid" in str(error):
             message = f"{one_line(str(error)).rstrip('. ')}; is there memory for as many processes that read scans?"
         else:
