@@ -124,7 +124,7 @@ def _cost_of(model: Backbone, repeats: int, device: str) -> dict[str, Any]:
 
 def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T, float]:
     """Result of a call and its duration in seconds, including work on the device."""
-    wait = torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda device: None
+    wait = torch.accelerator.synchronize if torch.device(device).type != "cpu" else lambda device: None
     wait(device)
     begin = time.perf_counter()
     result = call()

@@ -23,8 +23,7 @@ def wall(material: str, distance: float = 10.0, sensor=VLP16, albedo: float | No
     b = SceneBuilder(OPEN, ScalarDraws(np.random.default_rng(0)))
     usual = MATERIALS[INDEX[material]].albedo if albedo is None else albedo
     b.add(Boxes(distance + 5, 0, 0, 10, 200, -1, 100), "building", material, usual)
-    scan = observe(b.build(), sensor, np.random.default_rng(1))
-    return scan, np.abs(sensor.rays().numpy()[1]) < np.pi / 6
+    return observe(b.build(), sensor, np.random.default_rng(1)), np.abs(sensor.rays().numpy()[1]) < np.pi / 6
 
 
 def test_rows_and_edges_of_the_image_agree():
