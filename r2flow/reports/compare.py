@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
@@ -60,9 +61,9 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     return list({run.resolve(): run for run in runs}.values())  # a link and its run are one
 
 
-def labels(folders: Sequence[Path]) -> list[str]:
-    """Folder names, with as many parents as needed to be unique."""
-    parts = [folder.resolve().parts for folder in folders]
+def labels(paths: Sequence[Path]) -> list[str]:
+    """Names of files or folders, with as many parents as needed to be unique."""
+    parts = [Path(os.path.abspath(path)).parts for path in paths]  # links keep the names that the user gave them
     depth = 1
     while depth < max(map(len, parts), default=1) and len({p[-depth:] for p in parts}) < len(set(parts)):
         depth += 1

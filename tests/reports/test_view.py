@@ -85,7 +85,7 @@ def test_what_is_unpacked_is_the_scan(farthest):
     given[1, 0, 3, 5] = farthest
     given[0, 0, 0, :2], given[1, 0, 0, 0] = (np.nan, -1), np.inf
     data = Parsed(page_of(*given)).data
-    for number, image in enumerate(np.nan_to_num(given.clip(0), posinf=0)):  # other values are no returns
+    for number, image in enumerate(np.nan_to_num(given.clip(0), posinf=0)):  # other values are not returns
         r, reflectance = unpacked(data, number)
         assert np.abs(r - image[0]).max() <= max(0.002, farthest / 65535 / 2) + 1e-5
         assert ((r == 0) == (image[0] == 0)).all()

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import count, pairwise
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
 from r2flow.progress import Bar
+from r2flow.reports.compare import labels
 from r2flow.reports.view import Panel, write_page
 from r2flow.samplers import OnGrid
 from r2flow.simulator import simulate
@@ -44,8 +45,8 @@ def one_scale(readings: Mapping[str, Reading], most: int) -> dict[str, Reading]:
 def scan_panels(readings: Mapping[str, Reading], most: int, labelled: bool = True) -> Iterator[tuple[str, Panel]]:
     """Sets and a panel for each of up to `most` scans of them (`open_scans`), evenly spread; `labelled`: with ids.
 
-    The caption is the file name, with the folders in which files of equal names differ. Files not written by r2flow
-    are opened one by one, since sizes of range images and reflectance may differ.
+    The caption is the file name, with folders if names are ambiguous. Files not written by r2flow are opened one by
+    one, since sizes of range images and reflectance may differ.
     """
     views: list[tuple[str, Path, ScanSet, int]] = []
     for spec, reading in readings.items():
@@ -62,12 +63,9 @@ def scan_panels(readings: Mapping[str, Reading], most: int, labelled: bool = Tru
             views += [(spec, options.folder / name, scans, i) for i, name in enumerate(scans.source.names)]
         if total > most:
             print(f"{spec}: {most} of its {total:,} scans, evenly spread (--num)")
-    for spec, path, scans, number in views:
-        image, labels = _labelled(scans.source, number) if labelled else (scans.source[number], None)
-        alike = {other.parts for _, other, *_ in views if other.name == path.name}
-        depth = next(n for n in count(1) if len({parts[-n:] for parts in alike}) == len(alike))
-        caption = "/".join(path.parts[-depth:])
-        yield spec, Panel(caption, image[None], scans.sensor.rays(), None if labels is None else labels[None])
+    for (spec, _, scans, number), caption in zip(views, labels([path for _, path, *_ in views]), strict=True):
+        image, classes = _labelled(scans.source, number) if labelled else (scans.source[number], None)
+        yield spec, Panel(caption, image[None], scans.sensor.rays(), None if classes is None else classes[None])
 
 
 def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -83,12 +81,12 @@ def _labelled(source: ScanSource, number: int) -> tuple[np.ndarray, np.ndarray |
 
 def in_turn(panels: Sequence[Panel], caption: str) -> Panel:
     """Combine panels as frames of one."""
-    captions, images, rays, labels, _ = zip(*panels, strict=True)
+    captions, images, rays, classes, _ = zip(*panels, strict=True)
     for name, image, ray, label, _ in panels[1:]:
-        alike = image.shape == images[0].shape and (label is None) == (labels[0] is None) and torch.equal(ray, rays[0])
+        alike = image.shape == images[0].shape and (label is None) == (classes[0] is None) and torch.equal(ray, rays[0])
         check(alike, f"{name} and {captions[0]} differ in size, sensor, reflectance or labels: "
                      "they cannot be frames of one sequence; leave --sequence out.")  # fmt: skip
-    numbers = None if labels[0] is None else np.concatenate(labels)
+    numbers = None if classes[0] is None else np.concatenate(classes)
     return Panel(caption, np.concatenate(images), rays[0], numbers, captions)
 
 
