@@ -245,6 +245,8 @@ def compare(
 
     compared = read_runs(runs)
     groups = group_runs(compared) if group else {run.label: [run] for run in compared}
+    if out is not None:
+        check_folder(out)
     for title, (cells, headings) in tables(groups).items():
         print_table(cells, headings, title)
         print()
