@@ -130,7 +130,7 @@ def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
             f"{figures['copies_nearer']:.0%} of all pairs (p = {test.pvalue:.2g})."
         )
     settings = {"cells": list(CELLS), "turned": True, "mirrored": True, "training scans": len(real.training)}
-    sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(judged.numbers)}
+    sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(d)}
     protocol = {**asdict(Protocol("copies", "log-range of cells", settings=settings)), "sizes": sizes}
     return MetricResult("copies", figures, protocol, None, remarks)
 
