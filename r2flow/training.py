@@ -322,8 +322,8 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     except MisconfigurationException as error:  # as of limit_val_batches, with few scans
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     except RuntimeError as error:
-        if isinstance(error.__context__, OSError) and re.search("combined_loader|Too many open", str(error)):  # hide it
-            raise error.__context__ from None
+        if isinstance(cause := error.__context__, OSError) and re.search("combined_loader|Too many open", str(error)):
+            raise cause from None
         if run.trainer.world_size > 1 and stopping.told is None and re.search(PEER_LOST, str(error)):
             if any(map(_failed, getattr(run.trainer.strategy.launcher, "procs", ()))):
                 raise InputError("a process of this run on another device ended with an error.") from error

@@ -237,7 +237,7 @@ def area(negative: Tensor, positive: Tensor) -> float:
 
 
 def interval(value: float, n: int, m: int) -> tuple[float, float]:
-    """All areas a at most 1.96 of their errors (Hanley and McNeil 1982) from that of n by m scores (Newcombe 2006)."""
+    """Ends of all a with |a - value| <= 1.96 se(a) (Newcombe 2006), se of n by m scores (Hanley and McNeil 1982)."""
     a = torch.cat([torch.linspace(-20, 20, 100_001).double().sigmoid(), torch.tensor([value], dtype=torch.float64)])
     variance = a * (1 - a) * (1 + ((n + m) / 2 - 1) * ((1 - a) / (2 - a) + a / (1 + a))) / (n * m)
     inside = a[(a - value).square() <= 1.96**2 * variance]  # a's error: the value's is 0 if all pairs agree

@@ -182,8 +182,7 @@ class SPVCNN(MinkowskiNet):
         points = at_4.to_points(y.features) + self.point_transforms[1](points)
 
         y = self.up(3, y._replace(features=at_4.to_voxels(points)), maps[1])
-        y = self.up(4, y, maps[0])
-        return y.features + self.point_transforms[2](points)
+        return self.up(4, y, maps[0]).features + self.point_transforms[2](points)
 
 
 class Corners:
