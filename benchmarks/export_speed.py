@@ -1,6 +1,6 @@
 """Seconds a scan of an exported flow, beside the flow itself and its network compiled: medians, taken in turns.
 
-python benchmarks/export_speed.py street --sampler chord --steps 2 --repeats 7
+python benchmarks/export_speed.py street --sampler jump --steps 2 --repeats 7
 """
 
 import argparse

@@ -148,11 +148,11 @@ def test_fields_in_a_sampler_s_text_count_and_make_a_set_each(points, saved):
 def test_each_number_of_steps_takes_the_sampler_that_the_generator_has_for_it(points, tmp_path):
     config = {**CONFIG, "generator": {"name": "flow_map"}}
     generator = build_generator(config).eval()
-    generator.run_by(build_sampler("adams3", steps=2, grid="power:1.75"), few=build_sampler("chord", steps=1))
+    generator.run_by(build_sampler("adams3", steps=2, grid="power:1.75"), few=build_sampler("jump", steps=1))
     save_checkpoint(Checkpoint(generator, config), tmp_path / "map.safetensors")
     points(tmp_path / "map.safetensors", "--steps", "1,2")
     one, two = json.loads((tmp_path / "evaluation.json").read_text())["comparisons"]
-    names = {"map.safetensors, 1 step": "chord", "map.safetensors, 2 steps": "adams3"}
+    names = {"map.safetensors, 1 step": "jump", "map.safetensors, 2 steps": "adams3"}
     assert [(c["comparison"], c["generated"]["sampler"]["name"]) for c in (one, two)] == [*names.items()]
 
 

@@ -18,7 +18,7 @@ from r2flow.noise import Draws, standard_normal
 from r2flow.runs.lineage import Parent, generator_of
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
-from r2flow.stages.flow_map import LearnFlowMap, paths_of
+from r2flow.stages.flow_map import LearnFlowMap
 from tests.fields import CONFIG, Field
 from tests.test_sampling import network
 
@@ -60,9 +60,9 @@ def exact() -> Exact:
     return found  # type: ignore[return-value]
 
 
-def test_before_it_has_learned_jumps_and_chords_are_its_parent_s_euler_steps(grown, parent):
+def test_before_it_has_learned_jumps_are_its_parent_s_euler_steps(grown, parent):
     x_0 = Draws(0, range(2)).start(grown.noise_shape)
-    for name, steps, grid in (("jump", 1, "uniform"), ("jump", 3, "uniform"), ("chord", 3, "power:2")):
+    for name, steps, grid in (("jump", 1, "uniform"), ("jump", 3, "uniform"), ("jump", 3, "power:2")):
         jumped = grown(x_0, sampler=build_sampler(name, steps=steps, grid=grid))
         walked = parent(x_0, sampler=build_sampler("euler", steps=steps, grid=grid))
         torch.testing.assert_close(jumped.x, walked.x, rtol=0, atol=1e-5)  # s - t is rounded otherwise
@@ -97,24 +97,6 @@ def test_jumps_of_an_exact_map_end_where_the_flow_does(exact, steps, grid):
     assert found.converged.all()
 
 
-def test_the_chord_leads_to_where_a_jump_to_the_end_would(exact):
-    """Of N(m, sd^2): x_s = (1 - s) x_0 + s (m + sd x_0), and the jump from there."""
-    x_0 = Draws(0, range(3)).start(exact.noise_shape)
-    mean, std = exact.problem.mean, exact.problem.std
-    expected = mean + std * x_0
-    for s in (0.25, 0.5, 0.75):
-        x_s = (1 - s) * x_0 + s * expected
-        size = ((1 - s) ** 2 + (s * std) ** 2) ** 0.5
-        expected = mean + std / size * (x_s - s * mean)
-        x_0 = (x_s - s * expected) / (1 - s)  # the chord from here begins elsewhere
-    start = Draws(0, range(3)).start(exact.noise_shape)
-    found = exact(start, sampler=build_sampler("chord", steps=4, grid="uniform"), draws=Draws(0, range(3)))
-    torch.testing.assert_close(found.x, expected, rtol=0, atol=1e-5)
-    assert found.evaluations.tolist() == [4, 4, 4]
-    whole = exact(start, sampler=build_sampler("chord", steps=1)).x
-    assert torch.equal(whole, exact(start, sampler=build_sampler("jump", steps=1)).x)
-
-
 def test_refined_samples_follow_the_path_then_renoise(exact, monkeypatch):
     draws = Draws(5, range(2))
     x_0 = draws.start(exact.noise_shape)
@@ -141,36 +123,35 @@ OWN = build_sampler("adams3", steps=16, grid="power:1.75")
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [
-        ({"steps": 15}, build_sampler("chord", steps=15)),
-        ({"steps": 2, "grid": "power:3"}, build_sampler("chord", steps=2, grid="power:3")),
+        ({"steps": 15}, build_sampler("renoise", steps=15)),
+        ({"steps": 2, "grid": "power:3"}, build_sampler("renoise", steps=2, grid="power:3")),
         ({"steps": 16}, OWN),
         ({"steps": 32}, build_sampler("adams3", steps=32, grid="power:1.75")),
         ({"steps": 4, "name": "adams3"}, build_sampler("adams3", steps=4, grid="power:1.75")),
         ({"steps": 4, "name": "euler"}, build_sampler("euler", steps=4)),
-        ({"name": "chord"}, build_sampler("chord")),
+        ({"name": "renoise"}, build_sampler("renoise")),
         ({}, OWN),
     ],
 )
 def test_fewer_steps_alone_go_over_to_the_sampler_for_few(grown, asked, expected):
-    grown.run_by(OWN, build_sampler("chord"))
+    grown.run_by(OWN, build_sampler("renoise"))
     assert grown.choose(**asked) == expected
 
 
-def test_the_own_grids_of_chord_and_renoise_are_late():
-    torch.testing.assert_close(build_sampler("chord", steps=2).times(), torch.tensor([0, 31 / 32, 1]).double())
-    for name, log in (("chord", (4.25, 4.75, 5.25, 5.75)), ("renoise", (1.625, 2.875, 4.125, 5.375))):
-        expected = torch.tensor([0, *(1 - 2**-part for part in log), 1]).double()  # equal parts of 4 to 6, 1 to 6
-        torch.testing.assert_close(build_sampler(name, steps=5).times(), expected)
+def test_the_own_grid_of_renoise_is_late():
+    log = (1.625, 2.875, 4.125, 5.375)  # equal parts of 1 to 6
+    expected = torch.tensor([0, *(1 - 2**-part for part in log), 1]).double()
+    torch.testing.assert_close(build_sampler("renoise", steps=5).times(), expected)
 
 
 def test_a_run_notes_the_sampler_for_few():
     config = {"stage": {"name": "flow_map"}, "data": DATA, "seed": 0}
-    assert build_stage({**config, "few": {"name": "chord"}}, flow_map()).generator.few == build_sampler("chord")
-    with pytest.raises(InputError, match="cord"):
-        build_stage({**config, "few": {"name": "cord"}}, flow_map())
+    assert build_stage({**config, "few": {"name": "renoise"}}, flow_map()).generator.few == build_sampler("renoise")
+    with pytest.raises(InputError, match="renoize"):
+        build_stage({**config, "few": {"name": "renoize"}}, flow_map())
 
 
-DATA = {"name": "pairs", "batch_size": 4, "pairs": {"knots": 3}}
+DATA = {"name": "pairs", "batch_size": 4}
 
 
 def stage(data: dict = DATA, generator: RectifiedFlow | None = None, **options) -> LearnFlowMap:
@@ -181,23 +162,6 @@ def batch_of(**further) -> dict[str, torch.Tensor]:
     draws = torch.Generator().manual_seed(0)
     x_0, x_1 = torch.randn(2, 4, 2, 8, 32, generator=draws).unbind(0)
     return {"x_0": x_0, "x_1": x_1, "u": torch.rand(4, generator=draws), "k": torch.arange(4), **further}
-
-
-def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_path: Path):
-    """dx/dt = x: x_t = e^t x_0, and the mean velocity (e^s - e^t) / (s - t) x_0."""
-    options = PairOptions(sampler={"name": "adams3", "steps": 64}, num=6, knots=7, batch_size=2, parent="a")
-    store = PairStore(tmp_path, options, (2, 4, 8))
-    make_pairs(store, Field(lambda t, x: x, (2, 4, 8)))
-    dataset = PairDataset(store, store.usable(), 0, "training")
-    batch = torch.utils.data.default_collate([dataset[k, k] for k in range(6)])
-    assert batch["knots"].shape == (6, 7, 2, 4, 8)
-    t = torch.tensor([0.0, 0.11, 0.4, 0.63, 0.9, 1.0])
-    s = torch.tensor([1.0, 0.5, 0.9, 1.0, 1.0, 1.0])
-    paths, x_0, wide = paths_of(batch), batch["x_0"], (6, 1, 1, 1)
-    torch.testing.assert_close(paths.at(t), t.exp().view(wide) * x_0, rtol=1e-3, atol=1e-4)
-    t[-1] = s[-1] = 0.5
-    mean = torch.where(s == t, t.exp(), (s.exp() - t.exp()) / (s - t).clamp(min=1e-9))
-    torch.testing.assert_close(paths.mean_velocity(t, s), mean.view(wide) * x_0, rtol=1e-2, atol=2e-2)
 
 
 def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, tmp_path: Path):
@@ -218,11 +182,6 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
     other = PairOptions(num=6, sampler={"name": "sde"}, parent="a")
     with pytest.raises(InputError, match="sde"):
         make_pairs(PairStore(tmp_path / "other", other, exact.space.shape), exact)
-
-
-@pytest.mark.parametrize("method", ["chord", "renoise"])
-def test_a_map_s_own_pairs_need_no_knots(method):
-    assert stage({**DATA, "pairs": {"sampler": {"name": method}}}, objective="knots").objective is OBJECTIVES["knots"]
 
 
 @pytest.mark.parametrize("objective", list(OBJECTIVES))
@@ -264,7 +223,7 @@ def test_the_jump_from_noise_to_scan_is_regressed_on_pairs_alone(monkeypatch, na
 def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps_those_of_the_pairs(monkeypatch):
     noise, scan = torch.randn(2, 4, 2, 8, 32, generator=torch.Generator().manual_seed(1)).unbind(0)
     batch = batch_of(noise=noise, scan=scan)
-    learned = stage(objective="knots").eval()
+    learned = stage(objective="straight").eval()
     t, s = torch.tensor([0.0, 0.3, 0.5, 1.0]), torch.tensor([1.0, 0.3, 0.75, 1.0])
     learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
     asked, aims = list[torch.Tensor](), list[torch.Tensor]()
@@ -278,13 +237,11 @@ def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps
         torch.testing.assert_close(aims[0][row], slope[row])
 
 
-def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths(parent):
+def test_scans_beside_pairs_are_for_straight_lines(parent):
     scans = {"name": "simulated", "scenes": 4}
-    assert stage({**DATA, "scans": scans}, objective="knots").objective is not None
-    with pytest.raises(InputError, match=r"leave data\.scans out, or give stage\.objective=knots"):
+    assert stage({**DATA, "scans": scans}, objective="straight").objective is not None
+    with pytest.raises(InputError, match=r"leave data\.scans out, or give stage\.objective=straight"):
         stage({**DATA, "scans": scans})
-    with pytest.raises(InputError, match="times of data.pairs.knots=7 are equal in float32"):  # 1 - 8^-10 is 1
-        stage({**DATA, "pairs": {"knots": 7, "sampler": {"name": "adams3", "steps": 16, "grid": "power:10"}}})
     with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
         build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent)
     with pytest.raises(InputError, match=r"data\.scans needs the name of a data set"):
@@ -313,8 +270,6 @@ def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path
 
 
 def test_a_stage_of_jumps_says_what_it_lacks(parent):
-    with pytest.raises(InputError, match=r"data\.pairs\.knots=7"):
-        stage({**DATA, "pairs": {"knots": 0}}, objective="knots")
     with pytest.raises(InputError, match=r"leave stage\.time out"):
         stage(time={"name": "uniform"})
     with pytest.raises(InputError, match="'step'"):

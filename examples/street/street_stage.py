@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 
 from r2flow.flow.losses import LOSSES, absolute
-from r2flow.flow.maps import Aim
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import Generator
 from r2flow.registry import Portion
 from r2flow.stages import STAGES
 from r2flow.stages.base import Batch
-from r2flow.stages.flow_map import LearnFlowMap, paths_of
+from r2flow.stages.flow_map import LearnFlowMap
 
 
 def gradient_matching(v_t: Tensor, u_t: Tensor) -> Tensor:
@@ -30,7 +29,7 @@ def gradient_matching(v_t: Tensor, u_t: Tensor) -> Tensor:
 
 
 class LearnStreetMap(LearnFlowMap):
-    """Jumps on the paths of pairs; velocities, and from `ends_from` on jumps to s = 1, on scans.
+    """Jumps on the straight lines of pairs; velocities, and from `ends_from` on jumps to s = 1, on scans.
 
     On scans alone the jumps are those of the flow map that the run starts from.
 
@@ -44,7 +43,7 @@ class LearnStreetMap(LearnFlowMap):
         generator: Generator,
         end_loss: str = "gradient_matching",
         ends_from: Portion = 0.5,
-        objective: str = "knots",
+        objective: str = "straight",
         **options: Any,
     ) -> None:
         super().__init__(generator, objective, **options)
@@ -60,11 +59,10 @@ class LearnStreetMap(LearnFlowMap):
         of_scans = (t == s) | ((s == 1) & (t >= self.ends_from))
         if not self.on_pairs:
             s = torch.where(of_scans, s, t)
-        paths, x_0, x_1 = paths_of(batch), batch.get("noise", batch["x_0"]), batch.get("scan", batch["x_1"])
-        aim = Aim(paths.at(t), paths.mean_velocity(t, torch.where(of_scans, t, s)))
-        x_t, v = interpolate(x_0, x_1, t)
+        aim = interpolate(batch["x_0"], batch["x_1"], t)
+        x_t, v = interpolate(batch.get("noise", batch["x_0"]), batch.get("scan", batch["x_1"]), t)
         here = expand_time(of_scans | (not self.on_pairs), x_t)
-        x_t, target = torch.where(here, x_t, aim.x_t), torch.where(here, v, aim.target)
+        x_t, target = torch.where(here, x_t, aim[0]), torch.where(here, v, aim[1])
         estimate = self.generator.map()(t, x_t, s)  # type: ignore[operator]
         ends = (s == 1) & (t < s)
         of_ends, others = (self.loss_of_each(loss, estimate, target) for loss in (self.end_loss, self.loss))

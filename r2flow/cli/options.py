@@ -143,7 +143,7 @@ class SamplerOptions:
         str | None,
         typer.Option(
             help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: dopri5, torchdiffeq; "
-            "stochastic: sde; flow maps: jump, chord, renoise, refine; completion: transport, mmps, replace, repaint. "
+            "stochastic: sde; flow maps: jump, renoise, refine; completion: transport, mmps, replace, repaint. "
             "For other systems see docs/systems.md."
         ),
     ] = None

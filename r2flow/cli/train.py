@@ -36,14 +36,13 @@ def pairs(
     shard_mib: Annotated[float, typer.Option(min=0.001, help="Shard size in MiB.")] = 16.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     precision: PrecisionOption = "32-true",
-    knots: Annotated[int | None, typer.Option(min=1, help="Inner states to store per path, for flow maps.")] = None,
     device: DeviceOption = "auto",
 ) -> None:
     """Generate reflow pairs with a flow; several processes share the missing or damaged pairs.
 
     `python train.py experiment=reflow stage.init=RUN` generates pairs itself; this verb only generates, also under
     torchrun or as a SLURM array, with the settings of `data.pairs`. Default sampler: adams3 in 32 steps; the paper uses
-    --sampler dopri5. chord or renoise samples a flow map in several jumps, as targets for its first jump.
+    --sampler dopri5. renoise samples a flow map in several jumps, as targets for its first jump.
     """
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import PairStore, default_folder, make_pairs
@@ -60,7 +59,7 @@ def pairs(
     flow = parent.checkpoint
     options = {
         "sampler": {"name": "adams3", **how.given}, "precision": precision, "num": num, "batch_size": batch_size,
-        "shard_mib": shard_mib, "seed": seed, "knots": knots,
+        "shard_mib": shard_mib, "seed": seed,
     }  # fmt: skip
     chosen = PairOptions(**pairs_of(parent, options))
     store = PairStore(out or default_folder(flow.path), chosen, flow.encoding.shape, flow.generator.noise_shape)

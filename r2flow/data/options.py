@@ -84,14 +84,11 @@ class PairOptions:
     seed: Seed = 0  # seed of the noise, separate from the run's: runs of several seeds can share one set of pairs
     first: Seed | None = None  # index of the first pair; None: after the pairs that the flow itself was trained on
     precision: Precision = "32-true"  # precision of the network
-    knots: Natural | None = None  # number of inner states of each path to store with its pair, for stage=flow_map
     of: str | None = None  # the flow that draws the pairs; None: the flow of stage.init
     parent: str | None = None  # hash of the flow, filled in by the run
 
     def __post_init__(self) -> None:
-        sampler = build_sampler(self.sampler)
-        if self.knots:
-            sampler.knot_times(self.knots)
+        build_sampler(self.sampler)
 
 
 @dataclass(frozen=True)

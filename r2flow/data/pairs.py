@@ -17,9 +17,7 @@ from r2flow.data.loader import FlowDataset, Item, Permutations
 from r2flow.data.options import PairOptions
 from r2flow.errors import InputError, check
 from r2flow.files import telling
-from r2flow.flow.solvers import Solution
-from r2flow.generators import Flow, Generated, Generator, as_flow
-from r2flow.generators.base import autocast
+from r2flow.generators import Flow, Generator, as_flow
 from r2flow.models import name_of
 from r2flow.processes import place
 from r2flow.progress import Bar
@@ -48,14 +46,14 @@ class PairStore(Store):
         shape: tuple[int, int, int],
         noise_shape: tuple[int, ...] | None = None,
     ) -> None:
-        self.options, self.first, self.knots = options, options.first or 0, options.knots or 0
+        self.options, self.first = options, options.first or 0
         self.noise_shape, self.sampler = noise_shape or shape, build_sampler(options.sampler)
-        size = options.batch_size * 2 * math.prod(shape) * (1 + self.knots)
+        size = options.batch_size * 2 * math.prod(shape)
         self.shard_batches = max(round(options.shard_mib * 2**20 / size), 1)
         recipe = {
             "parent": options.parent or "", "shape": shape, "seed": options.seed, "first": self.first,
             "sampler": self.sampler.asdict(), "batch_size": options.batch_size, "shard_batches": self.shard_batches,
-            "noise_shape": None if self.noise_shape == shape else self.noise_shape, "knots": self.knots,
+            "noise_shape": None if self.noise_shape == shape else self.noise_shape,
             "precision": options.precision,
         }  # fmt: skip
         super().__init__(folder, "pairs", recipe)
@@ -93,9 +91,9 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
 
     The result is whether each pair that this process has drawn is usable.
 
-    x_1 is the generator's sample for x_0 = `store.noise`, neither clamped nor snapped, in half precision. With `chord`
-    or `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function
-    of (seed, index, step). Batches do not depend on the process: shards are byte-identical for any number of processes.
+    x_1 is the generator's sample for x_0 = `store.noise`, neither clamped nor snapped, in half precision. With
+    `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function of
+    (seed, index, step). Batches do not depend on the process: shards are byte-identical for any number of processes.
     """
     if generator.noise_shape != store.noise_shape:
         raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")
@@ -142,43 +140,34 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
 
 
 def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.ndarray]:
-    """The pairs first + [b B, (b + 1) B) of batch b: x_1, evaluations, usable and, with knots, the inner states.
+    """The pairs first + [b B, (b + 1) B) of batch b: x_1, evaluations and usable.
 
-    States are float16, (B, C, H, W) and (B, K, C, H, W); pairs whose states overflow float16 are not usable.
+    x_1 is float16, (B, C, H, W); pairs that overflow float16 are not usable.
     """
-    options, sampler, states = store.options, store.sampler, {}
+    options, sampler = store.options, store.sampler
     indices = range(store.first + batch * options.batch_size, store.first + (batch + 1) * options.batch_size)
     x_0 = torch.stack([store.noise(index) for index in indices]).to(generator.device)
-    end: Generated | Solution
-    if store.knots:
-        with autocast(generator.device, options.precision):
-            end = generator.solve(x_0, sampler=sampler, knots=store.knots)
-        assert end.knots is not None
-        states["knots"] = end.knots
-    else:
-        fresh = noise.Draws(options.seed, indices, "pairs") if sampler.draws else None
-        end = generator(x_0, sampler=sampler, draws=fresh, precision=options.precision)
-    states["x_1"] = end.x
-    tensors, usable = {"evaluations": end.evaluations.cpu().numpy().astype(np.int32)}, end.converged.cpu().numpy()
-    for name, values in states.items():
-        tensors[name] = values.to(torch.float16).cpu().numpy()
-        usable = usable & np.isfinite(tensors[name]).reshape(len(usable), -1).all(1)
-    return {**tensors, "usable": usable}
+    fresh = noise.Draws(options.seed, indices, "pairs") if sampler.draws else None
+    end = generator(x_0, sampler=sampler, draws=fresh, precision=options.precision)
+    x_1 = end.x.to(torch.float16).cpu().numpy()
+    return {
+        "evaluations": end.evaluations.cpu().numpy().astype(np.int32),
+        "x_1": x_1,
+        "usable": end.converged.cpu().numpy() & np.isfinite(x_1).all((1, 2, 3)),
+    }
 
 
 class PairDataset(Dataset[Item]):
     """Some pairs of a store as training items; u depends only on (seed, purpose, k).
 
-    The keys are those of `FlowDataset`; with stored knots also knots, (K, C, H, W), states of the path, and times,
-    (K + 2,), the times of x_0, the knots and x_1. Further keys with `scans`: scan, (C, H, W), a scan in model space,
-    and noise, (*noise_shape), independent of it.
+    The keys are those of `FlowDataset`. Further keys with `scans`: scan, (C, H, W), a scan in model space, and noise,
+    (*noise_shape), independent of it.
     """
 
     def __init__(
         self, store: PairStore, numbers: np.ndarray, seed: int, purpose: str, scans: FlowDataset | None = None
     ) -> None:
         self.store, self.numbers, self.seed, self.purpose, self.scans = store, numbers, seed, purpose, scans
-        self.times = {"times": store.sampler.knot_times(store.knots).float()} if store.knots else {}
         self.order = Permutations(0 if scans is None else len(scans), seed)
 
     def __getitem__(self, key: tuple[int, int]) -> Item:
@@ -186,10 +175,9 @@ class PairDataset(Dataset[Item]):
         store, number = self.store, int(self.numbers[index])
         shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
         with telling(path := store.files(shard)[0]), safe_open(path, framework="pt") as file:
-            names = ("x_1", "knots") if store.knots else ("x_1",)
-            states = {name: file.get_slice(name)[offset].float() for name in names}
+            x_1 = file.get_slice("x_1")[offset].float()
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
-        item = {"x_0": store.noise(store.first + number), **states, **self.times, "u": u, "k": torch.tensor(k)}
+        item = {"x_0": store.noise(store.first + number), "x_1": x_1, "u": u, "k": torch.tensor(k)}
         if self.scans is not None:
             scan = self.scans[k, self.order[k]]
             item |= {"scan": scan["x_1"], "noise": scan["x_0"]}

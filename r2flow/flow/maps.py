@@ -21,47 +21,11 @@ from r2flow.flow.times import build_density
 from r2flow.registry import Portion, Registry
 
 MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # u(t, x, s), in the argument order of backbones
-NEAREST = 4  # knots per interpolating polynomial: error of order 4 in their distance
 
 
 def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
     """X_{t->s}(x), (B, ...), for times of shape () or (B,)."""
     return x + expand_time(s - t, x) * u(t, x, s)
-
-
-class Paths:
-    """A path per scan through N >= 2 states, (B, N, ...), by a polynomial through the four nearest.
-
-    Times, (N,), increase. With only the two ends, the path is a straight line.
-    """
-
-    def __init__(self, times: Tensor, states: Tensor) -> None:
-        self.times, self.states = times.double(), states
-
-    def at(self, t: Tensor) -> Tensor:
-        """x_t, (B, ...), at times t, (B,)."""
-        return self._coefficient(0, t)
-
-    def velocity(self, t: Tensor) -> Tensor:
-        """dx_t / dt, (B, ...)."""
-        return self._coefficient(1, t)
-
-    def mean_velocity(self, t: Tensor, s: Tensor) -> Tensor:
-        """(x_s - x_t) / (s - t), (B, ...); the velocity where s = t."""
-        between = self.at(s) - self.at(t)
-        differ = s != t
-        mean = between / expand_time(torch.where(differ, s - t, 1), between)
-        return torch.where(expand_time(differ, mean), mean, self.velocity(t))
-
-    def _coefficient(self, power: int, t: Tensor) -> Tensor:
-        """Coefficient of (t' - t)^power, (B, ...), of the polynomials in t' through the n knots nearest to t, (B,)."""
-        times, n, t = self.times, min(NEAREST, len(self.times)), t.double()
-        interval = torch.searchsorted(times[1:-1].contiguous(), t.contiguous(), right=True)
-        first = (interval - (n // 2 - 1)).clamp(0, len(times) - n)
-        near = first[:, None] + torch.arange(n, device=t.device)
-        weights = torch.linalg.inv_ex(torch.linalg.vander(times[near] - t[:, None])).inverse[:, power].to(self.states)
-        states = self.states[torch.arange(len(t), device=t.device)[:, None], near]
-        return (weights.reshape(*near.shape, *[1] * (states.ndim - 2)) * states).sum(1)
 
 
 class JumpTimes:
@@ -120,21 +84,21 @@ class Aim(NamedTuple):
     target: Tensor
 
 
-Objective = Callable[[MeanVelocity, Paths, Tensor, Tensor, Tensor], Aim]
+Objective = Callable[[MeanVelocity, Tensor, Tensor, Tensor, Tensor, Tensor], Aim]  # of u, x_0, x_1, t, s, rho
 
 
-def along_knots(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """Target u(x_t, t, s) = (x_s - x_t) / (s - t) on the path of an earlier flow, interpolated from its knots."""
-    return Aim(paths.at(t), paths.mean_velocity(t, s))
+def straight(u: MeanVelocity, x_0: Tensor, x_1: Tensor, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
+    """Target u(x_t, t, s) = x_1 - x_0 on the straight line from x_0 to x_1, for every s: k-TD's regression."""
+    return Aim(*interpolate(x_0, x_1, t))
 
 
-def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
+def consistency(u: MeanVelocity, x_0: Tensor, x_1: Tensor, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
     """Target u(x_t, t, s) = rho v + (1 - rho) u(x_l, l, s), l = t + rho (s - t), x_l = x_t + rho (s - t) v.
 
     x_t lies on the straight line from x_0 to x_1, v = x_1 - x_0; the target has no gradient (Luo et al. 2025, SoFlow;
-    Zhang et al. 2025, alpha-Flow). rho = 1 is k-TD's regression; rho -> 0 gives MeanFlow.
+    Zhang et al. 2025, alpha-Flow). rho = 1 is `straight`; rho -> 0 gives MeanFlow.
     """
-    x_t, v = interpolate(paths.states[:, 0], paths.states[:, -1], t)
+    x_t, v = interpolate(x_0, x_1, t)
     target, learned = v.clone(), (rho < 1).nonzero()[:, 0]  # the only device synchronisation
     if len(learned):
         t, s, rho, v = t[learned], s[learned], rho[learned], v[learned]
@@ -148,6 +112,6 @@ def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor
 
 OBJECTIVES: Registry[Objective] = Registry(
     "objective of a flow map",
-    knots=along_knots,
+    straight=straight,
     consistency=consistency,
 )

@@ -1,7 +1,7 @@
 """Registry of samplers. A sampler is a frozen dataclass that runs a generator.
 
     build_sampler({"name": "adams3", "steps": 16})
-    build_sampler("chord", steps=2)
+    build_sampler("jump", steps=2)
 
 To add a sampler, derive a dataclass from `Sampler` and call `SAMPLERS.add(name, cls)`. Every solver in
 `r2flow.flow.solvers.SOLVERS` is also a sampler.
@@ -16,13 +16,13 @@ from r2flow.errors import InputError, check
 from r2flow.flow.solvers import SOLVERS, usual_grid
 from r2flow.registry import Registry, lazy
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _plain
-from r2flow.samplers.maps import Chord, Jump, Refine, Renoise, Transport
+from r2flow.samplers.maps import Jump, Refine, Renoise, Transport
 from r2flow.samplers.ode import Adaptive, FixedSteps, ODESampler, TorchDiffEq
 from r2flow.samplers.posterior import MMPS, Posterior, Repaint, Replace
 from r2flow.samplers.stochastic import SDE
 
 __all__ = [
-    "MMPS", "SAMPLERS", "SDE", "Adaptive", "Chord", "Condition", "FixedSteps", "Generated", "Jump", "Noise",
+    "MMPS", "SAMPLERS", "SDE", "Adaptive", "Condition", "FixedSteps", "Generated", "Jump", "Noise",
     "ODESampler", "OnGrid", "Posterior", "Progress", "Refine", "Renoise", "Repaint", "Replace", "Sampler",
     "TorchDiffEq", "Transport", "build_sampler", "parse_sampler", "split_samplers",
 ]  # fmt: skip
@@ -54,7 +54,6 @@ SAMPLERS = _Samplers(
     torchdiffeq=TorchDiffEq,
     sde=SDE,
     jump=Jump,
-    chord=Chord,
     renoise=Renoise,
     refine=Refine,
     transport=Transport,

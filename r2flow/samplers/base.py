@@ -91,10 +91,6 @@ class Sampler(ABC):
         if getattr(generator, "fixed", False) and self != generator.sampler:
             raise InputError(f"this model is distilled for {generator.sampler} alone: use these, or its parent flow.")
 
-    def knot_times(self, knots: int) -> Tensor:
-        """Times of x_0, of the inner states that a solution keeps, and of x_1, (knots + 2,) float64."""
-        raise InputError(f"sampler {self.name} keeps no inner states; give a fixed-step solver, such as adams3.")
-
     def changed(self, **options: Any) -> Self:
         """A copy with the options that are not None."""
         options = _plain(options)

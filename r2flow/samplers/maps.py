@@ -42,26 +42,7 @@ class Jump(OnGrid):
 
 
 @dataclass(frozen=True)
-class Chord(Jump):
-    """x_s = x_t + (s - t) u(x_t, t, 1), a point on the straight line to X_{t->1}(x_t).
-
-    This is DDIM's step (Song et al. 2021) with X_{t->1}(x_t) as the estimate of the scan: the next jump starts with
-    less of the same noise and corrects the estimate. It is exact if paths are straight. Otherwise x_s does not have
-    the flow's density at s, even for the exact map, and each jump adds grain to the reflectance.
-    """
-
-    steps: Steps = 2
-    grid: Grid | None = None  # type: ignore[assignment]  # None: `late`
-
-    def times(self) -> Tensor:
-        return late(self.steps, 1 / 2 if self.draws else 1 / 16) if self.grid is None else super().times()
-
-    def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
-        return x + (s - t) * u(t, x, torch.ones_like(t))
-
-
-@dataclass(frozen=True)
-class Renoise(Chord):
+class Renoise(Jump):
     """x_s = (1 - s) e + s X_{t->1}(x_t) with fresh noise e (Song et al. 2023, consistency models, algorithm 1).
 
     For the exact map of a 1-RF (not of a 2-RF), x_1 has the right distribution, but is not the end of the path of x_0.
@@ -71,6 +52,10 @@ class Renoise(Chord):
     draws: ClassVar[bool] = True
 
     steps: Steps = 8
+    grid: Grid | None = None  # type: ignore[assignment]  # None: `late`
+
+    def times(self) -> Tensor:
+        return late(self.steps, 1 / 2) if self.grid is None else super().times()
 
     def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
         return s * jump(u, t, x, torch.ones_like(t)) + (1 - s) * e

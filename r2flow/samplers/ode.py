@@ -6,8 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.errors import InputError, check
-from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, named_grid, solve
+from r2flow.errors import check
+from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, solve
 from r2flow.registry import Count, Portion, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Sampler
 
@@ -54,14 +54,6 @@ class FixedSteps(OnGrid, ODESampler):
         near = solve(v, noise, 0.0, t, progress=progress, **(self.options() | {"steps": self.steps - 1}))
         last = solve(v, near.x, t, steps=1, progress=progress)
         return Generated(last.x, near.evaluations + last.evaluations, near.converged & last.converged)
-
-    def knot_times(self, knots: int) -> Tensor:
-        if self.steps % (knots + 1) or self.finish or not isinstance(self.grid, str):
-            raise InputError(
-                f"{self} cannot keep {knots} inner states: give a named grid, no finish, and a multiple of "
-                f"{knots + 1} steps."
-            )
-        return named_grid(self.grid)(0.0, 1.0, knots + 1)
 
 
 @dataclass(frozen=True)

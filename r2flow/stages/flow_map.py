@@ -6,13 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError, check
-from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots
+from r2flow.errors import InputError
+from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, straight
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
 from r2flow.registry import Positive, construct
-from r2flow.samplers import Jump, build_sampler
+from r2flow.samplers import Jump
 from r2flow.stages.base import Batch
 from r2flow.stages.rectify import Reflow
 
@@ -20,10 +20,8 @@ from r2flow.stages.rectify import Reflow
 class LearnFlowMap(Reflow):
     """Flow map: regress u(x_t, t, s) onto the target of an objective of `r2flow.flow.maps`.
 
-    The data are pairs of a 1-RF or 2-RF, with inner states of their paths (`data.pairs.knots`) for the objective
-    `knots`. With additional scans (`data.scans`), velocities (s = t) are learned from the scans, as in `Rectify`, and
-    jumps from the pairs. Pairs drawn from a flow map by `chord` or `renoise` have no inner states; the objective
-    `knots` then takes straight lines.
+    The data are scans, or pairs of a 1-RF or 2-RF. With additional scans (`data.scans`) and the objective `straight`,
+    velocities (s = t) are learned from the scans, as in `Rectify`, and jumps from the pairs.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
@@ -55,44 +53,28 @@ class LearnFlowMap(Reflow):
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         self.on_pairs = data["name"] == "pairs"
-        pairs = (data.get("pairs") or {}) if self.on_pairs else {}
-        sampler, knots = build_sampler(pairs.get("sampler") or "adams3"), pairs.get("knots")
-        if self.objective is along_knots and not (knots or sampler.needs == "map"):
+        if data.get("scans") is not None and self.objective is not straight:
             raise InputError(
-                f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
-                "data.pairs.knots=7, or stage.objective=consistency."
+                f"stage.objective={self.objective_name} learns jumps from velocities of pairs, which are not those of "
+                "scans: leave data.scans out, or give stage.objective=straight."
             )
-        if data.get("scans") is not None and self.objective is not along_knots:
-            raise InputError(
-                f"stage.objective={self.objective_name} learns from straight lines between pairs, whose velocities are "
-                "not those of scans: leave data.scans out, or give stage.objective=knots."
-            )
-        differ = not knots or bool((sampler.knot_times(knots).float().diff() > 0).all())  # float32, as in batches
-        check(differ, f"times of data.pairs.knots={knots} are equal in float32: give fewer knots, or grid=uniform.")
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
         if not (self.training or self.on_pairs):
             t = s = self.jumps.velocities(u)  # scans have velocities only
         diagonal = t == s
-        paths, u_ts = paths_of(batch), self.generator.map(self.condition(batch))
+        x_0, x_1 = batch["x_0"], batch["x_1"]
+        u_ts = self.generator.map(self.condition(batch))
         if self.training:
             # With independent noise, x_1 is not the end of x_0's path.
             exact = diagonal | (self.on_pairs & (s - t == 1))
             rho = torch.where(exact, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
-            aim = self.objective(u_ts, paths, t, torch.where(diagonal, t, s), rho)
+            aim = self.objective(u_ts, x_0, x_1, t, torch.where(diagonal, t, s), rho)
         else:  # the same validation loss for all objectives
-            aim = along_knots(u_ts, paths, t, s, torch.ones_like(t))
+            aim = straight(u_ts, x_0, x_1, t, s, torch.ones_like(t))
         if "scan" in batch:
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
             mask = expand_time(diagonal, x_t)
             aim = Aim(torch.where(mask, x_t, aim.x_t), torch.where(mask, v, aim.target))
         return self.loss_of_each(self.loss, u_ts(t, aim.x_t, s), aim.target).mean()
-
-
-def paths_of(batch: Batch) -> Paths:
-    """The paths from x_0 to x_1 of a batch; straight lines if it has no inner states."""
-    ends = batch["x_0"][:, None], batch["x_1"][:, None]
-    if "knots" not in batch:
-        return Paths(torch.tensor([0.0, 1.0], device=batch["x_1"].device), torch.cat(ends, 1))
-    return Paths(batch["times"][0], torch.cat([ends[0], batch["knots"], ends[1]], 1))

@@ -1,23 +1,18 @@
-"""Flow maps as mathematics: paths by their knots, jump times, objectives against exact maps."""
+"""Flow maps as mathematics: jump times, objectives against exact maps."""
 
 import pytest
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, consistency
+from r2flow.flow.maps import OBJECTIVES, JumpTimes, consistency
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Straight
 from r2flow.generators.flow import Conditioned
 from tests.fields import Field
 
-TIMES = torch.tensor([0.0, 0.3, 0.55, 0.75, 0.9, 1.0], dtype=torch.float64)
 X_0 = torch.linspace(-2, 2, 12, dtype=torch.float64).view(3, 2, 2)
 T, S = torch.tensor([0.0, 0.37, 0.8], dtype=torch.float64), torch.tensor([1.0, 0.37, 0.81], dtype=torch.float64)
-
-
-def paths_of(function, times: Tensor = TIMES) -> Paths:
-    return Paths(times, torch.stack([function(X_0, t) for t in times], 1))
 
 
 def exact_map(problem):
@@ -30,26 +25,6 @@ def exact_map(problem):
         return torch.where(length == 0, problem(t, x), moved / torch.where(length == 0, 1.0, length))
 
     return u
-
-
-@pytest.mark.parametrize("degree", [1, 2, 3])
-def test_a_polynomial_path_is_known_exactly_from_its_knots(degree):
-    paths = paths_of(lambda x, t: x + 0.5 * t**degree, TIMES if degree > 1 else TIMES[[0, -1]])
-    t = torch.tensor([0.0, 0.41, 1.0], dtype=torch.float64)
-    slope = 0.5 * degree * t ** (degree - 1)
-    torch.testing.assert_close(paths.at(t), X_0 + expand_time(0.5 * t**degree, X_0), rtol=0, atol=1e-13)
-    torch.testing.assert_close(paths.velocity(t), expand_time(slope, X_0).expand_as(X_0), rtol=0, atol=1e-12)
-    means = [0.5, slope[1], 0.5 * (0.81**degree - 0.8**degree) / 0.01]
-    begin, end = torch.tensor([[0.0, 0.41, 0.8], [1.0, 0.41, 0.81]], dtype=torch.float64)
-    for row, mean in zip(paths.mean_velocity(begin, end), means, strict=True):
-        torch.testing.assert_close(row, torch.full_like(row, float(mean)), rtol=0, atol=1e-11)
-
-
-def test_between_knots_the_error_is_that_of_the_four_nearest():
-    paths = paths_of(lambda x, t: x * torch.sin(3 * t), torch.linspace(0, 1, 9, dtype=torch.float64))
-    for t in torch.linspace(0, 1, 81, dtype=torch.float64):
-        # The fourth derivative is at most 81, and between four knots h apart |(t - t_0) ... (t - t_3)| at most h^4.
-        assert (paths.at(t.expand(3)) - X_0 * torch.sin(3 * t)).abs().max() <= 2 * 81 / 24 / 8**4
 
 
 def test_jump_times_keep_their_shares():
@@ -100,18 +75,17 @@ def test_jump_times_that_cannot_be_are_refused(options):
 @pytest.mark.parametrize("rho", [0.0, 0.3, 1.0])
 def test_the_exact_map_of_a_straight_flow_is_what_every_objective_asks_for(name, rho):
     problem = Straight()
-    paths = paths_of(problem.solution)
     u = exact_map(problem)
-    x_t, target = OBJECTIVES[name](u, paths, T, S, torch.full_like(T, rho))
+    x_t, target = OBJECTIVES[name](u, X_0, problem.solution(X_0, 1.0), T, S, torch.full_like(T, rho))
     torch.testing.assert_close(x_t, problem.solution(X_0, T))
     torch.testing.assert_close(target, u(T, x_t, S))
 
 
 def test_consistency_ends_at_both_of_its_limits():
-    paths, u = paths_of(lambda x, t: x * (1 - t) + t**2), exact_map(Gaussian())
-    x_t, target = consistency(u, paths, T, S, torch.ones_like(T))
+    x_1, u = torch.ones_like(X_0), exact_map(Gaussian())
+    x_t, target = consistency(u, X_0, x_1, T, S, torch.ones_like(T))
     torch.testing.assert_close(target, 1 - X_0)  # k-TD's
-    x_t, target = consistency(u, paths, T, S, torch.zeros_like(T))
+    x_t, target = consistency(u, X_0, x_1, T, S, torch.zeros_like(T))
     torch.testing.assert_close(target, u(T, x_t, S))  # itself
 
 
@@ -124,13 +98,12 @@ def test_each_scan_is_asked_for_under_its_own_condition():
 
     u = Conditioned(Speeds(exact_map, (2, 2)), {"speed": torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)})
     rho = torch.where(T == S, 1.0, torch.zeros_like(T))
-    _, target = consistency(u, paths_of(lambda x, t: x + 7 * t, TIMES[[0, -1]]), T, S, rho)
+    _, target = consistency(u, X_0, X_0 + 7, T, S, rho)
     torch.testing.assert_close(target, expand_time(torch.tensor([1.0, 7.0, 3.0]).double(), X_0).expand_as(X_0))
 
 
 @pytest.mark.parametrize("name", list(OBJECTIVES))
 def test_a_target_has_no_gradient(name):
     weight = torch.ones((), dtype=torch.float64, requires_grad=True)
-    paths = paths_of(lambda x, t: x * torch.cos(2 * t) + t)
-    aim = OBJECTIVES[name](lambda t, x, s: weight * x, paths, T, S, torch.full_like(T, 0.3))
+    aim = OBJECTIVES[name](lambda t, x, s: weight * x, X_0, 1 - X_0, T, S, torch.full_like(T, 0.3))
     assert not any(part.requires_grad for part in aim)

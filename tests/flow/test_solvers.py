@@ -8,7 +8,7 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
-from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve, usual_grid
+from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve
 from r2flow.samplers import build_sampler
 from tests.fields import Field
 from tests.reference import assert_near, backbone_of, load_case
@@ -156,26 +156,3 @@ def test_a_scene_does_not_depend_on_its_neighbours(method):
     assert together.evaluations[3] == alone.evaluations[0]
     if method not in FIXED:
         assert together.evaluations[0] < together.evaluations[3]
-
-
-@pytest.mark.parametrize("method", ["euler", "adams3"])
-def test_knots_are_states_of_the_path(method):
-    """dx/dt = x: (1 + h)^n after n Euler steps, e^t else."""
-    x_0 = torch.tensor([[1.0, -2.0], [0.5, 3.0]], dtype=torch.float64)
-    grid = usual_grid(method)
-    found = solve(lambda t, x: x, x_0, method=method, steps=64, grid=grid, knots=3)
-    times = named_grid(grid)(0.0, 1.0, 4)[1:-1]
-    growth = (1 + 1 / 64) ** (64 * times) if method == "euler" else times.exp()
-    torch.testing.assert_close(found.knots, x_0[:, None] * growth[:, None], rtol=1e-4, atol=0)
-    whole = solve(lambda t, x: x, x_0, method=method, steps=64, grid=grid)
-    assert torch.equal(found.x, whole.x)
-    assert torch.equal(found.evaluations, whole.evaluations)
-    for wrong in ({"knots": 4}, {"knots": 64}, {"knots": -1}, {"knots": 1, "method": "dopri5"}):
-        with pytest.raises(InputError, match="knots need a fixed-step method"):
-            solve(logistic, x_0, steps=64, **wrong)
-
-
-def test_knots_that_a_sampler_does_not_have_are_refused():
-    for sampler in ("adams3:steps=10", "dopri5", "torchdiffeq:method=rk4", "jump", "adams3:steps=8:finish=0.1"):
-        with pytest.raises(InputError, match="inner states"):
-            build_sampler(sampler).knot_times(3)

@@ -99,7 +99,7 @@ def test_a_flow_draws_the_data_s_distribution(method):
 def test_what_needs_the_ode_says_so():
     flow = build_generator({**CONFIG, "generator": {"name": "flow_map"}}).eval()
     x_0 = torch.zeros(1, *flow.noise_shape)
-    for method in ("sde", "jump", "chord"):
+    for method in ("sde", "jump", "renoise"):
         with pytest.raises(InputError, match=f"sampler {method} does not follow the flow's paths"):
             flow.solve(x_0, sampler=build_sampler(method, steps=2))
 

@@ -50,7 +50,6 @@ def solve(
     max_evaluations: int = 20_000,
     max_step: float = 1.0,
     global_error: bool = False,
-    knots: int = 0,
 ) -> Solution:
     """Solve dx/dt = v(t, x) from x at t_0 to t_1, forward or backward in time.
 
@@ -78,7 +77,6 @@ def solve(
             pulses longer than 1/128.
         global_error: Estimate the error at t_1 of an adaptive method by a second solution at 1/60 of the tolerance; its
             evaluations are counted.
-        knots: Number of inner states to keep, at equal numbers of steps; for r2flow's fixed-step methods.
     """
     solver = method_of(method)
     check(math.isfinite(t_1 - t_0), f"a solution needs two times, found {t_0} and {t_1}.")
@@ -91,11 +89,9 @@ def solve(
     if t_0 == t_1 or not len(x):
         v.converged[:] = finite(x).cpu()
         error = torch.zeros(len(x), dtype=torch.float64, device="cpu") if global_error else None
-        return replace(v.solution(x, torch.stack([x] * knots, 1) if knots else None), global_error=error)
+        return replace(v.solution(x), global_error=error)
     times = uniform(t_0, t_1, 1) if solver.adapts else build_grid(grid, t_0, t_1, steps)
-    even = isinstance(solver, FixedStep) and knots > 0 and (len(times) - 1) % (knots + 1) == 0
-    check(even or knots == 0, f"{knots} knots need a fixed-step method of r2flow and a multiple of {knots + 1} steps.")
-    limits = Limits(tolerance, max_evaluations, max_step=max_step, knots=knots)
+    limits = Limits(tolerance, max_evaluations, max_step=max_step)
     solution = solver.solve(v, x, times, limits)
     if not (global_error and solver.adapts):
         return solution

@@ -64,7 +64,7 @@ class FixedStep:
     multistep: bool = False  # whether `step` makes such a function from the times of a solution, (N + 1,) float64
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
-        """Take the steps of a time grid, (N + 1,) float64; keep inner states at equal numbers of steps.
+        """Take the steps of a time grid, (N + 1,) float64.
 
         A scene whose state becomes non-finite keeps its last finite state; other scenes are not affected.
         """
@@ -74,14 +74,11 @@ class FixedStep:
         def inside(t: Tensor, state: Tensor) -> Tensor:
             return v(t.clamp(low, high), state)  # t + h can round to 1 + 1e-7
 
-        knots = limits.knots
-        alive, inner_states, interval = finite(x), [], (len(times) - 1) // (knots + 1)
-        for n, (t, h) in enumerate(zip(times[:-1].to(x), times.diff().to(x), strict=True)):  # moved once, not per step
-            if knots and n and n % interval == 0:
-                inner_states.append(x)
+        alive = finite(x)
+        for t, h in zip(times[:-1].to(x), times.diff().to(x), strict=True):  # moved once, not per step
             x, alive = stepped(x, step(inside, t, h, x), alive)
         v.accepted[:], v.converged[:] = len(times) - 1, alive.cpu()
-        return v.solution(x, torch.stack(inner_states, 1) if knots else None)
+        return v.solution(x)
 
 
 def euler(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:

@@ -30,7 +30,6 @@ class Solution:
     #: Estimated root mean square error over a scene's elements, (B,) float64; inf without an estimate for the scene;
     #: None if not requested.
     global_error: Tensor | None = None
-    knots: Tensor | None = None  #: inner states, (B, K, ...); None if not requested
 
 
 class Limits(NamedTuple):
@@ -40,7 +39,6 @@ class Limits(NamedTuple):
     max_evaluations: int  #: budget per scene
     tighter: float = 1.0  #: divisor of the attainable tolerance
     max_step: float = 1.0  #: longest step as a share of the interval
-    knots: int = 0  #: number of inner states to keep, in a fixed-step method
 
 
 class Spent(Exception):
@@ -107,10 +105,10 @@ class Evaluations:
         self.scenes = scenes
         self._velocity = selected(self._whole, torch.from_numpy(scenes))
 
-    def solution(self, x: Tensor, knots: Tensor | None = None) -> Solution:
+    def solution(self, x: Tensor) -> Solution:
         counts = self.counts, self.accepted, self.rejected, self.stiff, self.converged
         evaluations, accepted, rejected, stiff, converged = (torch.from_numpy(count) for count in counts)
-        return Solution(x, evaluations, accepted, rejected, stiff, converged, knots=knots)
+        return Solution(x, evaluations, accepted, rejected, stiff, converged)
 
 
 def selected(velocity: V, scenes: Tensor) -> V:
