@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-dependencies = ["torch", "numpy", "safetensors", "yaml", "filelock", "rich"]
+dependencies = ["torch", "numpy", "safetensors", "pydantic", "omegaconf", "yaml", "filelock", "rich"]
 
 
 def street(device: str = "cpu"):

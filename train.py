@@ -3,7 +3,7 @@
     python train.py
     python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small
     python train.py experiment=r2flow_1rf data.root=KITTI-360 trainer=ddp
-    python train.py experiment=r2flow_2rf stage.init=runs/r2flow_1rf trainer=ddp
+    python train.py experiment=r2flow_2rf stage.parent=runs/r2flow_1rf trainer=ddp
     python train.py experiment=r2flow data.root=KITTI-360 trainer=ddp
     python train.py -m backbone=hdit_tiny,hdit_small seed=1,2,3
     python train.py --plugin my.module stage=my_stage

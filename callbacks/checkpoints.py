@@ -44,32 +44,42 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 class Checkpoints(Checkpoint):
-    """A checkpoint every `every` steps and one at the last step; the newest `keep` remain."""
+    """A checkpoint every `every` steps and one at the last step; the newest `keep` remain.
 
-    def __init__(self, run_dir: str | Path, every: Count = 100, keep: Count = 2) -> None:
-        self.run_dir, self.every, self.keep = Path(run_dir), every, keep
-        self._saved, self._stop = 0, False
+    They are `checkpoints/step-XXXXXXXX.ckpt` in the trainer's `default_root_dir`.
+    """
+
+    def __init__(self, every: Count = 100, keep: Count = 2) -> None:
+        self.every = every
+        self.keep = keep
+        self._saved = 0
+        self._stop = False
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         stop = self._stop or trainer.should_stop  # after a whole step: no run can resume within one
-        trainer.should_stop, self._stop = stop and stepped, stop and not stepped
+        trainer.should_stop = stop and stepped
+        self._stop = stop and not stepped
         if stepped and trainer.global_step % self.every == 0:
             self.save(trainer)
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if trainer.global_step > self._saved:
+        if trainer.should_stop or trainer.global_step >= trainer.estimated_stepping_batches:
             self.save(trainer)
 
     def save(self, trainer: L.Trainer) -> None:
         """Save the current step, and delete old checkpoints."""
-        step = self._saved = trainer.global_step
-        trainer.save_checkpoint(self.run_dir / FOLDER / f"step-{step:08d}.ckpt", weights_only=False)
+        step = trainer.global_step
+        if step == self._saved:
+            return
+        self._saved = step
+        run = trainer.default_root_dir
+        trainer.save_checkpoint(Path(run, FOLDER, f"step-{step:08d}.ckpt"), weights_only=False)
         if trainer.is_global_zero:
-            for path in checkpoints_of(self.run_dir):
+            for path in checkpoints_of(run):
                 if step_of(path) > step:  # damaged: the run could not resume from it
                     path.rename(path.with_suffix(".damaged"))
-            for old in checkpoints_of(self.run_dir)[self.keep :]:
+            for old in checkpoints_of(run)[self.keep :]:
                 old.unlink(missing_ok=True)

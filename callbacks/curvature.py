@@ -7,7 +7,7 @@ from r2flow.generators import Flow
 from r2flow.noise import Draws
 from r2flow.registry import Count, Natural
 
-from .periodic import Periodic
+from .periodic import Periodic, seed_of
 
 
 class Curvature(Periodic):
@@ -22,15 +22,16 @@ class Curvature(Periodic):
         steps: Euler steps per scan.
     """
 
-    def __init__(self, seed: int, every: Natural = 500, num: Count = 2, steps: Count = 16) -> None:
+    def __init__(self, every: Natural = 500, num: Count = 2, steps: Count = 16) -> None:
         super().__init__(every)
-        self.seed, self.num, self.steps = seed, num, steps
+        self.num = num
+        self.steps = steps
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         flow = pl_module.generator
         if not isinstance(flow, Flow) or not flow.draws or flow.fixed:
             return
-        x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
+        x_0 = Draws(seed_of(pl_module), range(self.num)).start(flow.noise_shape).to(pl_module.device)
         result = straightness(flow.velocity, x_0, self.steps)
         values = {"curvature/s": result.s.mean().item(), "curvature/bend": result.s_normalised.mean().item()}
         for logger in trainer.loggers:

@@ -51,9 +51,13 @@ class EMA(WeightAveraging):
     ) -> None:
         # Buffers are not averaged: most are constants (ray angles, frequencies), the others counters.
         super().__init__(use_buffers=False, avg_fn=self._average)
-        self.decay, self.every, self.warmup_steps = decay, every, warmup_steps
+        self.decay = decay
+        self.every = every
+        self.warmup_steps = warmup_steps
         self._decay_at = DECAYS[rule]
-        self._step, self._end, self._copies = 0, -1, False
+        self._step = 0
+        self._end: float = -1
+        self._copies = False
 
     def _decay(self) -> float:
         """Decay after step `_step`, counted from 0."""
@@ -71,13 +75,17 @@ class EMA(WeightAveraging):
         return before == step_idx or self._copies
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        self._device, self._end = trainer.strategy.root_device, trainer.max_steps - 1  # the module moves there later
+        self._device = trainer.strategy.root_device  # the module moves there later
         trainer.precision_plugin.convert_module(pl_module)  # as the strategy does later: the average has its type
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
             self._average_model.n_averaged.fill_(1)  # at 0 the base class copies the weights, whatever the rule
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._end = trainer.estimated_stepping_batches - 1
         if self.warmup_steps is None:
-            self.warmup_steps = int(getattr(pl_module, "warmup_steps", 0))
+            images = pl_module.hparams.get("warmup_images", 0)
+            self.warmup_steps = images // pl_module.images_per_step if images else 0
 
 
 def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:
@@ -95,14 +103,18 @@ class HalfLifeEMA(EMA):
     images seen so far if that is less (`half_life_decay`).
 
     Args:
-        batch_size: Images per step.
         half_life: Half-life in images.
         rampup: Upper limit of the half-life, as a share of the images seen.
     """
 
-    def __init__(self, batch_size: int, half_life: Positive = 10_000.0, rampup: Positive = 0.05) -> None:
+    def __init__(self, half_life: Positive = 10_000.0, rampup: Positive = 0.05) -> None:
         super().__init__(every=1, warmup_steps=0)
-        self.batch_size, self.half_life, self.rampup = batch_size, half_life, rampup
+        self.half_life = half_life
+        self.rampup = rampup
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        super().on_train_start(trainer, pl_module)
+        self.batch_size = pl_module.images_per_step
 
     def _decay(self) -> float:
         return half_life_decay(self._step + 1, self.batch_size, self.half_life, self.rampup)

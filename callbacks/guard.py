@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any, NoReturn
 
 import lightning as L
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
-from r2flow.data.loader import RunLoader
+from r2flow.data.loader import RunSampler
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count, NonNegative
@@ -32,7 +31,6 @@ class Guard(L.Callback):
     Checkpoints with non-finite weights are not written; the run stops instead.
 
     Args:
-        run_dir: The run's folder, with the last good checkpoint.
         skips: Number of steps skipped in a row after which the run stops.
         lowest_scale: Smallest valid loss scale of 16-mixed.
 
@@ -41,9 +39,11 @@ class Guard(L.Callback):
         total: Steps skipped in the run, except those that only adjusted the loss scale.
     """
 
-    def __init__(self, run_dir: str | Path, skips: Count = 10, lowest_scale: NonNegative = 1.0) -> None:
-        self.run_dir, self.skips, self.lowest_scale = Path(run_dir), skips, lowest_scale
-        self.in_a_row = self.total = 0
+    def __init__(self, skips: Count = 10, lowest_scale: NonNegative = 1.0) -> None:
+        self.skips = skips
+        self.lowest_scale = lowest_scale
+        self.in_a_row = 0
+        self.total = 0
         self._losses: list[Tensor] = []
         self._found: list[bool] = []  # whether the gradients are finite, per optimiser in this step
 
@@ -88,7 +88,7 @@ class Guard(L.Callback):
                 trainer,
                 f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss or gradient, "
                 f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; {scaled}; "
-                f"{describe_batch(trainer)}. {self._last_good()} Look at these scans; {hint}try, in a run of another "
+                f"{describe_batch(trainer)}. {last_good(trainer)} Look at these scans; {hint}try, in a run of another "
                 "name, a lower stage.learning_rate.",
             )
         if trainer.is_global_zero and not overflow:
@@ -107,7 +107,7 @@ class Guard(L.Callback):
                 self._end(
                     trainer,
                     f"stopped at step {trainer.global_step}: the {what} are no longer finite ({broken[0]} first, "
-                    f"{len(broken)} of {len(learned)}), so no checkpoint was written. {self._last_good()} "
+                    f"{len(broken)} of {len(learned)}), so no checkpoint was written. {last_good(trainer)} "
                     "Start under another name with a lower stage.learning_rate.",
                 )
 
@@ -116,17 +116,19 @@ class Guard(L.Callback):
             outlive_parent()
         raise InputError(message)
 
-    def _last_good(self) -> str:
-        newest = next(iter(checkpoints_of(self.run_dir)), None)
-        if newest is None:
-            return "There is no checkpoint to resume from yet."
-        return f"The last good checkpoint is {newest}, from which the same command resumes."
-
     def state_dict(self) -> dict[str, Any]:
         return {"in_a_row": self.in_a_row, "total": self.total}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.in_a_row, self.total = state_dict["in_a_row"], state_dict["total"]
+
+
+def last_good(trainer: L.Trainer) -> str:
+    """Sentence about the newest checkpoint of the run."""
+    newest = next(iter(checkpoints_of(trainer.default_root_dir)), None)
+    if newest is None:
+        return "There is no checkpoint to resume from yet."
+    return f"The last good checkpoint is {newest}, from which the same command resumes."
 
 
 def describe_gradients(module: torch.nn.Module) -> str:
@@ -138,14 +140,13 @@ def describe_gradients(module: torch.nn.Module) -> str:
 
 def describe_batch(trainer: L.Trainer) -> str:
     """Describe the images and scans of the current step, on all devices and in all accumulated batches."""
-    loader = trainer.train_dataloader
-    if not isinstance(loader, RunLoader):
+    sampler = getattr(trainer.train_dataloader, "sampler", None)
+    if not isinstance(sampler, RunSampler):
         return "images unknown to the loader"
-    sampler: Any = loader.batch_sampler
-    size = trainer.accumulate_grad_batches * sampler.batch_size
-    images = range(sampler.images)[trainer.global_step * size :][:size]
+    size = trainer.datamodule.batch_size  # type: ignore[attr-defined]
+    images = range(trainer.global_step * size, (trainer.global_step + 1) * size)
     scans = ", ".join(str(sampler.order[k]) for k in images[:16]) + (", ..." if len(images) > 16 else "")
-    return f"images k = {images[0]} to {images[-1]}, scans {scans}" if images else "no images"
+    return f"images k = {images[0]} to {images[-1]}, scans {scans}"
 
 
 def _not_finite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:

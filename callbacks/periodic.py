@@ -23,7 +23,8 @@ class Periodic(L.Callback, ABC):
     """
 
     def __init__(self, every: int) -> None:
-        self.every, self._last = every, 0
+        self.every = every
+        self._last = 0
 
     @abstractmethod
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -36,42 +37,63 @@ class Periodic(L.Callback, ABC):
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
-        due = self.every > 0 and step > 0 and (step % self.every == 0 or step == trainer.max_steps)
-        # With gradient accumulation a step spans several batches: act once per step.
-        if due and trainer.is_global_zero and step != self._last:
-            self._last, training = step, pl_module.training
-            with averaged_weights(trainer, pl_module), torch.no_grad():
-                pl_module.eval()
-                self.act(trainer, pl_module)
-                pl_module.train(training)
+        last = step == trainer.estimated_stepping_batches
+        if self.every > 0 and (step % self.every == 0 or last):
+            self._act_once(trainer, pl_module)
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if self.every > 0:  # as of a run that was stopped early
+            self._act_once(trainer, pl_module)
+
+    def _act_once(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Act at this step, unless it was done: with gradient accumulation a step spans several batches."""
+        if not trainer.is_global_zero or trainer.global_step in (0, self._last):
+            return
+        self._last = trainer.global_step
+        training = pl_module.training
+        with averaged_weights(trainer, pl_module), torch.no_grad():
+            pl_module.eval()
+            self.act(trainer, pl_module)
+            pl_module.train(training)
+
+
+def seed_of(module: L.LightningModule) -> int:
+    """The seed of a stage; 0 of other modules."""
+    return int(module.hparams.get("seed", 0))
 
 
 class SamplePictures(Periodic):
     """Draws a few scans, always from the same noise, into the run's folder and its loggers.
 
+    They are `pictures/step-XXXXXXXX.png` in the trainer's `default_root_dir`.
+
     Args:
-        folder: Folder of `step-XXXXXXXX.png`.
         every: Steps between two pictures; 0 for none.
         num: Scans per picture.
         steps: Steps per scan; None: the generator's default sampler.
     """
 
-    def __init__(
-        self, folder: str | Path, seed: int, every: Natural = 500, num: Count = 4, steps: Count | None = None
-    ) -> None:
+    def __init__(self, every: Natural = 500, num: Count = 4, steps: Count | None = None) -> None:
         super().__init__(every)
-        self.folder, self.seed, self.num, self.steps = Path(folder), seed, num, steps
+        self.num = num
+        self.steps = steps
 
     def sampler(self, generator: Generator) -> Sampler:
         """The sampler of the pictures; refuses `steps` that the generator's sampler does not have."""
         return generator.choose(steps=None if generator.fixed else self.steps)
 
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        generator: Generator = pl_module.generator  # type: ignore[assignment]
+        if self.every and generator.draws:
+            self.sampler(generator)  # refuses wrong steps before training
+
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        step, path = trainer.global_step, self.folder / f"step-{trainer.global_step:08d}.png"
+        step = trainer.global_step
+        path = Path(trainer.default_root_dir, "pictures", f"step-{step:08d}.png")
         generator: Generator = pl_module.generator  # type: ignore[assignment]
         if path.exists() or not generator.draws:
             return
-        drawn = draw(generator, range(self.num), self.seed, self.sampler(generator))
+        drawn = draw(generator, range(self.num), seed_of(pl_module), self.sampler(generator))
         figure = contact_sheet(list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"])
         save_figure(figure, path)
         log_picture(trainer.loggers, "samples", figure_pixels(figure), step)

@@ -15,7 +15,9 @@ class Progress(ProgressBar):
 
     def __init__(self, seconds: NonNegative = 15.0) -> None:
         super().__init__()
-        self.seconds, self.is_enabled = seconds, True
+        self.seconds = seconds
+        self.is_enabled = True
+        self._total = 0
         self._bar: Bar | None = None
         self._noted = 0.0
 
@@ -23,7 +25,9 @@ class Progress(ProgressBar):
         self.is_enabled = False
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._bar = Bar("training", trainer.max_steps, "steps", None if self.is_enabled else False, every=self.seconds)
+        steps = trainer.estimated_stepping_batches
+        self._total = int(steps) if steps < float("inf") else 0
+        self._bar = Bar("training", self._total, "steps", None if self.is_enabled else False, every=self.seconds)
         self._bar.live.transient = False
         self._bar.start()
         self._bar.set(trainer.global_step)
@@ -32,7 +36,7 @@ class Progress(ProgressBar):
         assert self._bar is not None
         if trainer.global_step == self._bar.tasks[0].completed:
             return  # within a step: the losses are those of a part of its batch
-        if trainer.global_step >= trainer.max_steps:
+        if trainer.global_step == self._total:
             self._noted = self._bar.every = 0.0  # the last figures are always written
         note, now = None, time.monotonic()
         if now - self._noted >= min(self.seconds, 1):  # reading a loss waits for the GPU

@@ -4,22 +4,26 @@ import lightning as L
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.pairs import make_pairs
+from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.lineage import find_parent
 
 
 class ReflowPairs(L.Callback):
     """Draws missing or damaged pairs of the run's data at its start, on all devices.
 
-    Args:
-        of: The flow that draws the pairs (`data.pairs.of`, else `stage.init`); None if the run has no parent.
+    They are drawn by the flow `pairs.of` of the DataModule, else by the stage's parent.
     """
-
-    def __init__(self, of: str | None) -> None:
-        self.of = of
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
-        if not isinstance(data, ScanDataModule) or data.pairs is None or self.of is None:
+        if not isinstance(data, ScanDataModule) or data.pairs is None:
             return
-        # File locks, not a barrier: collective calls time out after half an hour, and a slow rank may take longer.
-        make_pairs(data.pair_store, load_checkpoint(self.of).generator.to(trainer.strategy.root_device))
+        if data.pairs.of is None and not pl_module.hparams.get("parent"):
+            raise InputError("pairs are drawn by a trained flow: give the stage a parent, or pairs={'of': RUN}.")
+        record = find_parent(data.pairs.of).record() if data.pairs.of else pl_module.hparams["parent"]
+        data.drawn_by(record)
+        store = data.pair_store
+        if store.missing_pairs():
+            # File locks, not a barrier: collective calls time out after half an hour, and a slow rank may take longer.
+            make_pairs(store, load_checkpoint(record["path"]).generator.to(trainer.strategy.root_device))

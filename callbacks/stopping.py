@@ -38,8 +38,9 @@ class Stopping(L.Callback):
         every: Steps between two checks whether any device received a signal; a single device checks every step.
     """
 
-    def __init__(self, run_dir: str | Path, every: Count = 10) -> None:
-        self.run_dir, self.every = Path(run_dir), every
+    def __init__(self, every: Count = 10) -> None:
+        self.every = every
+        self.run_dir = Path()  # of the trainer
         self.job = slurm_job()
         self.told: int | None = None
         self._process = os.getpid()
@@ -71,6 +72,7 @@ class Stopping(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._training = True
+        self.run_dir = Path(trainer.default_root_dir)
         with suppress(ValueError):  # only the main thread can set handlers
             hear(self.hear, self.signals)
 
@@ -87,10 +89,10 @@ class Stopping(L.Callback):
             for number in self.signals if received else ():  # all devices stop for the same signal
                 if trainer.strategy.reduce_boolean_decision(self.told == number, all=False):
                     self.told = number
-        if received and trainer.global_step < trainer.max_steps:
+        if received and trainer.global_step < trainer.estimated_stepping_batches:
             if trainer.checkpoint_callbacks:  # a plug-in's own callback does not save where the run stops
                 ours = (callback for callback in trainer.checkpoint_callbacks if isinstance(callback, Checkpoints))
-                next(ours, Checkpoints(self.run_dir, keep=sys.maxsize)).save(trainer)
+                next(ours, Checkpoints(keep=sys.maxsize)).save(trainer)
             self._training = False
             trainer._logger_connector.update_train_step_metrics()  # as Lightning does after the callbacks
             environment = getattr(trainer.strategy, "cluster_environment", None)

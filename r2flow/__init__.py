@@ -8,18 +8,52 @@ Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1
     scan = r2flow.read("000000.bin", "vlp16")  # a scan file as such an image, (2, H, W)
 """
 
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     import torch
 
+    from r2flow.backbones import BACKBONES
+    from r2flow.data.datamodule import ScanDataModule
     from r2flow.lidar.sensors import Sensor
     from r2flow.model.checkpoint import Checkpoint
+    from r2flow.stages import STAGES, Distill, LearnFlowMap, Rectify, Reflow, Stage, Transfer
 
 __version__ = "0.2.0"
-__all__ = ["__version__", "load", "read"]
+
+# Imported at their first use, so that `import r2flow` is fast.
+_PLACES = {
+    "BACKBONES": "r2flow.backbones",
+    "ScanDataModule": "r2flow.data.datamodule",
+    **dict.fromkeys(
+        ("STAGES", "Distill", "LearnFlowMap", "Rectify", "Reflow", "Stage", "Transfer"), "r2flow.stages"
+    ),
+}
+
+__all__ = [
+    "BACKBONES",
+    "STAGES",
+    "Distill",
+    "LearnFlowMap",
+    "Rectify",
+    "Reflow",
+    "ScanDataModule",
+    "Stage",
+    "Transfer",
+    "__version__",
+    "load",
+    "read",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'r2flow' has no attribute {name!r}")
+    return getattr(import_module(_PLACES[name]), name)
 
 
 def __dir__() -> list[str]:
@@ -42,7 +76,10 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
 
 
 def read(
-    path: "str | Path", sensor: "Sensor | str | None" = None, reflectance_scale: float | None = None
+    path: "str | Path",
+    sensor: "Sensor | str | None" = None,
+    reflectance_scale: float | None = None,
+    columns: "Sequence[str] | None" = None,
 ) -> "torch.Tensor":
     """Read a scan from a file: range in metres and reflectance, (2, H, W) float32, 0 for rays without a return.
 
@@ -53,10 +90,11 @@ def read(
         reflectance_scale: Value of full reflectance in the file. Default: the sensor's, else the first of 1, 100 (with
             a warning), 255, 256, 65535 that no value exceeds or, with a warning, about the largest value if that is
             below a tenth of it. Fractions of 1 are not divided by 100, 255, 256 or 65535.
+        columns: Names of the columns of a file without names, as ("x", "y", "z", "intensity", "_").
 
     Raises:
         InputError: the file cannot be read, or no point is in the sensor's field of view.
     """
     from r2flow.data.opening import read
 
-    return read(path, sensor, reflectance_scale)
+    return read(path, sensor, reflectance_scale, columns)

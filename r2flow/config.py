@@ -1,4 +1,4 @@
-"""Rules of config keys: whether a key may change on resume, is inherited by a child, and applies to links of a chain.
+"""Rules of config keys: whether a key may change on resume, and which links of a chain it applies to.
 
 Constructors document and type the keys; defaults are in `conf/`. A key without an entry in `RULES` follows its
 innermost group with one, else the defaults of `Key`.
@@ -18,9 +18,6 @@ class Key:
     """Rule of a config key."""
 
     resume: Literal["fixed", "free"] = "fixed"  #: `free`: may differ on resume, since it does not affect the result
-    #: Whether a run with `stage.init` takes its parent's value: `always`, `unless_given` on the command line, or
-    #: `with_pairs`: always with pairs, which are images of the parent, else unless given.
-    inherited: Literal["no", "always", "unless_given", "with_pairs"] = "no"
     #: Links of a chain that take the key from the chain's command line: `all`, those that read `scans` (others inherit
     #: from them), those trained on `pairs`, or none, for keys of the `chain`.
     links: Literal["all", "scans", "pairs", "chain"] = "all"
@@ -28,32 +25,31 @@ class Key:
 
 FREE = Key(resume="free")
 OF_THE_CHAIN = Key(resume="free", links="chain")
-OF_THE_MODEL = Key(inherited="always", links="scans")
 OF_SCANS = Key(links="scans")
+OF_PAIRS = Key(links="pairs")
 
 RULES: dict[str, Key] = {
     **dict.fromkeys(("experiment", "size", "hydra", "name", "run_dir", "chain", "preview"), OF_THE_CHAIN),
-    **dict.fromkeys(("plugins", "loggers", "samples", "sampler", "few", "parent.path", "stage.init"), FREE),
-    "sensor": replace(OF_THE_MODEL, inherited="with_pairs"),
-    "encoding": OF_THE_MODEL,
-    "encoding.levels": replace(OF_THE_MODEL, inherited="unless_given"),
-    "generator": Key(inherited="unless_given", links="scans"),  # see `lineage.generator_of`
-    "backbone": OF_THE_MODEL,
-    "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # does not affect the weights' shapes
-    "backbone.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
-    **dict.fromkeys(("data", "data.validation.data"), OF_SCANS),
+    **dict.fromkeys(("plugins", "loggers", "samples", "sampler", "few"), FREE),
+    **dict.fromkeys(("stage.parent.path", "stage.parent.pairs"), FREE),
+    **dict.fromkeys(("sensor", "encoding", "generator", "backbone", "data", "data.validation.data"), OF_SCANS),
     **dict.fromkeys(("data.root", "data.parts.*.root", "data.validation.data.root"), replace(OF_SCANS, resume="free")),
     **dict.fromkeys(("data.validation", "data.batch_size"), Key()),
     **dict.fromkeys(("data.workers", "data.memory_gib"), FREE),
-    **dict.fromkeys(("data.pairs", "data.scans"), Key(links="pairs")),
+    **dict.fromkeys(("data.pairs", "data.scans"), OF_PAIRS),
     # data.pairs.parent identifies the flow that draws them.
-    **dict.fromkeys(("data.pairs.of", "data.scans.root"), Key(links="pairs", resume="free")),
-    **{f"callbacks.{name}": FREE for name in
-       ("reflow_pairs", "pictures", "curvature", "guard", "requeue", "checkpoint", "progress")},
-    **{f"trainer.{name}": FREE for name in
-       ("accelerator", "strategy", "devices", "num_nodes", "precision", "default_root_dir", "enable_progress_bar",
-        "log_every_n_steps", "max_time", "profiler", "val_check_interval")},
-}  # fmt: skip
+    **dict.fromkeys(("data.pairs.of", "data.scans.root"), replace(OF_PAIRS, resume="free")),
+    **dict.fromkeys(
+        (
+            *("callbacks.reflow_pairs", "callbacks.pictures", "callbacks.curvature", "callbacks.guard"),
+            *("callbacks.requeue", "callbacks.checkpoint", "callbacks.progress"),
+            *("trainer.accelerator", "trainer.strategy", "trainer.devices", "trainer.num_nodes", "trainer.precision"),
+            *("trainer.default_root_dir", "trainer.enable_progress_bar", "trainer.log_every_n_steps"),
+            *("trainer.max_time", "trainer.profiler", "trainer.val_check_interval"),
+        ),
+        FREE,
+    ),
+}
 
 
 def rule(key: str) -> Key:

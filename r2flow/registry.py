@@ -1,37 +1,46 @@
-"""Registries of named constructors, with errors that list the known names and options."""
+"""Registries of named constructors, and their options, checked by pydantic against the constructors' signatures."""
 
-import dataclasses
 import difflib
 import inspect
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial, reduce
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import cache, partial
+from importlib.resources import files
 from pkgutil import resolve_name
-from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, TypeVar
 
-from r2flow.errors import InputError, check
+from omegaconf import OmegaConf
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from pydantic.dataclasses import dataclass as checked_dataclass
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
+
+from r2flow.errors import InputError
 
 T = TypeVar("T")
 
 MISSING = "???"  # OmegaConf's mandatory value
-LARGEST = sys.float_info.max  # whole numbers can be larger
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+
+Count = Annotated[int, Field(ge=1)]
+Natural = Annotated[int, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Portion = Annotated[float, Field(ge=0, lt=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+# A frozen dataclass of options whose values are checked, also by Python callers.
+options_class = partial(checked_dataclass, frozen=True, config=STRICT)
 
 
-class Bound(NamedTuple):
-    """Range of an option's value, in its annotation: `width: Annotated[int, Bound("below 9", lambda n: n < 9)]`."""
+def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:  # noqa: N802 (as pydantic's Field)
+    """Range of an option, in its annotation: `width: Annotated[int, Bound("odd", lambda n: n % 2)]`."""
 
-    words: str
-    holds: Callable[[Any], bool]
+    def validate(value: Any) -> Any:
+        if not holds(value):
+            raise ValueError(f"must be {words}")
+        return value
 
-
-Count = Annotated[int, Bound("of at least 1", lambda n: n >= 1)]
-Natural = Annotated[int, Bound("of at least 0", lambda n: n >= 0)]
-Positive = Annotated[float, Bound("above 0", lambda x: x > 0)]
-NonNegative = Annotated[float, Bound("of at least 0", lambda x: x >= 0)]
-Seed = Annotated[int, Bound("of at least 0 and below 2^63", lambda n: 0 <= n < 2**63)]
-Portion = Annotated[float, Bound("in [0, 1)", lambda x: 0 <= x < 1)]
-Share = Annotated[float, Bound("in [0, 1]", lambda x: 0 <= x <= 1)]
+    return AfterValidator(validate)
 
 
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
@@ -56,7 +65,7 @@ def lazy(place: str, *given: Any) -> Any:
 
 
 class Registry(Mapping[str, T]):
-    """Named values of one kind.
+    """Named values of one kind, and the names of the files in conf/KIND/, which stand for one of them with options.
 
     BACKBONES = Registry("backbone", hdit=HDiT, adm_unet=ADMUNet)
     BACKBONES["hditt"]
@@ -75,13 +84,12 @@ class Registry(Mapping[str, T]):
 
     def __getitem__(self, name: str) -> T:
         if name not in self:
-            hint = did_you_mean(str(name), self)
-            raise UnknownName(f"no {self.kind} named {name!r}; known: {', '.join(sorted(self))}.{hint}")
+            names = sorted({*self, *presets(self.kind)})
+            raise UnknownName(f"no {self.kind} named {name!r}; known: {', '.join(names)}.{did_you_mean(str(name), names)}")
         entry = self._entries[name]
         if isinstance(entry, _Lazy):
             found: Any = resolve_name(entry.place)
-            found = partial(found, *entry.given) if entry.given else found
-            entry = self._entries[name] = found
+            entry = self._entries[name] = partial(found, *entry.given) if entry.given else found
         return entry
 
     def __iter__(self) -> Iterator[str]:
@@ -105,105 +113,110 @@ class Registry(Mapping[str, T]):
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
         self._entries[name] = entry
 
-    def build(self, options: Mapping[str, Any], *args: Any) -> Any:
-        """Call the entry `options["name"]` with `args` and the remaining options as keywords."""
-        if not isinstance(options, Mapping) or not isinstance(options.get("name"), str):
+    def name_of(self, entry: Any) -> str | None:
+        """The name of an entry, or None."""
+        place = f"{getattr(entry, '__module__', '')}:{getattr(entry, '__qualname__', '')}"
+        return next((name for name, own in self._entries.items() if own is entry or own == _Lazy(place, ())), None)
+
+    def options(self, given: str | Mapping[str, Any]) -> dict[str, Any]:
+        """Name and options of an entry, from a name, also of a file in conf/, or a mapping with a name and options."""
+        chosen = {"name": given} if isinstance(given, str) else given
+        if not isinstance(chosen, Mapping) or not isinstance(chosen.get("name"), str):
             known = ", ".join(sorted(self))
-            raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {known}.")
-        chosen = dict(options)
+            raise InputError(f"a {self.kind} config needs a 'name', found {given!r}; known: {known}.")
+        name = chosen["name"]
+        if name in self._entries or name not in presets(self.kind):
+            return dict(chosen)
+        return {**chosen, **presets(self.kind)[name], **{key: chosen[key] for key in chosen if key != "name"}}
+
+    def build(self, given: str | Mapping[str, Any], *args: Any) -> Any:
+        """Call the entry of `options` with `args` and its options as keywords."""
+        chosen = self.options(given)
         name = chosen.pop("name")
         constructor: Any = self[name]
         return construct(f"{self.kind} '{name}'", constructor, chosen, *args)
 
 
-def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> None:
-    """Check options against the signature of a constructor that takes `given` further arguments by position."""
-    check(isinstance(options, Mapping), f"{what} must be a group of keys, found {options!r}.")
-    parameters = _parameters(constructor)
-    if any(p.kind is p.VAR_KEYWORD for p in parameters):
-        return
-    known = _by_keyword(parameters, given)
-    for key, value in options.items():
-        if key not in known:
-            names = ", ".join(known) or "none"
-            raise InputError(f"{what} has no option {key!r}; it knows: {names}.{did_you_mean(key, known)}")
-        if (wanted := _wanted(known[key].annotation)) and not wanted[1](value):
-            raise InputError(f"{what}: {key} must be {wanted[0]}, found {value!r}.")
-    for key, parameter in known.items():
-        check(parameter.default is not parameter.empty or key in options, f"{what} needs the option {key!r}.")
+@cache
+def presets(group: str) -> dict[str, dict[str, Any]]:
+    """Options of each file of a folder of conf/, by its name, with those of the files in its `defaults`."""
+    folder = files("r2flow") / "conf" / group
+    read: dict[str, Any] = {}
+    for file in folder.iterdir() if folder.is_dir() else ():
+        if file.name.endswith(".yaml"):
+            content = OmegaConf.create(file.read_text(encoding="utf-8"))
+            read[file.name.removesuffix(".yaml")] = OmegaConf.to_container(content)
+
+    def merged(name: str) -> dict[str, Any]:
+        options = dict(read[name])
+        bases = [base for base in options.pop("defaults", ()) if base in read]
+        return {key: value for part in (*map(merged, bases), options) for key, value in part.items()}
+
+    return {name: merged(name) for name in read}
+
+
+def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> dict[str, Any]:
+    """Options as a constructor takes them that has `given` further arguments by position.
+
+    Raises:
+        InputError: an unknown option, a missing one, or a value that does not fit its annotation.
+    """
+    if not isinstance(options, Mapping):
+        raise InputError(f"{what} must be a group of keys, found {options!r}.")
+    try:
+        return _schema(constructor, given).validate_python(dict(options))
+    except ValidationError as error:
+        raise InputError(f"{what}: {_first_problem(error, _by_keyword(constructor, given))}") from None
 
 
 def construct(what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any) -> T:
     """Call a constructor with `args` and a config's options, which are checked; None: its defaults."""
-    options = {} if options is None else options
-    check_options(what, constructor, options, given=len(args))
-    return constructor(*args, **options)
+    return constructor(*args, **check_options(what, constructor, options or {}, given=len(args)))
 
 
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
     """Keyword options of a constructor, after `given` positional ones, with their defaults; `MISSING` without one."""
-    options = _by_keyword(_parameters(constructor), given)
-    defaults = {name: MISSING if p.default is p.empty else p.default for name, p in options.items()}
-    if dataclasses.is_dataclass(constructor):
-        for f in dataclasses.fields(constructor):
-            if f.name in defaults and callable(f.default_factory):
-                defaults[f.name] = f.default_factory()
-    return defaults
+    parameters = _by_keyword(constructor, given)
+    return {name: MISSING if p.default is p.empty else p.default for name, p in parameters.items()}
 
 
-def _by_keyword(parameters: Sequence[inspect.Parameter], given: int) -> dict[str, inspect.Parameter]:
-    taken = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD][:given]
-    kinds = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
-    return {p.name: p for p in parameters if p.kind in kinds and p.name not in taken}
-
-
-def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
-    """Parameters of a constructor; if a class passes `**options` to its base class, also those of the base."""
-    parameters = list(inspect.signature(constructor).parameters.values())
+def _by_keyword(constructor: Callable[..., Any], given: int = 0) -> dict[str, inspect.Parameter]:
+    """Parameters after `given` positional ones; of a class that passes `**options` on, also those of its base."""
+    parameters = inspect.signature(constructor).parameters.values()
+    named = {p.name: p for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+    positional = [name for name, p in named.items() if p.kind is not p.KEYWORD_ONLY][:given]
     passes_on = any(p.kind is p.VAR_KEYWORD for p in parameters)
     if passes_on and inspect.isclass(constructor) and constructor.__bases__[0] is not object:
-        direct = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
-        names = {p.name for p in direct}
-        return direct + [p for p in _parameters(constructor.__bases__[0]) if p.name not in names]
-    return parameters
+        named |= {name: p for name, p in _by_keyword(constructor.__bases__[0], given).items() if name not in named}
+    return {
+        name: p for name, p in named.items() if name not in positional and p.kind is not p.POSITIONAL_ONLY
+    }
 
 
-Check = tuple[str, Callable[[Any], bool]]  # what a value must be, and whether it is
-
-PLAIN: dict[Any, Check] = {
-    bool: ("true or false", lambda v: isinstance(v, bool)),
-    int: ("a whole number", lambda v: isinstance(v, int) and not isinstance(v, bool)),
-    float: ("a finite number", lambda v: isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= LARGEST),
-    str: ("a word", lambda v: isinstance(v, str)),
-    NoneType: ("null", lambda v: v is None),
-    Mapping: ("a group of keys", lambda v: isinstance(v, Mapping)),
-}
-
-
-def _wanted(annotation: Any) -> Check | None:
-    """The check of an annotation; None if it cannot be checked."""
-    origin, inner = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        bounds = [bound for bound in annotation.__metadata__ if isinstance(bound, Bound)]
-        return reduce(_bounded, bounds, _wanted(inner[0]))
-    if origin is Literal:
-        return " or ".join(map(repr, inner)), lambda v: any(type(v) is type(x) and v == x for x in inner)
-    if origin in (Union, UnionType):
-        checks = [check for check in map(_wanted, inner) if check]
-        words = " or ".join(words for words, _ in checks)
-        return (words, lambda v: any(fits(v) for _, fits in checks)) if len(checks) == len(inner) else None
-    if (origin or annotation) in (list, tuple, Sequence):
-        size = len(inner) if origin is tuple and inner and Ellipsis not in inner else None
-        each = _wanted(inner[0]) if inner else None
-        words = f"a list{f' of {size}' if size else ''}{f', each {each[0]}' if each else ''}"
-
-        def fits(value: Any) -> bool:
-            right_size = isinstance(value, list | tuple) and size in (None, len(value))
-            return right_size and (each is None or all(map(each[1], value)))
-
-        return words, fits
-    return PLAIN.get(origin or annotation)
+@cache
+def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[dict[str, Any]]:
+    fields: dict[str, Any] = {}
+    for name, parameter in _by_keyword(constructor, given).items():
+        annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
+        fields[name] = Required[annotation] if parameter.default is parameter.empty else NotRequired[annotation]
+    options = TypedDict("options", fields)  # type: ignore[operator]
+    open_ended = ConfigDict(STRICT, extra="allow") if _takes_any(constructor) else STRICT
+    return TypeAdapter(with_config(open_ended)(options))
 
 
-def _bounded(check: Check | None, bound: Bound) -> Check | None:
-    return check and (f"{check[0]} {bound.words}", lambda v: check[1](v) and bound.holds(v))
+def _takes_any(constructor: Callable[..., Any]) -> bool:
+    """Whether a function, not a class, takes any keyword."""
+    kinds = [p.kind for p in inspect.signature(constructor).parameters.values()]
+    return inspect.Parameter.VAR_KEYWORD in kinds and not inspect.isclass(constructor)
+
+
+def _first_problem(error: ValidationError, known: Collection[str]) -> str:
+    """The first problem of a validation in one line, without the names of a union's members."""
+    problem = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in problem["loc"][:1])
+    if problem["type"] == "extra_forbidden":
+        return f"no option '{key}'; it has {', '.join(known) or 'none'}.{did_you_mean(key, list(known))}"
+    if problem["type"] == "missing":
+        return f"needs the option '{key}'."
+    words = problem["msg"].removeprefix("Value error, ")
+    return f"{key}: {words[:1].lower()}{words[1:]}, found {problem['input']!r}."

@@ -1,9 +1,11 @@
 """Handling of stop signals in runs, launchers and workers."""
 
 import atexit
+import ctypes
 import multiprocessing
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -133,3 +135,23 @@ def outlive_the_signal(worker: int = 0) -> None:
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     hear(lambda number, frame: signal.alarm(30))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # blocked if started `out_of_reach`
+
+
+def run_process(command: Sequence[str]) -> int:
+    """Run a command, forward stop signals to it, and end it with this process; its exit code is that of a shell."""
+    received: list[int] = []
+
+    def pass_on(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        if process is not None and process.poll() is None:
+            process.send_signal(number)
+
+    process: subprocess.Popen[bytes] | None = None
+    with listening(pass_on):
+        # PR_SET_PDEATHSIG: a run that outlived its sweep would block the same command when given again.
+        end = (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL)) if sys.platform == "linux" else None
+        process = subprocess.Popen(command, preexec_fn=end)
+        if received:
+            process.send_signal(received[0])
+        code = process.wait() or -next(iter(received), 0)
+    return code_of(-code) if code < 0 else code

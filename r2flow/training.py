@@ -5,19 +5,20 @@
     result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
     result.metrics["val/loss"], result.checkpoint
 
-The same command, or the same config, resumes from the last checkpoint.
+A `Run` holds a stage, a `ScanDataModule` and a Trainer, which `fit` gives to `trainer.fit`. The same command, or the
+same config, resumes from the last checkpoint.
 """
 
 import logging
 import re
-import signal
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from signal import SIG_DFL
 from subprocess import Popen, TimeoutExpired
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import lightning as L
 import torch
@@ -26,28 +27,23 @@ from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.model_helpers import is_overridden
 
-from r2flow.callbacks import SamplePictures, build_callbacks
+from r2flow.callbacks import Progress, build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
-from r2flow.callbacks.loggers import LOGGERS, log_config, log_figures
+from r2flow.callbacks.loggers import LOGGERS, LearningRates, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import SOURCES, Layout, Prepared
-from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
-from r2flow.data.reading import AUTO
-from r2flow.data.resolving import reflectance_levels, resolve, resolve_reflectance
-from r2flow.errors import InputError, check_folder, naming
-from r2flow.generators import Generator, build_generator
-from r2flow.model.checkpoint import checkpoints_of, step_of
-from r2flow.noise import seed_torch
+from r2flow.data.options import PAIRS, SIMULATED
+from r2flow.errors import InputError, check_folder, one_line
+from r2flow.model.checkpoint import MODEL, checkpoints_of, config_of, step_of
+from r2flow.model.lineage import Parent, find_parent, model_options
 from r2flow.plugins import loaded_plugins, made_with
-from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
+from r2flow.registry import Bound, Natural, Seed, construct, options_class
 from r2flow.reports.training import finish, read_curves
-from r2flow.runs.composing import Keys, compose
-from r2flow.runs.folder import check_run, open_run, read_config, run_lock
-from r2flow.runs.lineage import Parent, find_parent, inherit
+from r2flow.runs.composing import compose
+from r2flow.runs.folder import check_run, has_ended, open_run, read_config, run_lock
 from r2flow.signals import LATER, STOPPING, Stopped, listening
-from r2flow.stages import build_stage
+from r2flow.stages import STAGES
 from r2flow.stages.base import Stage
 
 __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
@@ -66,31 +62,41 @@ EXPECTED_WARNINGS = (
 # Errors of gloo and NCCL after a peer process has ended.
 PEER_LOST = r"(?i)connection .*(close|reset)|broken pipe|process exited|gloo.*(timed out|(read|write) error)|NCCL"
 
+Named = Annotated[Mapping[str, Any], Bound("a group with a name", lambda group: "name" in group)]
+InRuns = Annotated[str, Bound("a folder in runs", lambda name: name.strip("./") and ".." not in Path(name).parts)]
 
-@dataclass(frozen=True)
+
+@options_class
 class SampleOptions:
     """Samples drawn at the end of a run."""
 
     num: Natural = 4
 
 
-@dataclass(frozen=True)
-class TrainerRanges:
-    """Ranges of options of Lightning's Trainer that r2flow's runs support; Lightning itself accepts more."""
+@options_class
+class RunConfig:
+    """Top-level keys of a run's config. Those of the groups are the options of the classes that they are for."""
 
-    max_steps: Annotated[int, Bound("of 1 to 10^15", lambda n: 1 <= n <= 10**15)]
-    min_steps: Natural | None
-    max_epochs: Annotated[Literal[-1], Bound("(trainer.max_steps is the length of a run)", lambda n: True)] | None
-    max_time: str | Mapping[str, Any] | None
-    num_sanity_val_steps: Annotated[int, Bound("of at least -1", lambda n: n >= -1)] | None
-    overfit_batches: Annotated[float, Bound("equal to 0 (data.scenes, data.drives choose few scans)", lambda n: n == 0)]
-    limit_train_batches: Annotated[None, Bound("(trainer.max_steps is the length of a run)", lambda n: True)]
-    val_check_interval: Positive | str | Mapping[str, Any] | None
-    check_val_every_n_epoch: Annotated[None, Bound("(a run is one epoch: give val_check_interval)", lambda n: True)]
-    use_distributed_sampler: Annotated[Literal[False], Bound("(each device is given its own scans)", lambda n: True)]
-    log_every_n_steps: Count
-    accumulate_grad_batches: Count
-    gradient_clip_val: NonNegative | None
+    stage: Named  # class of `STAGES`, with its options
+    backbone: Mapping[str, Any] | None  # the following four: as in `Stage`
+    sensor: Mapping[str, Any]
+    encoding: Mapping[str, Any]
+    data: Named  # `ScanDataModule`
+    trainer: Mapping[str, Any]  # Lightning's Trainer
+    callbacks: Mapping[str, Mapping[str, Any] | None]  # classes of `CALLBACKS`
+    samples: SampleOptions
+    run_dir: Annotated[str, Bound("a folder", lambda name: name.strip("/ "))]
+    seed: Seed
+    name: InRuns | int | float = "run"
+    experiment: str | Sequence[str] | None = None
+    generator: Mapping[str, Any] | str | None = None
+    sampler: Mapping[str, Any] | None = None
+    few: Mapping[str, Any] | None = None
+    chain: Mapping[str, Any] | None = None
+    preview: str | None = None
+    loggers: Sequence[str] | None = None
+    plugins: Sequence[str] = ()
+    scans: Any = None  # identity of the scans, filled in by the run
 
 
 @dataclass
@@ -116,154 +122,152 @@ class Result:
     checkpoint: Path | None  #: the last checkpoint, or None
     folder: Path
     step: int  #: total number of optimiser steps
-    finished: bool  #: whether `trainer.max_steps` was reached; `trainer.max_time` can stop a run earlier
+    finished: bool  #: whether the run reached its end; `trainer.max_time` can stop it earlier
 
 
-def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
-    """Build the run of a config, and refuse all errors that can be detected without reading scans.
+def build(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> Run:
+    """Build the stage, the data and the Trainer of a config; scans are listed, not read.
 
     Args:
         config: As returned by `compose`.
         asked: Overrides of the command line: only these are refused if they contradict the parent; other keys take the
             parent's values.
+        parent: The parent, if it is not the one that the config names.
 
     Raises:
         InputError: an invalid value, an unknown name or option, a parent that is missing or not finished.
     """
-    check_options("the config", Keys, config)
-    if config.get("chain"):
+    run = construct("the config", RunConfig, config)
+    if run.chain or run.preview:
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
-    if config.get("preview"):
-        raise InputError("preview is of a chain of runs, such as experiment=demo: leave it out, or give preview=null.")
-    with _quiet(), made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
-        parent = find_parent(config["stage"].get("init"))
-        config = _checked(config, asked, parent)
-        config["plugins"] = config.get("plugins") or loaded_plugins()
-        encoding = config["encoding"]
-        encoding["reflectance"] = resolve_reflectance(encoding.get("reflectance", AUTO), config["data"])
-        levels = reflectance_levels(config["data"])
-        if levels is not None and "encoding.levels" not in map(key_of, asked):
-            encoding["levels"] = levels
-        seed_torch(config["seed"], "weights")
-        generator = build_generator(config)
-        if parent and parent.checkpoint:
-            generator.start_from(parent.checkpoint.generator)
-        return _assembled(config, generator, asked)
+    with _quiet(), made_with(read_config(run.run_dir) or {}, f"the run in {run.run_dir}"):
+        stage_options = dict(run.stage)
+        stage_class = STAGES[stage_options.pop("name")]
+        named = stage_options.pop("parent", None)
+        if parent is None and named is not None:
+            parent = find_parent(named["path"] if isinstance(named, Mapping) else named)
+        with made_with(parent.config if parent else {}, "the run that it starts from"):
+            options = model_options(
+                _given(config, asked, parent), parent, stage_class.generator_name, stage_class.needs_pairs
+            )
+        data = _build_data(run, options, asked, parent)
+        options["encoding"] = data.encoding.described()
+        options |= {"parent": parent, "sampler": run.sampler, "few": run.few, "seed": run.seed}
+        stage: Stage = construct(f"stage '{run.stage['name']}'", stage_class, {**stage_options, **options})
+        _check_pair(run, stage, data, asked)
+        data.adopt(stage.item_format)
+        trainer = _build_trainer(run, stage)
+        complete = config_of(stage.hparams, data.hparams, run.stage["name"])
+        return Run({**config, **complete, "plugins": list(run.plugins) or loaded_plugins()}, stage, data, trainer)
 
 
 def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
-    """Check a config by building its run with weights on the meta device; no scans are read, no files written.
+    """Check a config by building its run; no files are written.
 
     The result is completed with values of its parent; `parent` is one that has not been trained yet.
     """
-    check_options("the config", Keys, config)
-    config = _checked(config, asked, parent or find_parent(config["stage"].get("init")))
-    if config["encoding"].get("reflectance", AUTO) == AUTO:
-        config["encoding"]["reflectance"] = True  # decided when the scans are read
-    with torch.device("meta"):
-        generator = build_generator(config)
-    check_run(_assembled(config, generator, asked).folder, config)
-    return config
+    run = build(config, asked, parent)
+    check_run(run.folder, run.config)
+    return run.config
 
 
-def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
-    check_trainer(config["trainer"])
-    check_options("samples", SampleOptions, config["samples"])
-    with made_with(parent.config if parent else {}, "the run that it starts from"):
-        config = inherit(config, asked, parent)
-    given = {key_of(text) for text in asked}
-    drawn = sorted(key for key in given if f"{key}.".startswith("data.pairs."))
-    if drawn and config["data"]["name"] != PAIRS:
-        raise InputError(f"data={config['data']['name']} has no pairs (data=pairs has): leave out {', '.join(drawn)}.")
-    _refuse_unread(config["data"], given)
-    return config
+def _given(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
+    """Options of the model for `model_options`; next to a parent's, only those of the command line."""
+    given = {group: config.get(group) for group in MODEL}
+    if parent is None:
+        return given
+    keys = [key_of(text) for text in asked]
+    for group in ("backbone", "sensor", "encoding"):
+        if group not in keys:
+            own = {key.split(".")[1] for key in keys if key.startswith(f"{group}.")}
+            given[group] = {key: config[group][key] for key in own} or None
+    return given
 
 
-def _refuse_unread(data: Mapping[str, Any], given: Collection[str]) -> None:
-    """Refuse options that the run's set of scans would ignore; `resolve` does those of its parts."""
-    name, defaults = data["name"], {**asdict(SourceOptions()), **resolve({})}
-    options = defaults.keys() - {"name"}
-    scenes = {"scenes"} if "data.scenes" in given else set[str]()  # else an experiment's
-    if name == SIMULATED:
-        what, unread = "simulated scans are not files (data=folder for yours)", options - {"scenes"}
-    elif name == PAIRS:
-        what, unread = "pairs are drawn, not read", options - {"root", "reading"}
-    elif name == MIXED:
-        run = DataOptions(**data)
-        sets = [one for one in (*run.sets, run.held_out) if one and one.scenes == run.scenes]
-        read = any(not isinstance(SOURCES[one.name], Layout | Prepared) for one in sets)
-        what, unread = "each of data.parts has its own", {"split", "drives"} | (set() if read else scenes)
-    else:
-        files = isinstance(SOURCES[name], Layout | Prepared)
-        what, unread = "scans in files are no simulated scenes", scenes if files else set()
-    if wrong := sorted(f"data.{option}" for option in unread if data.get(option, defaults[option]) != defaults[option]):
-        raise InputError(f"{what}: leave {', '.join(wrong)} out.")
+def _build_data(
+    run: RunConfig, options: Mapping[str, Any], asked: Sequence[str], parent: Parent | None
+) -> ScanDataModule:
+    """The DataModule of a config, for the model's sensor and encoding."""
+    data = dict(run.data)
+    theirs = (parent.config.get("data") or {}).get("reading") if parent else None
+    if data["name"] == PAIRS:
+        data["reading"] = theirs
+    elif theirs and data["name"] != SIMULATED:
+        own = {key: value for key, value in (data.get("reading") or {}).items() if value is not None}
+        data["reading"] = {"projection": theirs["projection"], "convention": theirs["convention"], **own}
+    encoding = dict(options["encoding"])
+    if "encoding.levels" not in map(key_of, asked):
+        encoding["levels"] = None  # those of the scans, else of the parent
+    module = ScanDataModule(**data, sensor=options["sensor"], encoding=encoding, seed=run.seed)
+    if module.encoding.levels is None:
+        module.encoding.levels = options["encoding"]["levels"]
+    if module.pairs is not None:
+        if parent is None:
+            raise InputError("data=pairs are drawn by a trained run: give stage.parent=RUN.")
+        drawer = find_parent(module.pairs.of) if module.pairs.of else parent
+        for group in ("sensor", "encoding"):
+            if drawer is not parent and drawer.config[group] != parent.config[group]:
+                raise InputError(f"data.pairs.of={module.pairs.of} has another {group} than {parent.path}.")
+        module.drawn_by(drawer.record())
+    return module
 
 
-def _assembled(config: dict[str, Any], generator: Generator, asked: Sequence[str]) -> Run:
-    space = generator.space
-    if not hasattr(generator, "backbone"):
-        if wrong := [text for text in asked if key_of(text).partition(".")[0] == "backbone"]:
-            raise InputError(f"generator {config['generator']['name']} has its own network: leave {wrong[0]} out.")
-        config["backbone"] = None
-    data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
-    stage = build_stage(config, generator)
-    data.further = stage.further
-    trainer = _build_trainer(config, stage)
-    data.check_run(trainer.world_size, trainer.accumulate_grad_batches)
-    callbacks: list[L.Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    for pictures in [one for one in callbacks if isinstance(one, SamplePictures) and one.every and generator.draws]:
-        with naming("callbacks.pictures"):
-            pictures.sampler(generator)
-    return Run(config, stage, data, trainer)
+def _check_pair(run: RunConfig, stage: Stage, data: ScanDataModule, asked: Sequence[str]) -> None:
+    """Refuse a stage and data that do not fit each other."""
+    name = run.stage["name"]
+    if stage.needs_pairs and data.pairs is None:
+        raise InputError(f"stage={name} learns from pairs: give data=pairs, not {run.data['name']}.")
+    if data.pairs is not None and not stage.takes_pairs:
+        raise InputError(f"stage={name} learns from scans, not data=pairs; give stage=reflow.")
+    if stage.hparams["backbone"] is None and any(key_of(text).partition(".")[0] == "backbone" for text in asked):
+        raise InputError(f"stage={name} has its own network: leave the backbone out.")
+    if data.augment.roll and stage.generator.learns_directions:
+        raise InputError(
+            "data.augment.roll makes all directions alike, but backbone.position=learnable (the paper's APE) learns "
+            "one vector per direction; give backbone.position=none, whose attention sees only differences in azimuth, "
+            "or leave roll out."
+        )
 
 
-def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
-    options = dict(config["trainer"])
-    check_options("trainer", L.Trainer, options)
+def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
+    options = dict(run.trainer)
     if options["accelerator"] == "auto" and not torch.cuda.is_available():
         options["accelerator"] = "cpu"  # Lightning would choose Apple's GPU, which lacks float64
     if not stage.automatic_optimization:  # Lightning leaves these two to the stage
         if options["accumulate_grad_batches"] != 1:
-            name = config["stage"]["name"]
+            name = run.stage["name"]
             raise InputError(f"stage={name} takes its own optimiser steps: trainer.accumulate_grad_batches must be 1.")
-        stage.gradient_clip_val, options["gradient_clip_val"] = options["gradient_clip_val"], None
-    if isinstance(interval := options["val_check_interval"], int):  # a short run is validated once, at its end
-        options["val_check_interval"] = min(interval, options["max_steps"]) * options["accumulate_grad_batches"]
-    callbacks = build_callbacks(config)
+        stage.gradient_clip_val = options["gradient_clip_val"]
+        options["gradient_clip_val"] = None
+    interval = options["val_check_interval"]
+    if isinstance(interval, int) and options["check_val_every_n_epoch"] is None:
+        if options["max_steps"] > 0:  # a short run is validated once, at its end
+            interval = min(interval, options["max_steps"])
+        options["val_check_interval"] = interval * options["accumulate_grad_batches"]
+    callbacks = [Progress()] if options["fast_dev_run"] else build_callbacks(run.callbacks)
     for key, kind in (("enable_checkpointing", Checkpoint), ("enable_progress_bar", ProgressBar)):
-        options[key] = bool(options[key]) and any(isinstance(one, kind) for one in callbacks)  # or Lightning adds one
-    loggers = [LOGGERS[name](Path(config["run_dir"])) for name in config["loggers"] or ()]
+        if not options[key]:
+            callbacks = [callback for callback in callbacks if not isinstance(callback, kind)]
+        options[key] = any(isinstance(callback, kind) for callback in callbacks)  # or Lightning adds its own
+    loggers = [LOGGERS[name](Path(run.run_dir)) for name in run.loggers or ()]
+    if loggers:
+        callbacks.insert(0, LearningRates("step"))
     try:
         with _quiet():
             trainer = L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
         rank_zero_only.rank = trainer.global_rank  # type: ignore[attr-defined] # not SLURM_PROCID of a task alone
         if environment := getattr(trainer.strategy, "cluster_environment", None):
             environment.validate_settings(trainer.num_devices, trainer.num_nodes)
-        if (tasks := trainer.world_size) != (processes := trainer.num_devices * trainer.num_nodes):
-            start = f"srun --ntasks-per-node={trainer.num_devices}, or on one machine by env -u SLURM_NTASKS"
-            raise ValueError(f"the cluster starts {tasks} of {processes} processes; under SLURM start it by {start}.")
-        if trainer.world_size > 1 and isinstance(interval, str | Mapping):  # Lightning asks each process's clock
-            raise ValueError("a val_check_interval in time comes at another step on each device; give it in steps.")
-        return trainer
     except (TypeError, ValueError, RuntimeError, ImportError, MisconfigurationException) as error:
-        raise InputError(f"trainer: {' '.join(str(error).split())}") from None
-
-
-def check_trainer(options: Mapping[str, Any]) -> None:
-    """Refuse options that Lightning would change silently or answer with a traceback."""
-    check_options("trainer", TrainerRanges, {f.name: options.get(f.name) for f in fields(TrainerRanges)})
-    precision, accelerator, gpu = str(options["precision"]), options["accelerator"], torch.cuda.is_available()
-    on_cpu = accelerator == "cpu" or (accelerator == "auto" and not gpu)
-    mixed, cpu_too = precision.replace("true", "mixed"), "bf16-mixed or 32-true"
-    for wrong, problem in (
-        (precision in ("16-true", "bf16-true"), f"{precision} rounds the times of a flow to three digits; use {mixed}"),
-        (accelerator in ("gpu", "cuda") and not gpu, "accelerator=gpu, but torch sees no GPU here; use trainer=cpu"),
-        (re.search("spawn|fork|notebook", str(options["strategy"])), "its step is lost at its end; use strategy=ddp"),
-        (on_cpu and precision in ("16-mixed", "16"), f"{precision} becomes bfloat16 on a CPU; use {cpu_too}"),
-    ):
-        if wrong:
-            raise InputError(f"trainer: {problem}.")
+        raise InputError(f"trainer: {one_line(str(error))}") from None
+    tasks = trainer.world_size
+    processes = trainer.num_devices * trainer.num_nodes
+    if tasks != processes:
+        raise InputError(
+            f"trainer: the cluster starts {tasks} of {processes} processes; under SLURM start it by srun "
+            f"--ntasks-per-node={trainer.num_devices}, or on one machine by env -u SLURM_NTASKS."
+        )
+    return trainer
 
 
 def fit(run: Run) -> Result:
@@ -276,51 +280,56 @@ def fit(run: Run) -> Result:
         r2flow.signals.Stopped: a stop signal was received, or another device's process was killed.
     """
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
-    stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping(run.folder))
+    stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping())
+    stopping.run_dir = run.folder
+    first = run.trainer.is_global_zero
     with stopping.listening(), _quiet(repeated=False):  # each trains on scans of its own
+        if run.config["trainer"]["fast_dev_run"]:
+            run.trainer.fit(run.stage, run.data)
+            return _result(run, run.trainer.global_step, finished=True)
         with _quiet():
             run.data.setup()
             run.config["scans"] = run.data.fingerprint()
             log.info("training on %s", run.config["scans"].partition(",")[0])
-            if run.trainer.is_global_zero and not (run.folder.exists() or run.config["trainer"]["fast_dev_run"]):
+            if first and not run.folder.exists():
                 check_folder(run.folder)
                 run.data.read()  # a bad scan leaves no folder
-        run.stage.config = dict(run.config)
-        if run.config["trainer"]["fast_dev_run"]:
-            run.trainer.fit(run.stage, run.data)
-            return _result(run, run.trainer.global_step, finished=True)
-        with run_lock(run.folder) if run.trainer.is_global_zero else nullcontext():
+        with run_lock(run.folder) if first else nullcontext():
             # Python hears no signal while it waits for other machines; from its first step on, `Stopping` does.
-            with listening(signal.SIG_DFL, STOPPING if run.trainer.num_nodes > 1 else ()):
+            with listening(SIG_DFL, STOPPING if run.trainer.num_nodes > 1 else ()):
                 step = _fit_in_folder(run, stopping)
-            if run.trainer.is_global_zero:
-                where, kept = run.trainer.strategy.root_device, bool(run.trainer.checkpoint_callbacks)
+            finished = has_ended(run.folder) or not run.trainer.checkpoint_callbacks
+            if first:
+                where = run.trainer.strategy.root_device
                 device = str(where) if where.type == "cuda" else "cpu"
-                finish(run.folder, run.config["samples"], run.config["seed"], device, run.trainer.max_steps, kept=kept)
+                kept = bool(run.trainer.checkpoint_callbacks)
+                finish(run.folder, run.config["samples"], run.config["seed"], device, finished, kept=kept)
                 log_figures(run.trainer.loggers, run.folder, step)
-    return _result(run, step, finished=step >= run.trainer.max_steps)
+    return _result(run, step, finished)
 
 
 def _fit_in_folder(run: Run, stopping: Stopping) -> int:
-    last = open_run(run.folder, run.config, locked=run.trainer.is_global_zero)
-    if last is not None and step_of(last) >= run.trainer.max_steps:
-        if run.trainer.is_global_zero:
-            init = as_override("stage.init", run.folder)
-            print(f"finished before, at step {step_of(last)}; to learn more: {init} name=OTHER")
+    first = run.trainer.is_global_zero
+    last = open_run(run.folder, run.config, locked=first)
+    if last is not None and has_ended(run.folder):
+        if first:
+            parent = as_override("stage.parent", run.folder)
+            print(f"finished before, at step {step_of(last)}; to learn more: {parent} name=OTHER")
         return step_of(last)  # no training, no pairs
     with _quiet():
         run.data.read()
         if last is not None:
-            run.stage.start = step_of(last)
             log.info("resuming from %s", last)
-    if run.trainer.is_global_zero:
+    if first:
         log_config(run.trainer.loggers, run.config)
     try:
-        if last is None and run.config["stage"].get("init") and is_overridden("validation_step", run.stage):
+        if last is None and run.stage.hparams["parent"] and is_overridden("validation_step", run.stage):
             run.trainer.validate(run.stage, run.data, verbose=False)  # what the end of the run is compared with
         run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
-    except MisconfigurationException as error:  # as of limit_val_batches, with few scans
-        raise InputError(f"trainer: {' '.join(str(error).split())}") from None
+    except (MisconfigurationException, ValueError) as error:  # as of limit_val_batches, with few scans
+        if isinstance(error, InputError) or "trainer" not in str(error).lower():
+            raise
+        raise InputError(f"trainer: {one_line(str(error))}") from None
     except RuntimeError as error:
         if isinstance(cause := error.__context__, OSError) and re.search("combined_loader|Too many open", str(error)):
             raise cause from None

@@ -27,9 +27,11 @@ from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.checkpoint import MODEL, Checkpoint
+from r2flow.registry import construct
 from r2flow.reports.pictures import save_figure
-from r2flow.stages import build_stage
+from r2flow.stages import STAGES
+from r2flow.stages.base import Stage
 
 ROOT = Path(__file__).resolve().parent.parent
 Hydra.get_mode = lambda *_, **__: None  # it would compose each config twice, to read the null of hydra.mode
@@ -69,9 +71,19 @@ class Trap:
         return exec, ("raise SystemExit('a file has run code')",)
 
 
+def make_stage(config: dict[str, Any], **options: Any) -> Stage:
+    """The stage of a config, with further options."""
+    given = {key: config[key] for key in (*MODEL, "sampler", "few", "seed") if key in config}
+    own = {**config.get("stage", {"name": "rectify"}), **options}
+    return construct("stage", STAGES[own.pop("name")], {**given, **own})
+
+
 def write_checkpoint(path: Path, config: dict[str, Any]) -> Path:
-    state = build_stage(config, build_generator(config)).state_dict()
-    content = {"state_dict": state, "current_model_state": state, "config": config, "global_step": 7}
+    stage = make_stage(config)
+    state = stage.state_dict()
+    content = {"state_dict": state, "current_model_state": state, "global_step": 7}
+    content |= {"hyper_parameters": dict(stage.hparams), "datamodule_hyper_parameters": config["data"]}
+    stage.on_save_checkpoint(content)
     AtomicCheckpointIO().save_checkpoint(content, path)
     return path
 
@@ -80,10 +92,15 @@ def write_run(folder: Path, flow: Checkpoint, stage: dict[str, Any], scale: floa
     """A run folder with the weights of a flow, times a number."""
     weights = dict(flow.generator.named_parameters())
     state = flow.generator.state_dict()
+    options = {"sampler": None, "few": None, "seed": 0, "generator": {"name": "rectified_flow"}, **flow.config}
+    model = {key: options[key] for key in (*MODEL, "sampler", "few", "seed")}
     content = {
         "state_dict": {f"generator.{name}": scale * v if name in weights else v for name, v in state.items()},
-        "config": {**flow.config, "stage": stage}, "global_step": 7, "sampler": flow.generator.sampler.asdict(),
-    }  # fmt: skip
+        "hyper_parameters": {**model, **{key: value for key, value in stage.items() if key != "name"}},
+        "datamodule_hyper_parameters": flow.config.get("data", {}),
+        "r2flow": {"stage": stage["name"], "plugins": [], "total_steps": 7, **flow.generator.drawing()},
+        "global_step": 7,
+    }
     AtomicCheckpointIO().save_checkpoint(content, folder / "checkpoints" / "step-00000007.ckpt")
     return folder
 
@@ -146,11 +163,13 @@ def _from_the_start() -> None:
 @pytest.fixture
 def saved(tmp_path: Path) -> tuple[Path, dict]:
     """A checkpoint of ours with random weights, averaged and raw, and the averaged ones."""
-    stage = build_stage(CONFIG, build_generator(CONFIG))
+    stage = make_stage(CONFIG)
     parameters = dict(stage.named_parameters())
     raw = {name: torch.randn_like(v) if name in parameters else v for name, v in stage.state_dict().items()}
     averaged = {name: v + 1 if name in parameters else v for name, v in raw.items()}
-    content = {"state_dict": averaged, "current_model_state": raw, "config": CONFIG, "global_step": 7}
+    content = {"state_dict": averaged, "current_model_state": raw, "global_step": 7}
+    content |= {"hyper_parameters": dict(stage.hparams), "datamodule_hyper_parameters": CONFIG["data"]}
+    stage.on_save_checkpoint(content)
     path = tmp_path / "run" / "checkpoints" / "step-00000007.ckpt"
     AtomicCheckpointIO().save_checkpoint(content, path)
     return path, averaged

@@ -102,9 +102,9 @@ def test_the_groups_of_conf_are_groups_of_the_default_config(config):
     ["runs/sweep/seed=1-5b990e", "~/it's", 'a "b" c', "a\\b=c", "ü,1", "a{b}[c]", "${x}", "a b\\", "ü", "1_2", "null"],
 )
 def test_an_override_that_is_printed_is_read_back(path: str):
-    (text,) = shlex.split(as_override("stage.init", path))
+    (text,) = shlex.split(as_override("stage.parent", path))
     value = OverridesParser.create().parse_override(text).value()
-    assert (key_of(text), getattr(value, "text", value)) == ("stage.init", path)
+    assert (key_of(text), getattr(value, "text", value)) == ("stage.parent", path)
 
 
 def test_a_value_needs_no_quotes_unless_it_has_brackets_or_quotes(monkeypatch):

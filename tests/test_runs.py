@@ -42,7 +42,7 @@ def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert part.exists()
     assert read_config(tmp_path) == changed(trainer={"devices": 4})  # what runs now, and not what was refused
     with pytest.raises(InputError, match=r"max_steps=10 there, 9 here\. Give the same .* to resume it, or name="):
-        check_run(tmp_path, changed(trainer={"max_steps": 9}))  # of a link, which has a stage.init of its own
+        check_run(tmp_path, changed(trainer={"max_steps": 9}))  # of a link, which has a stage.parent of its own
     for lacking in ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step"):
         checkpoint(tmp_path, 6, lacking)
         assert open_run(tmp_path, CONFIG) == newest

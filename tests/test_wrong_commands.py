@@ -147,7 +147,7 @@ name=x backbone.base_channels=7
 name=x backbone.name=null
 name=x data=folder data.root=scans data.reading.projection=flat
 name=x data=folder data.root=scans data.validation.data=3
-name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
+name=x stage=reflow data=pairs stage.parent=run data.pairs.sampler.name=eulr
 --plugin
 name=x 'chain={a/b: {seed: 3}}'
 name=x 'chain={1: {seed: 3}}' # ('1', not 1)

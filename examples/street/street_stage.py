@@ -1,6 +1,6 @@
 """The stage that made the flow map in `street`: `stage=flow_map` with ends learned from scans, and a loss of their own.
 
-r2flow train --plugin examples/street/street_stage.py --config-dir examples/street experiment=street_few stage.init=MAP
+r2flow train --plugin examples/street/street_stage.py --config-dir examples/street experiment=street_few stage.parent=MAP
 """
 
 from typing import Any

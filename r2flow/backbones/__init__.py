@@ -1,10 +1,8 @@
 """Networks v(t, x) and u(x, t, s) by name, and their configurations in conf/backbone."""
 
 from collections.abc import Mapping
-from importlib.resources import files
 from typing import Any
 
-import yaml
 from torch import Tensor
 
 from r2flow.backbones.adm_unet import ADMUNet
@@ -13,11 +11,33 @@ from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
 from r2flow.errors import check
-from r2flow.registry import Registry
+from r2flow.lidar.sensors import SENSORS
+from r2flow.registry import Registry, presets
 
-BACKBONES: Registry[type[Backbone]] = Registry(
-    "backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, local=Local
-)
+
+class _Backbones(Registry[type[Backbone]]):
+    def build(  # type: ignore[override]
+        self,
+        options: str | Mapping[str, Any],
+        rays: Tensor | None = None,
+        *,
+        shape: tuple[int, int, int] | None = None,
+        **given: Any,
+    ) -> Backbone:
+        """Build a backbone by name or options, as in conf/backbone, for images of some rays.
+
+        Args:
+            rays: Elevation and azimuth in radians, (2, H, W).
+            shape: Instead of rays: (C, H, W) of images of an HDL-64E.
+            given: Further options of `Backbone`, such as in_channels.
+        """
+        if shape is not None:
+            rays = SENSORS["hdl64e"].resized(*shape[1:]).rays()
+            given["in_channels"] = shape[0]
+        return super().build({**self.options(options), **given}, rays)
+
+
+BACKBONES = _Backbones("backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, local=Local)
 
 
 def build_backbone(
@@ -31,23 +51,15 @@ def build_backbone(
 
     `in_channels` includes the channels of a condition; `out_channels` None means as many.
     """
-    check(options is not None, "stage.init names a run without a backbone: leave it out, or name a flow.")
+    check(options is not None, "stage.parent names a run without a backbone: leave it out, or name a flow.")
     wanted = {"in_channels": in_channels, "out_channels": out_channels, "second_time": second_time or None}
     given = {name: value for name, value in wanted.items() if value is not None}  # a plug-in may not know the others
-    built: Backbone = BACKBONES.build({**options, **given}, rays)
+    built = BACKBONES.build(options, rays, **given)
     check(any(True for _ in built.parameters()), f"a {type(built).__name__} has no weights to learn.")
     return built
 
 
 def configurations() -> Registry[dict[str, Any]]:
     """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of backbones without a file."""
-    folder = files("r2flow") / "conf" / "backbone"
-    written = sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
-
-    def read(name: str) -> dict[str, Any]:
-        options = yaml.safe_load((folder / f"{name}.yaml").read_text())
-        bases = [read(base) for base in options.pop("defaults", []) if base != "_self_"]
-        return {key: value for part in (*bases, options) for key, value in part.items()}
-
     defaults = {name: {"name": name} for name in BACKBONES}
-    return Registry("backbone configuration", **{**defaults, **{name: read(name) for name in written}})
+    return Registry("backbone configuration", **{**defaults, **presets("backbone")})

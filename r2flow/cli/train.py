@@ -40,13 +40,13 @@ def pairs(
 ) -> None:
     """Generate reflow pairs with a flow; several processes share the missing or damaged pairs.
 
-    `python train.py experiment=reflow stage.init=RUN` generates pairs itself; this verb only generates, also under
+    `python train.py experiment=reflow stage.parent=RUN` generates pairs itself; this verb only generates, also under
     torchrun or as a SLURM array, with the settings of `data.pairs`. Default sampler: adams3 in 32 steps; the paper uses
     --sampler dopri5. renoise samples a flow map in several jumps, as targets for its first jump.
     """
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import PairStore, default_folder, make_pairs
-    from r2flow.runs.lineage import find_parent, pairs_of
+    from r2flow.model.lineage import find_parent
 
     where = choose_device(device)
     if where == "cuda":
@@ -55,13 +55,14 @@ def pairs(
         local = int(os.environ.get("LOCAL_RANK") or os.environ.get("SLURM_LOCALID", "0"))
         where = f"cuda:{local % torch.cuda.device_count()}"  # SLURM may expose one GPU per task
     parent = find_parent(model)
-    assert parent is not None and parent.checkpoint is not None  # noqa: PT018
+    assert parent.checkpoint is not None
     flow = parent.checkpoint
     options = {
         "sampler": {"name": "adams3", **how.given}, "precision": precision, "num": num, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed,
     }  # fmt: skip
-    chosen = PairOptions(**pairs_of(parent, options))
+    record = parent.record()
+    chosen = PairOptions(**options, parent=record["weights"], first=record["first_pair"])
     store = PairStore(out or default_folder(flow.path), chosen, flow.encoding.shape, flow.generator.noise_shape)
     make_pairs(store, flow.generator.to(where), wait=False)
     if missing := store.missing_pairs():

@@ -3,7 +3,9 @@
 import hashlib
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import cached_property
 from typing import Any
 
 import lightning as L
@@ -12,69 +14,157 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow.data.augment import Augmentation
-from r2flow.data.loader import FlowDataset, Further, Item, MixedOrder, Mixture, Permutations, RunLoader, RunSampler
-from r2flow.data.opening import open_source
-from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
+from r2flow.data.loader import FlowDataset, Item, ItemFormat, MixedOrder, Mixture, Order, Permutations, RunSampler
+from r2flow.data.opening import Described
+from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions
 from r2flow.data.pairs import PairDataset, PairStore
-from r2flow.data.reading import Reading
-from r2flow.data.resolving import resolve
+from r2flow.data.reading import AUTO, Reading
+from r2flow.data.resolving import lacking_reflectance, plan_data, reflectance_levels
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
-from r2flow.errors import InputError, check
-from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.sensors import Sensor, build_sensor
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import Encoding, encoding_options
+from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 from r2flow.progress import track
-from r2flow.registry import construct
+from r2flow.registry import check_options, construct
 from r2flow.signals import outlive_the_signal
 
 log = logging.getLogger(__name__)
+
+Scans = Mixture | np.ndarray  # scans, or the numbers of pairs
 
 
 class ScanDataModule(L.LightningDataModule):
     """Projected scans with their noise, or pairs that a flow has drawn, for training and validation.
 
-    `r2flow.data.loader.FlowDataset` describes a batch; `further`, a function of the run's stage, adds items to each of
-    its scans. Noise, of `noise_shape` or the encoding's (C, H, W), times and order derive from the run's seed
-    (`r2flow.noise`). `keys` are those of `r2flow.data.options.DataOptions`.
+    `r2flow.data.loader.FlowDataset` describes a batch. An epoch is a pass over the training scans, without those left
+    over when they are shared in batches; test and prediction use the held-out scans. In a Trainer, scans have the
+    encoding of the module's `item_format`, if it has one. Noise, times and order derive from the seed (`r2flow.noise`).
+
+        data = ScanDataModule("kitti_raw", root="KITTI", sensor="hdl64e_small", batch_size=8)
+
+    Args:
+        name: Kind of scans, a name in `r2flow.data.opening.SOURCES`, `mixed` or `pairs`.
+        sensor: Sensor of the images, its name, YAML file or options.
+        encoding: Encoding of the images, a name in conf/encoding, or options; `reflectance: auto` looks at the scans.
+        seed: Seed of noise, times and order.
+        options: Further fields of `r2flow.data.options.DataOptions`: root, split, batch_size, ...
+
+    Raises:
+        InputError: an unknown name or option.
     """
 
     def __init__(
-        self, sensor: Sensor, encoding: Encoding, seed: int, noise_shape: Sequence[int] | None = None, **keys: Any
+        self,
+        name: str = SIMULATED,
+        sensor: Sensor | str | Mapping[str, Any] = "hdl64e",
+        encoding: Encoding | str | Mapping[str, Any] = "logscale",
+        seed: int = 0,
+        **options: Any,
     ) -> None:
         super().__init__()
-        self.sensor, self.encoding, self.seed = sensor, encoding, seed
-        self.noise_shape = tuple(noise_shape or encoding.shape)
-        self.options = DataOptions(**resolve(keys, sensor.reflectance_scale))
+        self.options = DataOptions(**check_options("data", DataOptions, {"name": name, **options}))
+        self.seed = seed
         self.batch_size = self.options.batch_size
-        self.parts = self.options.sets
-        self.sensors = [sensor if part.sensor is None else build_sensor(**part.sensor) for part in self.parts]
+        self._sensor_options = sensor_options(sensor)
+        self._encoding_options = encoding_options(encoding)
+        self.sensor = build_sensor(**self._sensor_options)
+        self.plan = plan_data(self.options, self.sensor)
         self.augment = construct("data.augment", Augmentation, self.options.augment)
-        self.validation = self.options.validation_options
-        self.further: Further | None = None
+        self.pairs: PairOptions | None = None
+        if name == PAIRS:
+            self.pairs = self.options.pairs
+            if self.augment:
+                raise InputError("data.augment changes scans, and an augmented pair is not a flow's; leave it out.")
+        self.described_sets = [Described(part.name, part) for part in self.plan.sets]  # listed once
+        self.described_held_out = self.plan.held_out and Described(self.plan.held_out.name, self.plan.held_out)
+        self.item_format: ItemFormat | None = None
         self.names: list[str] = []
         self.opened: Sequence[Mixture] = ()  # as found, before they are read
-        self.training_source: Mixture | np.ndarray | None = None  # scans, or the numbers of pairs
-        self.validation_source: Mixture | np.ndarray | None = None
+        self.training_source: Scans | None = None
+        self.validation_source: Scans | None = None
         self.scans: Mixture | None = None  # next to pairs
-        self.pairs: PairOptions | None = None
-        if self.options.name == PAIRS:
-            self.pairs = construct("data.pairs", PairOptions, self.options.pairs)
-            check(not self.augment, "data.augment changes scans, and an augmented pair is not a flow's; leave it out.")
-            check(self.validation.data is None, "data.validation.data cannot be held out from pairs; leave it out.")
+        self.save_hyperparameters(self.described(), logger=False)  # the module logs those that they share
+
+    def described(self) -> dict[str, Any]:
+        """The arguments of this DataModule, complete, as plain values."""
+        plain = asdict(self.options)
+        if self.options.parts is not None:
+            plain["parts"] = [asdict(part) for part in self.plan.sets]
+        elif self.plan.sets:
+            plain["reading"] = asdict(self.plan.sets[0])["reading"]
+        if self.plan.held_out is not None:
+            plain["validation"]["data"] = asdict(self.plan.held_out)
+        if self.plan.scans is not None:
+            plain["scans"] = asdict(self.plan.scans)
+        encoding = self._encoding_options
+        return {**plain, "sensor": self._sensor_options, "encoding": encoding, "seed": self.seed}
+
+    @cached_property
+    def encoding(self) -> Encoding:
+        """Encoding of the images; looks at the scans for whether they have reflectance, and its levels."""
+        options = dict(self._encoding_options)
+        if options["reflectance"] == AUTO:
+            held_out = [self.described_held_out] if self.described_held_out else []
+            lacking = lacking_reflectance([*self.described_sets, *held_out])
+            if lacking:
+                log.info("range alone is learned (encoding.reflectance=auto): %s", lacking)
+            options["reflectance"] = lacking is None
+        if options["levels"] is None and self.plan.sets:
+            options["levels"] = reflectance_levels(self.described_sets)
+        return Encoding(self.sensor, **check_options("encoding", Encoding, options, given=1))
+
+    @property
+    def sensors(self) -> list[Sensor]:
+        """The sensor of each set of scans."""
+        return [build_sensor(**part.sensor) if part.sensor else self.sensor for part in self.plan.sets]
+
+    @property
+    def format(self) -> ItemFormat:
+        """What items are: the module's `item_format`, else this DataModule's encoding and noise of its shape."""
+        return self.item_format or ItemFormat(self.encoding, self.encoding.shape)
+
+    def drawn_by(self, parent: Mapping[str, Any]) -> None:
+        """Complete the identity of the pairs by the record of the flow that draws them (`Parent.record`)."""
+        assert self.pairs is not None
+        first = parent["first_pair"] if self.pairs.first is None else self.pairs.first
+        self.pairs = replace(self.pairs, parent=parent["weights"], first=first)
+        self.options = replace(self.options, root=self.options.root or parent["pairs"], pairs=self.pairs)
+        self.save_hyperparameters(self.described(), logger=False)  # the module logs those that they share
 
     @property
     def pair_store(self) -> PairStore:
         """The folder of the run's pairs, complete or not."""
         assert self.pairs is not None
-        return PairStore(self.options.folder, self.pairs, self.encoding.shape, self.noise_shape)
+        return PairStore(self.options.folder, self.pairs, self.format.encoding.shape, self.format.noise_shape)
 
     def setup(self, stage: str | None = None) -> None:
         """Open the scans; `read` reads them."""
+        module = getattr(self.trainer, "lightning_module", None)
+        wanted = getattr(module, "item_format", None)
+        if isinstance(wanted, ItemFormat):
+            self.adopt(wanted)
         if self.pairs is None and self.training_source is None:
-            self.training_source, self.validation_source = self.opened = self.sources()
+            self.training_source, self.validation_source = self.opened = self._open_all()
             self._order(self.training_source)  # refuses wrong weights before anything is read or written
-        elif self.options.scans is not None and self.scans is None:
-            self.scans = Mixture([self._open(SourceOptions(**self.options.scans))])
-            self.names, self.opened = list(self.scans.names), [self.scans]
+        elif self.plan.scans is not None and self.scans is None:
+            self.scans = Mixture([self._open(Described(self.plan.scans.name, self.plan.scans))])
+            self.names = list(self.scans.names)
+            self.opened = [self.scans]
+
+    def adopt(self, wanted: ItemFormat) -> None:
+        """Make the items that a module takes; refuses scans that it cannot learn from."""
+        sensor = wanted.encoding.sensor
+        if self.pairs is None and not sensor.same_image(self.sensor):
+            ours, theirs = ("x".join(map(str, one.shape)) + f" of {one.name}" for one in (self.sensor, sensor))
+            raise InputError(f"the module's images are {theirs}, the data's {ours}: give both the same sensor.")
+        several = any(part.sensor for part in self.plan.sets)
+        if several and not wanted.several_sensors:
+            raise InputError("this stage learns from scans of one sensor: leave sensor out of data.parts.")
+        for number, one in enumerate(self.sensors if several else ()):
+            if one.shape[0] < wanted.smallest[0] or one.shape[1] < wanted.smallest[1]:
+                least = "x".join(map(str, wanted.smallest))
+                raise InputError(f"data.parts[{number}]: crops of {least} need images as large, found {one.shape}.")
+        self.item_format = wanted
 
     def read(self) -> None:
         """Read the scans into memory if they fit; a second call reads at most one of each set."""
@@ -85,46 +175,51 @@ class ScanDataModule(L.LightningDataModule):
             self.training_source = self._kept(self.training_source, "training scans")
             self.validation_source = self._kept(self.validation_source, "validation scans")
 
-    def sources(self) -> tuple[Mixture, Mixture]:
+    def _open_all(self) -> tuple[Mixture, Mixture]:
         """The training and the validation scans, not yet read.
 
         Without `validation.data`, each part of a mixture holds out one block.
         """
-        whole, first_scene = list[ScanSource](), 0  # parts and held-out scans have different simulated scenes
-        for part, sensor in zip(self.parts, self.sensors, strict=True):
-            whole.append(self._open(part, first_scene, sensor))
-            first_scene += part.scenes if part.name == SIMULATED else 0
-        # A prefix makes the names of the parts' scans distinct.
-        labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
-        self.names = [f"{label}{name}" for label, source in zip(labels, whole, strict=True) for name in source.names]
-        other = self.options.held_out
-        if other is None:
-            training, held = [], []
+        whole: list[ScanSource] = []
+        first_scene = 0  # parts and held-out scans have different simulated scenes
+        for scans, sensor in zip(self.described_sets, self.sensors, strict=True):
+            whole.append(self._open(scans, first_scene, sensor))
+            first_scene += scans.options.scenes if scans.options.name == SIMULATED else 0
+        for number, source in enumerate(whole):
+            label = f"{number}: " if len(whole) > 1 else ""  # makes the names of the parts' scans distinct
+            self.names += [f"{label}{name}" for name in source.names]
+        other = self.described_held_out
+        training, held = whole, list[ScanSource]()
+        if other is not None:
+            held = [self._open(other, first_scene)]
+        else:
+            training = []
             for source in whole:
                 starts = sorted(numbers[0] for numbers in source.drives.values() if len(numbers))
-                first, last = holdout_block(len(source), self.validation.share, starts)
+                first, last = holdout_block(len(source), self.options.validation.share, starts)
                 training.append(source.subset(first))
                 held.append(source.subset(last))
-        else:
-            training, held = whole, [self._open(other, first_scene)]
         if other is not None or len(whole) > 1:
-            trained, validated = (set().union(*(source.places() for source in side)) for side in (training, held))
-            if shared := trained & validated:
-                log.warning(
-                    "%s holds %d scans that are trained on, as %s: give each set its own split or drives",
-                    "data.validation.data" if other else "a held-out block of data.parts",
-                    len(shared), min(shared),
-                )  # fmt: skip
+            self._warn_of_shared(training, held)
         validation = Mixture(held)
-        return Mixture(training), validation.subset(spread(len(validation), self.validation.scans))
+        return Mixture(training), validation.subset(spread(len(validation), self.options.validation.scans))
 
-    def _open(self, options: SourceOptions, first_scene: int = 0, sensor: Sensor | None = None) -> ScanSource:
-        images = {"reflectance": self.encoding.reflectance, "within_limits": True}
-        reading = Reading.of({**options.chosen, **images, "sensor": (sensor or self.sensor).described()})
-        return open_source(options, reading, self.seed, first_scene)
+    def _warn_of_shared(self, training: Sequence[ScanSource], held: Sequence[ScanSource]) -> None:
+        trained = set[str]().union(*(source.places() for source in training))
+        validated = set[str]().union(*(source.places() for source in held))
+        if shared := trained & validated:
+            what = "data.validation.data" if self.plan.held_out else "a held-out block of data.parts"
+            advice = "give each set its own split or drives"
+            log.warning("%s holds %d scans that are trained on, as %s: %s", what, len(shared), min(shared), advice)
 
-    def _order(self, source: Mixture | np.ndarray) -> MixedOrder | Permutations:
-        weights = [part.weight for part in self.parts if part.weight is not None]
+    def _open(self, scans: Described, first_scene: int = 0, sensor: Sensor | None = None) -> ScanSource:
+        images = {"reflectance": self.format.encoding.reflectance, "within_limits": True}
+        own = (sensor or self.format.encoding.sensor).described()
+        reading = Reading.of({**scans.options.chosen, **images, "sensor": own})
+        return scans.open(reading, self.seed, first_scene)
+
+    def _order(self, source: Scans) -> Order:
+        weights = [part.weight for part in self.plan.sets if part.weight is not None]
         if isinstance(source, Mixture) and len(weights) > 1:
             return MixedOrder([len(part) for part in source.parts], weights, self.seed)
         return Permutations(len(source), self.seed)
@@ -154,68 +249,92 @@ class ScanDataModule(L.LightningDataModule):
             parts[i] = InMemory(images, parts[i].names)
         return Mixture(parts)
 
-    def check_run(self, ranks: int, accumulated: int) -> None:
-        """Refuse a run whose global batch cannot be divided among devices."""
-        check(
-            self.batch_size % (ranks * accumulated) == 0,
-            f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
-            f"{accumulated} accumulated batches; give a multiple of {ranks * accumulated}.",
-        )
+    @property
+    def ranks(self) -> tuple[int, int]:
+        """Rank of this process and number of processes."""
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
-    def train_dataloader(self) -> RunLoader:
-        """Batches from the trainer's current step to max_steps."""
-        self._ready()
-        assert self.training_source is not None
-        trainer = self.trainer
-        assert trainer is not None
-        rank, ranks, accumulated = trainer.global_rank, trainer.world_size, trainer.accumulate_grad_batches
-        self.check_run(ranks, accumulated)  # also for a Trainer that `build` did not make
-        check(trainer.max_steps >= 1, "trainer.max_steps must be at least 1: it is the length of a run.")
-        images = trainer.max_steps * self.batch_size
-        sampler = RunSampler(self._order(self.training_source), self.batch_size // accumulated, images, rank, ranks)
-        sampler.first_batch = trainer.global_step * accumulated
-        dataset = self._dataset(self.training_source, "training")
-        return RunLoader(dataset, batch_sampler=sampler, **self._loader_options())
+    def train_dataloader(self) -> DataLoader[Item]:
+        """The batches of an epoch from the trainer's step on.
 
-    def _ready(self) -> None:
+        Raises:
+            InputError: the batch cannot be shared by the devices and accumulated parts.
+        """
+        source, _ = self._ready()
+        rank, ranks = self.ranks
+        parts = self.trainer.accumulate_grad_batches if self.trainer else 1
+        if self.batch_size % (ranks * parts):
+            raise InputError(
+                f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times {parts} accumulated "
+                f"batches; give a multiple of {ranks * parts}."
+            )
+        images = max(len(source) // self.batch_size, 1) * self.batch_size
+        sampler = RunSampler(self._order(source), images, rank, ranks, self._place)
+        return self._loader(self._dataset(source, "training"), sampler, self.batch_size // (ranks * parts))
+
+    def _place(self) -> tuple[int, int]:
+        """The next k of the run, and the number of images of this epoch before it."""
+        if self.trainer is None:
+            return 0, 0
+        batch = self.batch_size // self.trainer.accumulate_grad_batches
+        done = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
+        return self.trainer.global_step * self.batch_size, done * batch
+
+    def _ready(self) -> tuple[Scans, Scans]:
         """Read the scans, and open the pairs, which are made after `setup`."""
         self.read()
         if self.pairs is not None and self.training_source is None:
             pairs = self.pair_store.usable()
-            first, last = holdout_block(len(pairs), self.validation.share)
+            first, last = holdout_block(len(pairs), self.options.validation.share)
             self.training_source = pairs[first]
-            self.validation_source = pairs[last][spread(len(last), self.validation.scans)]
+            self.validation_source = pairs[last][spread(len(last), self.options.validation.scans)]
+        assert self.training_source is not None
+        assert self.validation_source is not None
+        return self.training_source, self.validation_source
 
-    def _dataset(self, source: Mixture | np.ndarray, purpose: str) -> Dataset[Item]:
+    def _dataset(self, source: Scans, purpose: str, whole: bool = False) -> Dataset[Item]:
+        item_format = self.format._replace(further=None) if whole else self.format
         if not isinstance(source, Mixture):
             scans = None
             if self.scans is not None and purpose == "training":
-                scans = FlowDataset(self.scans, self.encoding, self.seed, "beside", None, self.noise_shape)
+                scans = FlowDataset(self.scans, item_format, self.seed, "beside")
             return PairDataset(self.pair_store, source, self.seed, purpose, scans)
         augment = self.augment if purpose == "training" else None
-        sensors = self.sensors if purpose == "training" or self.options.held_out is None else [self.sensor]
-        return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further, sensors)
+        sensors = self.sensors if purpose == "training" or self.plan.held_out is None else []
+        return FlowDataset(source, item_format, self.seed, purpose, augment, sensors)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
         """The held-out scans, each once, without those that are left when the devices share them equally."""
-        self._ready()
-        assert self.validation_source is not None
-        if len(self.validation_source) == 0:
+        return self._held_out_loader()
+
+    def test_dataloader(self) -> DataLoader[Item] | list[Any]:
+        """The held-out scans, to compare generated scans with."""
+        return self._held_out_loader(whole=True)
+
+    def predict_dataloader(self) -> DataLoader[Item] | list[Any]:
+        """The held-out scans, for as many predictions."""
+        return self._held_out_loader(whole=True)
+
+    def _held_out_loader(self, whole: bool = False) -> DataLoader[Item] | list[Any]:
+        _, source = self._ready()
+        if len(source) == 0:
             return []
-        rank, ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        scans, batch_size = len(self.validation_source), max(self.batch_size // ranks, 1)
+        rank, ranks = self.ranks
+        batch_size = max(self.batch_size // ranks, 1)
         # All ranks need the same number of batches, or they would wait for each other: with fewer scans than ranks,
         # every rank takes all scans; otherwise the remainder is left out.
-        if scans < ranks:
+        if len(source) < ranks:
             rank, ranks = 0, 1
-        batches = RunSampler(range(scans), batch_size * ranks, scans - scans % ranks, rank, ranks)
-        dataset = self._dataset(self.validation_source, "validation")
-        return DataLoader(dataset, batch_sampler=batches, **self._loader_options())
+        sampler = RunSampler(range(len(source)), len(source) - len(source) % ranks, rank, ranks)
+        return self._loader(self._dataset(source, "validation", whole), sampler, batch_size)
 
-    def _loader_options(self) -> dict[str, Any]:
-        return {
-            "num_workers": self.options.workers,
-            "persistent_workers": self.options.workers > 0,
-            "worker_init_fn": outlive_the_signal,
-            "pin_memory": torch.cuda.is_available(),
-        }
+    def _loader(self, dataset: Dataset[Item], sampler: RunSampler, batch_size: int) -> DataLoader[Item]:
+        return DataLoader(
+            dataset,
+            batch_size=batch_size,
+            sampler=sampler,
+            num_workers=self.options.workers,
+            persistent_workers=self.options.workers > 0,
+            worker_init_fn=outlive_the_signal,
+            pin_memory=torch.cuda.is_available(),
+        )

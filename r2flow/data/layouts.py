@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from r2flow.data.options import SourceOptions
 from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
@@ -20,6 +21,10 @@ log = logging.getLogger(__name__)
 KITTI_360_SPLIT = {"train": (3, 4, 5, 6, 7, 9, 10), "test": (0, 2)}
 ODOMETRY_SPLIT = {"train": (0, 1, 2, 3, 4, 5, 6, 7, 9, 10), "validation": (8,), "test": tuple(range(11, 22))}
 OBJECT_SPLIT = {"train": ("training",), "test": ("testing",)}
+
+
+if TYPE_CHECKING:
+    from r2flow.data.opening import Described
 
 
 @dataclass(frozen=True)
@@ -39,17 +44,17 @@ class SourceKind(ABC):
     levels: int | None = None  # reflectance is n / levels
 
     @abstractmethod
-    def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+    def open(self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
         """The scans in order, not yet read; `seed` and `first_scene` are for simulated scans.
 
         `reading.reflectance` is True or False.
         """
 
-    def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
+    def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
         """Reason why the scans count as scans without reflectance; None if they have reflectance."""
         return None
 
-    def levels_of(self, options: SourceOptions) -> int | None:
+    def levels_of(self, scans: "Described") -> int | None:
         """The levels of these scans' reflectance, n / levels; None if unknown."""
         return self.levels
 
@@ -103,24 +108,25 @@ class Layout(SourceKind):
             )
         return self.chosen(drives, None, options.drives)
 
-    def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanFiles:
+    def open(self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanFiles:
         if reading.projection == "unfolding" and reading.sensor.name == "hdl64e":
             log.warning(
                 "unfolded rows are the sensor's rings, which are not evenly spaced: sensor=hdl64e_rings has their "
                 "elevations, sensor=hdl64e is up to 6 degrees off"
             )
-        paths, drives = list[str](), dict[str, range]()
-        for drive in self.find_drives(options):
-            drives[drive.name] = range(len(paths), len(paths) + len(drive.scans))
-            paths += drive.scans
+        first = 0
+        drives: dict[str, range] = {}
+        for drive in scans.drives:
+            drives[drive.name] = range(first, first + len(drive.scans))
+            first += len(drive.scans)
+        options = scans.options
         about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
-        warn_of_other_sensor(paths, reading, options.folder)
-        return ScanFiles(paths, reading, options.folder, drives, about)
+        warn_of_other_sensor(scans.paths, reading, options.folder, scans.made_here)
+        return ScanFiles(scans.paths, reading, options.folder, drives, about)
 
-    def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
-        paths = (path for drive in self.find_drives(options) for path in drive.scans)
+    def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
         with leaving_out(on_bad_scan == "error"):
-            return lacks_reflectance(paths, on_bad_scan, options.chosen.get("columns"))
+            return lacks_reflectance(scans.paths, on_bad_scan, scans.options.chosen.get("columns"))
 
 
 def kitti_360(root: Path) -> list[Drive]:

@@ -1,22 +1,34 @@
 """The images of a run as resumable batches, also of mixtures of data sets."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import Dataset
+from torch.utils.data.distributed import DistributedSampler
 
 from r2flow import noise
 from r2flow.data.augment import Augmentation
 from r2flow.data.sources import ScanSource
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.lidar.encoding import FAR, Encoding, wrong_with
 from r2flow.lidar.sensors import Sensor
 
 Item = dict[str, Tensor]
 Further = Callable[[Tensor, Sensor, np.random.Generator], Item]  # of x_1, (C, H, W), its sensor, the image's draws
+Key = int | tuple[int, int]  # of an item: the number k of the image in the run, and that of the scan; or both in one
+
+
+class ItemFormat(NamedTuple):
+    """What a LightningModule takes as an item."""
+
+    encoding: Encoding  # of the scans
+    noise_shape: tuple[int, ...]  # of x_0
+    further: Further | None = None  # makes further entries for training and validation
+    several_sensors: bool = False  # whether parts of a mixture may be scans of different sensors
+    smallest: tuple[int, int] = (1, 1)  # rows and columns that `further` needs
 
 
 class FlowDataset(Dataset[Item]):
@@ -36,26 +48,27 @@ class FlowDataset(Dataset[Item]):
     def __init__(
         self,
         source: ScanSource,
-        encoding: Encoding,
+        item_format: ItemFormat,
         seed: int,
         purpose: str,
         augment: Augmentation | None = None,
-        noise_shape: Sequence[int] | None = None,
-        further: Further | None = None,
-        sensors: Sequence[Sensor] | None = None,
+        sensors: Sequence[Sensor] = (),
     ) -> None:
-        self.source, self.seed, self.purpose = source, seed, purpose
-        self.encodings = [encoding.through(sensor) for sensor in sensors or [encoding.sensor]]
-        self.augment, self.noise_shape = augment, tuple(noise_shape or encoding.shape)
-        self.further = further
+        self.source = source
+        self.format = item_format
+        self.seed = seed
+        self.purpose = purpose
+        self.augment = augment
+        encoding = item_format.encoding
+        self.encodings = [encoding.through(sensor) for sensor in sensors] or [encoding]
 
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, key: tuple[int, int]) -> Item:
-        k, index = key
+    def __getitem__(self, key: Key) -> Item:
+        k, index = (key, key) if isinstance(key, int) else key
         draw = noise.generator(self.seed, self.purpose, k)
-        x_0 = torch.from_numpy(draw.standard_normal(self.noise_shape, dtype=np.float32))
+        x_0 = torch.from_numpy(draw.standard_normal(self.format.noise_shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))
         encoding = self.encodings[self.source.locate(index)[0]]
         image = self.source[index][: encoding.channels]
@@ -67,10 +80,16 @@ class FlowDataset(Dataset[Item]):
             image = self.augment(image, self.seed, k)
         x_1 = encoding.encode(torch.from_numpy(image))
         item = {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
-        if self.further is None:
+        if self.format.further is None:
             return item
         seed = self.seed if self.purpose == "training" else 0
-        return item | self.further(x_1, encoding.sensor, noise.generator(seed, "condition", k))
+        return item | self.format.further(x_1, encoding.sensor, noise.generator(seed, "condition", k))
+
+
+class Order(Protocol):
+    """Maps the number k of an image of a run to the number of its scan."""
+
+    def __getitem__(self, k: int, /) -> int: ...
 
 
 class Permutations:
@@ -80,8 +99,10 @@ class Permutations:
     """
 
     def __init__(self, scans: int, seed: int) -> None:
-        self.scans, self.seed = scans, seed
-        self.epoch, self.order = -1, np.empty(0, dtype=np.int64)
+        self.scans = scans
+        self.seed = seed
+        self.epoch = -1
+        self.order = np.empty(0, dtype=np.int64)
 
     def __getitem__(self, k: int) -> int:
         epoch, turn = divmod(k, self.scans)
@@ -91,39 +112,43 @@ class Permutations:
         return int(self.order[turn])
 
 
-class RunSampler(Sampler[list[tuple[int, int]]]):
-    """The batches of one rank over a whole run, or a validation, as lists of (k, scan), from `first_batch` on.
+class RunSampler(DistributedSampler[Key]):
+    """The images of one rank in an epoch of a run, or a validation, as (k, scan).
 
-    Global batch m holds images [m B, (m + 1) B); rank r of R takes images r, r + R, ... of it. The length is that of
-    the whole run, even if it starts at a later batch: Lightning adds a resumed run's finished batches to its count.
+    An epoch of n images is the range [first, first + n) of k, of which rank r of R takes first + r, first + r + R, ...
+    So batches of b images on each rank are the global batches of b R images, whatever R is. Lightning leaves a
+    `DistributedSampler` as it is.
+
+    Args:
+        order: Maps k to a scan.
+        images: Number n of images of an epoch, on all ranks.
+        place: Gives the next k of the run, and the number of images of this epoch before it, which a resumed run skips.
     """
 
     def __init__(
-        self, order: "Permutations | MixedOrder | range", batch_size: int, images: int, rank: int = 0, ranks: int = 1
+        self,
+        order: Order,
+        images: int,
+        rank: int = 0,
+        ranks: int = 1,
+        place: Callable[[], tuple[int, int]] = lambda: (0, 0),
     ) -> None:
-        self.order, self.batch_size, self.images = order, batch_size, images
-        self.rank, self.ranks = rank, ranks
-        self.first_batch = 0
+        self.order = order
+        self.images = images
+        self.rank = rank
+        self.ranks = ranks
+        self.place = place
 
     def __len__(self) -> int:
-        return -(-self.images // self.batch_size)
+        return self.images // self.ranks
 
-    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        for start in range(self.first_batch * self.batch_size, self.images, self.batch_size):
-            end = min(start + self.batch_size, self.images)
-            yield [(k, self.order[k]) for k in range(start + self.rank, end, self.ranks)]
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        first, done = self.place()
+        for k in range(first + self.rank, first + self.images - done, self.ranks):
+            yield k, self.order[k]
 
-
-class RunLoader(DataLoader[Item]):
-    """A loader whose only epoch is the whole run, by a `RunSampler`."""
-
-    # With these two methods, Lightning treats the loader as resumable. The position itself comes from the trainer's
-    # step (ScanDataModule.train_dataloader), which also works with another number of ranks.
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        pass
+    def set_epoch(self, epoch: int) -> None:
+        """Do nothing: the position in the run is that of the trainer."""
 
 
 class Mixture(ScanSource):
@@ -170,8 +195,10 @@ class MixedOrder:
     """
 
     def __init__(self, sizes: Sequence[int], weights: Sequence[float], seed: int) -> None:
-        check(all(sizes), f"data.parts: a part has no scan left to train on; the parts have {list(sizes)}.")
-        self.seed, self.sizes = seed, sizes
+        if not all(sizes):
+            raise InputError(f"data.parts: a part has no scan left to train on; the parts have {list(sizes)}.")
+        self.seed = seed
+        self.sizes = sizes
         self.edges = np.cumsum(weights) / np.sum(weights)
         self.starts = np.cumsum([0, *sizes])
 

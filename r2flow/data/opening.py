@@ -8,10 +8,9 @@ scan files listed by `find_mine(root)`, or a subclass of `SourceKind`.
 """
 
 import logging
-import math
-from collections.abc import Sequence
-from dataclasses import replace
-from numbers import Real
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_imag
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, mismatch_of, warn_of_other_sensor
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS, Sensor, named_sensor
 from r2flow.models import MODELS
@@ -40,33 +39,36 @@ SCENES = 1000  # default number of simulated scans
 class Simulated(SourceKind):
     levels = 100
 
-    def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        scenes = range(first_scene, first_scene + options.scenes)
+    def open(self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+        scenes = range(first_scene, first_scene + scans.options.scenes)
         return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance))
 
 
 class Prepared(SourceKind):
     """Shards of `r2flow prepare`."""
 
-    def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        folder, split, drives = options.folder, options.split, options.drives
-        store = read_prepared(folder)
+    def open(self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+        options = scans.options
+        store = read_prepared(options.folder)
         refuse_other_images(store, reading)
-        stored, layout = store.drives, store.described["layout"]
+        layout = store.described["layout"]
         kind = SOURCES[layout if layout in SOURCES else FOLDER]
-        if split is None and drives is None:
-            parts = sorted({part for drive in stored if (part := kind.split_of(drive.name))})
+        if options.split is None and options.drives is None:
+            parts = sorted({part for drive in store.drives if (part := kind.split_of(drive.name))})
             if len(parts) > 1:
-                log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(parts))
+                held = " and ".join(parts)
+                log.warning("%s holds %s drives, and data.split=null takes all of them", options.folder, held)
         place = {name: number for number, name in enumerate(store.names)}
-        numbers = [place[name] for drive in kind.chosen(stored, split, drives) for name in drive.scans]
+        chosen = kind.chosen(store.drives, options.split, options.drives)
+        numbers = [place[name] for drive in chosen for name in drive.scans]
         return PreparedScans(store, numbers, bool(reading.reflectance))
 
-    def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
-        return f"the scans in {options.folder} have no reflectance" if self.levels_of(options) is None else None
+    def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
+        folder = scans.options.folder
+        return f"the scans in {folder} have no reflectance" if self.levels_of(scans) is None else None
 
-    def levels_of(self, options: SourceOptions) -> int | None:
-        return read_prepared(options.folder).described["levels"]
+    def levels_of(self, scans: "Described") -> int | None:
+        return read_prepared(scans.options.folder).described["levels"]
 
 
 SOURCES: Registry[SourceKind] = Registry(
@@ -82,8 +84,147 @@ SOURCES: Registry[SourceKind] = Registry(
 )
 
 
+@dataclass(frozen=True)
+class Described:
+    """A set of scans by its name: what it is and where it lies, each looked up once."""
+
+    label: str  # the name, as given
+    options: SourceOptions
+    file: Path | None = None  # if the name is a file
+
+    @property
+    def kind(self) -> SourceKind:
+        return SOURCES[self.options.name]
+
+    @cached_property
+    def drives(self) -> list[Drive]:
+        """The drives of scan files, in order."""
+        return self.kind.find_drives(self.options)
+
+    @cached_property
+    def paths(self) -> list[str | Path]:
+        """The scan files, in order."""
+        return [self.file] if self.file else [path for drive in self.drives for path in drive.scans]
+
+    @cached_property
+    def manifest(self) -> Mapping[str, Any]:
+        """The manifest that r2flow wrote into the folder of the scans; empty if there is none."""
+        return manifest_of(self.options.folder) if self.options.name in (PREPARED, FOLDER) else {}
+
+    @cached_property
+    def stored(self) -> Reading | None:
+        """The stored reading of scans that r2flow wrote (prepared, sampled or simulated); None for other scans."""
+        described = self.manifest.get("recipe", {}).get("reading")
+        if described is None:
+            return None
+        stored = Reading.of(described)
+        return replace(stored, reflectance=AUTO, within_limits=False) if self.options.name == PREPARED else stored
+
+    @cached_property
+    def made_here(self) -> bool:
+        """Whether r2flow wrote the samples or simulated scans, whose reflectance is in [0, 1]."""
+        return self.options.name == FOLDER and (bool(self.manifest) or made_here(self.options.folder))
+
+    @property
+    def is_samples(self) -> bool:
+        """Whether they are samples or completed scans of a model, which are images of one size."""
+        return self.manifest.get("format") in ("r2flow samples", "r2flow answers")
+
+    def scale(self, of_sensor: float | None) -> float:
+        """Default value of full reflectance in the files; `of_sensor`: that of the sensor, if known."""
+        if self.options.name == FOLDER:
+            return 1.0 if self.made_here else of_sensor or 1.0
+        return self.kind.reflectance_scale
+
+    def part(self, **options: Any) -> "Described":
+        """These scans with other options, such as a split."""
+        return Described(self.label, replace(self.options, **options), self.file)
+
+    def open(self, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+        """Open the scans by `SourceKind.open`, after resolving `reading.reflectance`."""
+        options = self.options
+        if options.name == FOLDER:
+            self.refuse_other_samples(reading.sensor)
+            if self.made_here:
+                reading = replace(reading, reflectance_scale=1.0)
+        if reading.reflectance == AUTO:
+            reading = replace(reading, reflectance=self.kind.lacks_reflectance(self, reading.on_bad_scan) is None)
+        source = self.kind.open(self, reading, seed, first_scene)
+        if not len(source):
+            chosen = f"split={options.split!r}, drives={options.drives}"
+            raise InputError(f"{options.root or options.name} holds no usable scan of {chosen}.")
+        return source
+
+    def refuse_other_samples(self, sensor: Sensor) -> None:
+        """Refuse samples or completed scans of another sensor or size."""
+        if not self.is_samples or self.stored is None or self.stored.sensor.same_image(sensor):
+            return
+        theirs, ours = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (self.stored.sensor, sensor))
+        raise InputError(
+            f"{self.options.folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: give no other --sensor "
+            "or --size, no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, "
+            ".bin)."
+        )
+
+    def refuse_parts(self) -> None:
+        """Refuse samples of a region of the image: metrics would treat the rest of the image as missing returns."""
+        if self.manifest.get("recipe", {}).get("region"):
+            raise InputError(
+                f"{self.label} holds a part of each scan alone (see its {MANIFEST}) and cannot be compared with whole "
+                "scans: sample without --sector and --rows."
+            )
+
+
+Spec = str | Path | Described
+
+
+def describe(spec: Spec) -> Described:
+    """Look a name of scans up.
+
+    Args:
+        spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`, `NAME:ROOT` with a
+            name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run folder (its samples).
+
+    Raises:
+        InputError: there is no such file, folder or data set.
+    """
+    if isinstance(spec, Described):
+        return spec
+    text = str(spec)
+    path = Path(text).expanduser()
+    kind, colon, rest = text.partition(":")
+    if colon and kind in SOURCES:
+        if kind == SIMULATED and not rest.isdecimal():
+            raise InputError(f"simulated scans are named by their seed, as simulated:0; found {text!r}.")
+        return Described(text, SourceOptions(kind, rest, scenes=SCENES))
+    if colon and not path.exists() and "/" not in kind and "\\" not in kind:
+        SOURCES[kind]  # not known
+    if path.is_file():
+        return Described(text, SourceOptions(FOLDER, str(path.parent)), path)
+    if not path.exists():
+        raise _not_found(text, path)
+    folder = Described(text, SourceOptions(FOLDER, str(path)))
+    if folder.manifest.get("format") == "r2flow scans":
+        return Described(text, SourceOptions(PREPARED, str(path)))
+    if (path / "config.yaml").is_file() or (path / "checkpoints").is_dir():
+        samples = path / "samples"
+        if not samples.is_dir():
+            raise InputError(f"{path} is a run without samples; draw some: r2flow sample {path} --out {samples}.")
+        return Described(text, SourceOptions(FOLDER, str(samples)))
+    return folder
+
+
+def _not_found(text: str, path: Path) -> InputError:
+    if text in MODELS:
+        return InputError(f"{text} is a model; sample it first: r2flow sample {text} --out scans.")
+    if path.is_symlink():
+        return InputError(f"{path} is a broken link to {path.readlink()}.")
+    hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
+    return InputError(f"{path} does not exist. Give a scan, a folder, NAME:FOLDER, simulated:SEED or a run.{hint}")
+
+
 def open_scans(
-    spec: str | Path,
+    spec: Spec,
     reading: Reading | None = None,
     split: str | None = None,
     num: int | None = None,
@@ -94,77 +235,40 @@ def open_scans(
     """Open the scans of a name. Scans are read on access, except those that decide whether the set has reflectance.
 
     Args:
-        spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`, `NAME:ROOT` with a
-            name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run folder (its samples).
+        spec: As for `describe`.
         reading: How scans become images; None: `reading_for([spec], sensor=sensor, size=size)`.
         split: A part of the data set's standard split.
         num: Maximum number of scans, chosen by a fixed shuffle; the number of simulated scenes.
         own_size: For pictures: take the size of the range image instead of the sensor's, and do not compare beams.
     """
-    label = str(spec)
-    options, file = parse(label)
-    whole = num is None or (hasattr(num, "__index__") and num >= 1)
-    check(whole, f"num must be a whole number of at least 1, or None for all scans; found {num!r}.")
-    check(reading is None or (sensor is None and size is None), "give a reading, or a sensor and a size, not both.")
-    reading = reading or reading_for([label], sensor=sensor, size=size)
-    check(not split or (file is None and options.name != SIMULATED), f"{label} has no split: leave {split!r} out.")
-    if file is None:
-        options = replace(options, split=split, scenes=num or SCENES, reading={"columns": reading.columns})
-        seed = int(options.root or 0) if options.name == SIMULATED else 0
-        return ScanSet(label, open_source(options, reading, seed), reading.sensor).limited(num)
-    image = read_range_image(file)
+    scans = describe(spec)
+    if num is not None and num < 1:
+        raise InputError(f"num must be at least 1, or None for all scans; found {num!r}.")
+    if reading is not None and (sensor is not None or size is not None):
+        raise InputError("give a reading, or a sensor and a size, not both.")
+    reading = reading or reading_for([scans], sensor=sensor, size=size)
+    simulated = scans.options.name == SIMULATED
+    if split and (scans.file or simulated):
+        raise InputError(f"{scans.label} has no split: leave {split!r} out.")
+    if scans.file is None:
+        if split or simulated or reading.columns:
+            scans = scans.part(split=split, scenes=num or SCENES, reading={"columns": reading.columns})
+        seed = int(scans.options.root or 0) if simulated else 0
+        return ScanSet(scans.label, scans.open(reading, seed), reading.sensor).limited(num)
+    image = read_range_image(scans.file)
     if image is not None:  # points can be projected for any sensor
-        refuse_other_samples(file.parent, reading.sensor)
+        scans.refuse_other_samples(reading.sensor)
     elif not own_size:
-        warn_of_other_sensor([file], reading, file)
-    if manifest_of(file.parent):  # its reflectance is in [0, 1]
+        warn_of_other_sensor([scans.file], reading, scans.file, scans.made_here)
+    if scans.manifest:  # its reflectance is in [0, 1]
         reading = replace(reading, reflectance_scale=1.0)
     if own_size and image is not None:
         reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
     if reading.reflectance == AUTO:
-        reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan, reading.columns) is None)
-    return ScanSet(label, ScanFiles([file], reading, file.parent, about={"kind": "file"}), reading.sensor)
-
-
-def open_source(options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-    """Open the scans of some options by `SourceKind.open`, after resolving `reading.reflectance`."""
-    kind = SOURCES[options.name]
-    if options.name == FOLDER:
-        refuse_other_samples(options.folder, reading.sensor)
-        if made_here(options.folder):  # its reflectance is in [0, 1]
-            reading = replace(reading, reflectance_scale=1.0)
-    if reading.reflectance == AUTO:
-        reading = replace(reading, reflectance=kind.lacks_reflectance(options, reading.on_bad_scan) is None)
-    source = kind.open(options, reading, seed, first_scene)
-    chosen = f"split={options.split!r}, drives={options.drives}"
-    check(len(source), f"{options.root or options.name} holds no usable scan of {chosen}.")
-    return source
-
-
-def parse(text: str) -> tuple[SourceOptions, Path | None]:
-    """The options of a name of scans, and the file if the name is a file."""
-    path = Path(text).expanduser()
-    kind, colon, rest = text.partition(":")
-    if colon and kind in SOURCES:
-        if kind == SIMULATED and not rest.isdecimal():
-            raise InputError(f"simulated scans are named by their seed, as simulated:0; found {text!r}.")
-        return SourceOptions(kind, rest, scenes=SCENES), None
-    if colon and not path.exists() and "/" not in kind and "\\" not in kind:
-        SOURCES[kind]  # not known
-    if path.is_file():
-        return SourceOptions(FOLDER, str(path.parent)), path
-    if not path.exists():
-        check(text not in MODELS, f"{text} is a model; sample it first: r2flow sample {text} --out scans.")
-        if path.is_symlink():
-            raise InputError(f"{path} is a broken link to {path.readlink()}.")
-        hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
-        raise InputError(f"{path} does not exist. Give a scan, a folder, NAME:FOLDER, simulated:SEED or a run.{hint}")
-    if manifest_of(path).get("format") == "r2flow scans":
-        return SourceOptions(PREPARED, str(path)), None
-    if (path / "config.yaml").is_file() or (path / "checkpoints").is_dir():
-        run, path = path, path / "samples"
-        check(path.is_dir(), f"{run} is a run without samples; draw some: r2flow sample {run} --out {path}.")
-    return SourceOptions(FOLDER, str(path)), None
+        lacking = lacks_reflectance([scans.file], reading.on_bad_scan, reading.columns)
+        reading = replace(reading, reflectance=lacking is None)
+    source = ScanFiles([scans.file], reading, scans.file.parent, about={"kind": "file"})
+    return ScanSet(scans.label, source, reading.sensor)
 
 
 def find_drives(
@@ -175,7 +279,7 @@ def find_drives(
 
 
 def reading_for(
-    scans: Sequence[str | Path | None],
+    scans: Sequence[Spec | None],
     model: Any = None,
     sensor: Sensor | str | None = None,
     size: tuple[int, int] | None = None,
@@ -185,42 +289,43 @@ def reading_for(
     """How scans become images: `fields` first, then the model's training scans, the scans' manifest, the defaults.
 
     `fields` are those of `Reading`; None is not given. The default sensor is hdl64e, or the built-in sensor whose beams
-    plain scan files have. Scans have names as for `open_scans`; None is skipped. `model` is the checkpoint that they
+    plain scan files have. Scans have names as for `describe`; None is skipped. `model` is the checkpoint that they
     are for: another sensor or size than its own is refused. `estimate_scale` leaves None for plain scan files whose
     sensor does not tell it: an estimate.
     """
-    specs = [str(spec) for spec in scans if spec is not None]
-    stored = next((reading for spec in specs if (reading := own_reading(spec)) is not None), None)
-    options = parse(specs[0])[0] if specs else SourceOptions(FOLDER)
-    reading = _reading_of(model) if model else stored or Reading(SENSORS[SOURCES[options.name].sensor])
+    described = [describe(spec) for spec in scans if spec is not None]
+    stored = next((one.stored for one in described if one.stored is not None), None)
+    first = described[0] if described else Described("", SourceOptions(FOLDER))
+    if model:
+        reading = _reading_of(model)
+    else:
+        reading = stored or Reading(SENSORS[first.kind.sensor])
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if v is not None}
     reading = replace(reading, **given)
-    if specs and not (model or stored or sensor):
-        sensor = _detected(specs[0], reading)
+    if described and not (model or stored or sensor):
+        sensor = _detected(first, reading)
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and not chosen.same_image(model.sensor):
         expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
         raise InputError(f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out.")
     reading = replace(reading, sensor=reading.sensor if model else chosen)
-    if "reflectance_scale" in given or not specs:
+    if "reflectance_scale" in given or not described:
         return reading
     trained = reading.reflectance_scale  # 1: also of scans that were scaled before the training
     scale = trained if model and trained != 1 else reading.sensor.reflectance_scale
-    if not estimate_scale or stored or options.name != FOLDER:
-        scale = scale_of(options, scale)
+    if not estimate_scale or stored or first.options.name != FOLDER:
+        scale = first.scale(scale)
     return replace(reading, reflectance_scale=scale)
 
 
-def _detected(spec: str, reading: Reading) -> str | None:
+def _detected(scans: Described, reading: Reading) -> str | None:
     """The built-in sensor of plain scan files whose beams are not those of `reading.sensor`."""
-    options, file = parse(spec)
-    if options.name != FOLDER:
+    if scans.options.name != FOLDER:
         return None
-    paths = [file] if file else [path for drive in SOURCES[FOLDER].find_drives(options) for path in drive.scans]
-    mismatch = mismatch_of(paths, reading, options.folder)
+    mismatch = mismatch_of(scans.paths, reading, scans.made_here)
     if mismatch is None or not mismatch.sure:
         return None
-    log.warning("%s: read as scans of %s, whose beams are nearest; --sensor names another", spec, mismatch.name)
+    log.warning("%s: read as scans of %s, whose beams are nearest; --sensor names another", scans.label, mismatch.name)
     return mismatch.name
 
 
@@ -233,51 +338,29 @@ def _reading_of(model: Any) -> Reading:
     return Reading(model.sensor, **{key: value for key, value in agreed.items() if value is not None})
 
 
-def read(path: str | Path, sensor: Sensor | str | None = None, reflectance_scale: float | None = None) -> Tensor:
-    check(isinstance(path, str | Path), f"give the path of a scan; found {type(path)}.")
-    right = reflectance_scale is None or (isinstance(reflectance_scale, Real) and 0 < reflectance_scale < math.inf)
-    check(right, f"reflectance_scale must be a positive number, found {reflectance_scale!r}.")
-    options, file = parse(str(path))
-    check(options.name != FOLDER or file, f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
-    reading = reading_for([path], sensor=sensor, reflectance_scale=reflectance_scale, estimate_scale=True)
-    image = torch.from_numpy(open_scans(path, replace(reading, on_bad_scan="error", within_limits=True)).source[0])
+def read(
+    path: str | Path,
+    sensor: Sensor | str | None = None,
+    reflectance_scale: float | None = None,
+    columns: Sequence[str] | None = None,
+) -> Tensor:
+    scans = describe(path)
+    if scans.file is None:
+        raise InputError(f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
+    given = {"sensor": sensor, "reflectance_scale": reflectance_scale, "columns": columns}
+    reading = reading_for([scans], estimate_scale=True, **given)
+    image = torch.from_numpy(open_scans(scans, replace(reading, on_bad_scan="error", within_limits=True)).source[0])
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
 
 
-def own_reading(spec: str | Path) -> Reading | None:
-    """The stored reading of scans that r2flow wrote (prepared, sampled or simulated); None for other scans."""
-    options, _ = parse(str(spec))
-    if options.name not in (PREPARED, FOLDER):
-        return None
-    stored = Reading.stored(options.folder)
-    return replace(stored, reflectance=AUTO, within_limits=False) if stored and options.name == PREPARED else stored
+def own_reading(spec: Spec) -> Reading | None:
+    return describe(spec).stored
 
 
-def scale_of(options: SourceOptions, of_sensor: float | None) -> float:
-    """Default value of full reflectance in the files of a set of scans; `of_sensor`: that of the sensor, if known."""
-    if options.name == FOLDER:
-        return 1.0 if made_here(options.folder) else of_sensor or 1.0
-    return SOURCES[options.name].reflectance_scale
+def parse(text: str) -> tuple[SourceOptions, Path | None]:
+    scans = describe(text)
+    return scans.options, scans.file
 
 
-def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
-    """Refuse a folder of samples or completed scans of another sensor or size."""
-    stored, reading = sensor, Reading.stored(folder)
-    if reading and manifest_of(folder)["format"] in ("r2flow samples", "r2flow answers"):
-        stored = reading.sensor
-    theirs, ours = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (stored, sensor))
-    check(
-        stored.same_image(sensor),
-        f"{folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: give no other --sensor or --size, "
-        "no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, .bin).",
-    )
-
-
-def refuse_parts(spec: str | Path) -> None:
-    """Refuse samples of a region of the image: metrics would treat the rest of the image as missing returns."""
-    options, _ = parse(str(spec))
-    if options.name == FOLDER and manifest_of(options.folder).get("recipe", {}).get("region"):
-        raise InputError(
-            f"{spec} holds a part of each scan alone (see its {MANIFEST}) and cannot be compared with whole scans: "
-            "sample without --sector and --rows."
-        )
+def refuse_parts(spec: Spec) -> None:
+    describe(spec).refuse_parts()

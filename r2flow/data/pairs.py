@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from r2flow import noise
-from r2flow.data.loader import FlowDataset, Item, Permutations
+from r2flow.data.loader import FlowDataset, Item, Key, Permutations
 from r2flow.data.options import PairOptions
 from r2flow.errors import InputError, check
 from r2flow.files import telling
@@ -170,8 +170,11 @@ class PairDataset(Dataset[Item]):
         self.store, self.numbers, self.seed, self.purpose, self.scans = store, numbers, seed, purpose, scans
         self.order = Permutations(0 if scans is None else len(scans), seed)
 
-    def __getitem__(self, key: tuple[int, int]) -> Item:
-        k, index = key
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, key: Key) -> Item:
+        k, index = (key, key) if isinstance(key, int) else key
         store, number = self.store, int(self.numbers[index])
         shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
         with telling(path := store.files(shard)[0]), safe_open(path, framework="pt") as file:

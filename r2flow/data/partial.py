@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, scale_of
+from r2flow.data.opening import Described, describe, open_scans
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
@@ -63,19 +63,18 @@ def open_partial(
         most: Maximum number of scans per name, evenly spread; None: all scans, or `FEW` simulated scans.
     """
     opened: list[Opened] = []
-    groups: dict[tuple[Path, str], list[Path]] = {}  # files by their folder and name
+    files: dict[Path, list[Described]] = {}  # by their folder
     for spec in specs:
-        options, file = parse(str(spec))
-        if options.name in (SIMULATED, PREPARED):
-            opened.append(_images(str(spec), reading, source, most))
-        elif file is not None:
-            groups.setdefault((file.parent, ""), []).append(file)
+        scans = describe(spec)
+        if scans.options.name in (SIMULATED, PREPARED):
+            opened.append(_images(scans, reading, source, most))
+        elif scans.file is not None:
+            files.setdefault(scans.file.parent, []).append(scans)
         else:
-            paths = [Path(path) for drive in SOURCES[options.name].find_drives(options) for path in drive.scans]
-            chosen = [points_beside(paths[number]) for number in spread(len(paths), most or len(paths))]
-            groups[options.folder, str(spec)] = chosen
-    for (folder, spec), paths in groups.items():
-        opened.append(_files(folder, paths, spec or str(paths[0]), reading, source, scale))
+            paths = [points_beside(scans.paths[number]) for number in spread(len(scans.paths), most or len(scans.paths))]
+            opened.append(_files(scans, paths, reading, source, scale))
+    for together in files.values():
+        opened.append(_files(together[0], [one.file for one in together if one.file], reading, source, scale))
     scans = [scan for some, _ in opened for scan in some]
     if duplicates := [name for name, count in Counter(scan.name for scan in scans).items() if count > 1]:
         raise InputError(f"two of the scans would have answers called {duplicates[0]}: complete them apart.")
@@ -83,10 +82,13 @@ def open_partial(
 
 
 def _files(
-    folder: Path, paths: list[Path], spec: str, reading: Reading, source: Sensor | None, scale: float | None
+    described: Described, paths: list[Path], reading: Reading, source: Sensor | None, scale: float | None
 ) -> Opened:
-    target, lines = reading.sensor, list[str]()
-    stored = own_reading(folder)
+    target = reading.sensor
+    lines: list[str] = []
+    stored = described.stored
+    folder = described.options.folder
+    spec = described.label
     source = source or (stored.sensor if stored else None)
     images = {path for path in paths if path.suffix.lower() == ".npy" and read_numbers(path).ndim == 3}
     read_image: Callable[[Path], Partial] = partial(_read_image, source=source, target=target)
@@ -108,8 +110,8 @@ def _files(
         if not stored and not warn_of_frame(points[0], scans) and source and doubt and not doubt.finer:
             fits = f"; they fit {doubt.name}" if doubt.name else ""
             warn_odd(points[0], f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}")
-        of_sensor, options = known.reflectance_scale if known else None, parse(spec)[0]
-        usual = scale_of(options, of_sensor) if options.name != FOLDER or of_sensor else 0.0
+        of_sensor = known.reflectance_scale if known else None
+        usual = described.scale(of_sensor) if described.options.name != FOLDER or of_sensor else 0.0
         full = scale or (1.0 if stored else full_reflectance(scans, usual) or usual) or 1.0
         strict = scale is not None or full in FULL_REFLECTANCE
         as_own = same and fired.columns >= FEWER * target.columns
@@ -132,12 +134,14 @@ def _files(
     return [opened(path) for path in paths], lines
 
 
-def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None) -> Opened:
+def _images(described: Described, reading: Reading, source: Sensor | None, most: int | None) -> Opened:
     """Simulated and prepared scans, named by their number in the whole set."""
-    target, stored = reading.sensor, own_reading(spec)
+    spec = described.label
+    target = reading.sensor
+    stored = described.stored
     simulated = stored is None
     stored = stored or replace(reading, sensor=source or target)
-    scans = open_scans(spec, stored, num=(most or FEW) if simulated else None).source
+    scans = open_scans(described, stored, num=(most or FEW) if simulated else None).source
     kind = spec.replace(":", "-") if simulated else Path(spec).name
 
     def opened(number: int) -> PartialScan:

@@ -105,7 +105,7 @@ def read_labelled_scan(path: Path, file: Path, reading: Reading) -> tuple[np.nda
 def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
         f"{path} has no reflectance, and other scans, a metric or the model need it. Give scans with it, metrics of "
-        "range or a model of range alone (in training encoding.reflectance=false without a stage.init that has it)."
+        "range or a model of range alone (in training encoding.reflectance=false without a stage.parent that has it)."
     )
 
 

@@ -104,21 +104,23 @@ def readable(paths: Sequence[str | Path], columns: Sequence[str] | None) -> Iter
             yield read_points(path, columns)
 
 
-def mismatch_of(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> Doubt | None:
+def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Doubt | None:
     """The mismatch of a few scan files and a sensor (`other_sensor`); warns instead of one due to their frame.
 
-    Files that r2flow wrote store their sensor; other range images have no beams. Unreadable files are reported when
-    they are read as scans.
+    Files of `ours`, that r2flow wrote, store their sensor; other range images have no beams. Unreadable files are
+    reported when they are read as scans.
     """
-    if made_here(root):
-        readings, ours = map(Reading.stored, sorted(set(map(os.path.dirname, paths)))), reading.sensor
-        stored = [stored.sensor for stored in readings if stored]
-        others = [s for s in stored if s.name != ours.name or ours.name not in SENSORS or s.shape[0] < ours.shape[0]]
-        theirs = next((s for s in others if not s.resized(*ours.shape).same_image(ours)), None)
-        if theirs is None:
-            return None
-        seen, known = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}", theirs.name in SENSORS
-        return Doubt(seen, theirs.name if known else None, sure=known)
+    if ours:
+        sensor = reading.sensor
+        for folder in sorted({os.path.dirname(path) for path in paths}):
+            stored = Reading.stored(folder)
+            theirs = stored.sensor if stored else sensor
+            differs = theirs.name != sensor.name or sensor.name not in SENSORS or theirs.shape[0] < sensor.shape[0]
+            if differs and not theirs.resized(*sensor.shape).same_image(sensor):
+                seen = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}"
+                known = theirs.name in SENSORS
+                return Doubt(seen, theirs.name if known else None, sure=known)
+        return None
     scans = [*readable([paths[number] for number in spread(len(paths), LOOKED_AT)], reading.columns)]
     mismatch = other_sensor(scans, reading.sensor) if scans else None
     if not scans or (mismatch and mismatch.hopeless):
@@ -133,9 +135,15 @@ def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
     return unclear
 
 
-def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:
-    """Warn if scan files do not match a sensor (`mismatch_of`), and name the sensor that matches."""
-    mismatch, sensor = mismatch_of(paths, reading, root), reading.sensor
+def warn_of_other_sensor(
+    paths: Sequence[str | Path], reading: Reading, root: str | Path, ours: bool | None = None
+) -> None:
+    """Warn if scan files do not match a sensor (`mismatch_of`), and name the sensor that matches.
+
+    `ours`: whether r2flow wrote them; None: look (`made_here`).
+    """
+    sensor = reading.sensor
+    mismatch = mismatch_of(paths, reading, made_here(root) if ours is None else ours)
     if mismatch is None or mismatch.finer:
         return
     seen, name, hopeless = mismatch[:3]

@@ -173,7 +173,7 @@ class Generator(nn.Module):
         except RuntimeError:
             raise InputError(
                 f"the weights of a {type(parent).__name__} do not fit this {type(self).__name__}: give the "
-                "generator and the options that it was trained with, or leave stage.init out."
+                "generator and the options that it was trained with, or leave stage.parent out."
             ) from None
 
     @property

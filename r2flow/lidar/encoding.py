@@ -13,7 +13,16 @@ from torch import Tensor
 from r2flow.errors import check
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.registry import Bound, Registry, check_options, construct
+from r2flow.registry import (
+    Bound,
+    Registry,
+    UnknownName,
+    check_options,
+    construct,
+    did_you_mean,
+    options_of,
+    presets,
+)
 
 LIMIT_TOLERANCE = 1e-5  # relative, of closed range limits in decoding, for float32's rounding
 FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
@@ -120,6 +129,11 @@ class Encoding:
         self.limits, self.levels = limits, levels
         self.format = FORMATS[format](sensor)
 
+    def described(self) -> dict[str, Any]:
+        """All options but the sensor, as plain values."""
+        name = FORMATS.name_of(type(self.format))
+        return {"format": name, "reflectance": self.reflectance, "limits": self.limits, "levels": self.levels}
+
     def through(self, sensor: Sensor) -> "Encoding":
         """The same encoding of another sensor's ranges; the levels of its reflectance are not known."""
         other = copy(self)
@@ -224,6 +238,19 @@ class ModelSpace:
         check(images.ndim == 4 and images.shape[1] < 3, f"images are (B, 2 or 1, H, W), found {tuple(images.shape)}.")
         clouds = (image_to_points(image, rays) for image in images.detach().float().cpu().numpy())
         return [np.column_stack(cloud) for cloud in clouds]
+
+
+def encoding_options(encoding: Encoding | str | Mapping[str, Any]) -> dict[str, Any]:
+    """Complete options of an encoding, from itself, the name of a file in conf/encoding, or some of the options."""
+    if isinstance(encoding, Encoding):
+        return encoding.described()
+    if not isinstance(encoding, str):
+        return {**options_of(Encoding, given=1), **encoding}
+    known = presets("encoding")
+    if encoding not in known:
+        hint = did_you_mean(encoding, known)
+        raise UnknownName(f"no encoding named {encoding!r}; known: {', '.join(sorted(known))}.{hint}")
+    return {**options_of(Encoding, given=1), **known[encoding]}
 
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:

@@ -1,7 +1,7 @@
 """Sensors: spinning LiDARs, described by their rays, by name or in YAML files, as in conf/sensor/."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError, check
 from r2flow.files import atomic_write, reading
-from r2flow.registry import Registry, UnknownName, construct
+from r2flow.registry import Registry, UnknownName, check_options, construct, options_of
 
 Rays = Literal["centre", "reference"]
 Convention = Literal[Rays, "lidargen", "lidm"]
@@ -231,9 +231,10 @@ def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> S
     if str(sensor).lower().endswith(ENDINGS):
         return read_sensor(sensor, *(size or (None, None)))
     try:
-        return build_sensor(str(sensor), *(size or (None, None)))
+        named = build_sensor(**sensor_options(str(sensor)))
     except UnknownName as error:
         raise UnknownName(f"{error} Your own is a YAML file: r2flow sensor SCANS --out NAME.yaml") from None
+    return named if size is None else named.resized(*size)
 
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
@@ -250,3 +251,17 @@ def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
     options = {key: np.asarray(value).tolist() for key, value in asdict(sensor).items()}  # NumPy's numbers as Python's
     named = {"rows": len(sensor.elevations), "elevations": None} if sensor.name in SENSORS else {}  # beams by the name
     return {**options, "rows": None, "rays": "centre", **named}
+
+
+def sensor_options(sensor: Sensor | str | Mapping[str, Any]) -> dict[str, Any]:
+    """Complete options of `build_sensor`, from a sensor, its name, a YAML file, or some of the options.
+
+    Raises:
+        InputError: an unknown name or option.
+    """
+    if isinstance(sensor, Sensor):
+        return options_of_sensor(sensor)
+    if isinstance(sensor, str) and sensor.lower().endswith(ENDINGS):
+        return options_of_sensor(read_sensor(sensor))
+    chosen = {**options_of(build_sensor), **SENSORS.options(sensor)}
+    return check_options("sensor", build_sensor, chosen)

@@ -20,7 +20,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from r2flow.config import check_tree, learned
-from r2flow.data.opening import own_reading, reading_for
+from r2flow.data.opening import describe, reading_for
 from r2flow.data.partial import PartialScan, open_partial
 from r2flow.errors import IN_MEMORY, InputError, check, naming
 from r2flow.files import telling, write_file
@@ -39,7 +39,9 @@ from r2flow.samplers import build_sampler
 FOLDER = "checkpoints"
 PREFIX = "generator."  # of the generator's weights in a LightningModule
 COMPILED = "_orig_mod."  # in the names of the weights after torch.compile
-NOTES = "r2flow"  # key of the JSON metadata in a .safetensors
+HYPER = "hyper_parameters"  # Lightning's key of a module's options
+NOTES = "r2flow"  # key of our notes in a checkpoint of Lightning, and of the JSON metadata in a .safetensors
+MODEL = ("backbone", "sensor", "encoding", "generator")  # hyper-parameters of the model, the others are the stage's
 SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors
 
 
@@ -140,7 +142,7 @@ class Checkpoint:
 
     def _coarser(self, spec: str) -> bool:
         """Whether r2flow wrote some scans as images of this sensor in another size."""
-        stored = own_reading(spec)
+        stored = describe(spec).stored
         return stored is not None and self.sensor.resized(*stored.sensor.shape).same_image(stored.sensor)
 
     def through(self, sensor: Sensor | str, numbered: bool = True) -> "Checkpoint":
@@ -216,7 +218,7 @@ def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
             if not isinstance(content, dict):
                 return content
             content = {key: plain(value) for key, value in content.items()}
-            check_tree(content.get("config") or {})
+            check_tree(content.get(HYPER) or {})
             return content
     except Exception as error:  # torch.load raises nearly any exception on other files
         if isinstance(error, OSError) and error.errno is not None:
@@ -253,11 +255,13 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     Raises `InputError` without a usable checkpoint, or if the weights do not fit the config.
     """
     path = find_checkpoint(path)
-    with telling(path):
-        content = read_safetensors(path) if path.suffix == ".safetensors" else read_checkpoint(path)
     try:
-        with naming(path):
-            checkpoint = _built(content, path, averaged)
+        with naming(path), telling(path):
+            if path.suffix == ".safetensors":
+                notes = read_safetensors(path)
+                checkpoint = _built(notes["config"], notes["weights"], notes, path, int(notes["step"]))
+            else:
+                checkpoint = _of_torch(read_checkpoint(path), path, averaged)
     except InputError:
         raise
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
@@ -265,26 +269,41 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     return replace(checkpoint, generator=checkpoint.generator.to(device))
 
 
-def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
-    if published := next((known for known in FORMATS.values() if known.holds(content)), None):
+def _of_torch(content: Any, path: Path, averaged: bool) -> Checkpoint:
+    """The generator of a torch file, of Lightning or of a published system."""
+    published = next((known for known in FORMATS.values() if known.holds(content)), None)
+    if published is not None:
         converted = published.read(content, path, averaged)
-        config, weights, step, kind = converted.config, converted.weights, converted.step, "published"
+        config = converted.config
         if converted.elevations is not None:  # elevations of its own need a name of its own, as in `build_sensor`
             rings = torch.rad2deg(converted.elevations.double()).tolist()
             config["sensor"] |= {"name": "hdl64e_rings_published", "elevations": rings, "rays": "centre"}
-        drawing: Mapping[str, Any] = {"sampler": converted.sampler, "fixed": converted.fixed}
-    elif isinstance(content, dict) and "config" in content and "state_dict" in content:
+        drawing = {"sampler": converted.sampler, "fixed": converted.fixed}
+        return _built(config, converted.weights, drawing, path, converted.step, "published")
+    if isinstance(content, dict) and {HYPER, NOTES, "state_dict"} <= content.keys():
         state: Any = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
-        config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
-        drawing = content
-    else:
-        systems = ", ".join(known.system for known in FORMATS.values())
-        found = ", ".join(map(repr, list(content)[:6])) if isinstance(content, dict) else type(content).__name__
-        raise InputError(
-            f"{path} is a torch file but is not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
-            f"(ours) nor a published layout ({systems}); found {found}."
-        )
+        notes = content[NOTES]
+        config = config_of(content[HYPER], content.get("datamodule_hyper_parameters") or {}, notes["stage"])
+        config |= {"plugins": notes["plugins"], "trainer": {"max_steps": notes["total_steps"]}}
+        return _built(config, weights, notes, path, int(content.get("global_step", 0)))
+    systems = ", ".join(known.system for known in FORMATS.values())
+    found = ", ".join(map(repr, list(content)[:6])) if isinstance(content, dict) else type(content).__name__
+    raise InputError(
+        f"{path} is a torch file but is not a checkpoint of a generator: it has neither '{HYPER}' and '{NOTES}' (of a "
+        f"stage in a Lightning Trainer) nor a published layout ({systems}); found {found}."
+    )
+
+
+def _built(
+    config: dict[str, Any],
+    weights: Mapping[str, Tensor],
+    drawing: Mapping[str, Any],
+    path: Path,
+    step: int,
+    kind: str = "r2flow",
+) -> Checkpoint:
+    """The generator of a config with its weights and default samplers."""
     # First weights are drawn and replaced: neither the caller's random numbers nor torch's defaults matter.
     with made_with(config, str(path)), torch.random.fork_rng(devices=[]), torch.device("cpu"), ExitStack() as stack:
         stack.callback(torch.set_default_dtype, torch.get_default_dtype())
@@ -296,6 +315,18 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
             few = drawing.get("few")
             generator.run_by(build_sampler(drawing["sampler"]), few and build_sampler(few), bool(drawing.get("fixed")))
     return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind)
+
+
+def config_of(stage: Mapping[str, Any], data: Mapping[str, Any], name: str | None) -> dict[str, Any]:
+    """The config of a model by the hyper-parameters of its stage, of this name, and of its data.
+
+    Its keys are the hyper-parameters of `MODEL`, `sampler`, `few` and `seed`, `stage` with the others, and `data`.
+    """
+    options = dict(stage)
+    config: dict[str, Any] = {key: options.pop(key) for key in (*MODEL, "sampler", "few", "seed")}
+    config["stage"] = {"name": name, **options}
+    config["data"] = {key: value for key, value in data.items() if key not in ("sensor", "encoding", "seed")}
+    return config
 
 
 def weights_hash(checkpoint: Checkpoint) -> str:
@@ -312,16 +343,13 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def read_safetensors(path: Path) -> dict[str, Any]:
-    """Read weights and config of an r2flow `.safetensors`, in the layout of the other checkpoints."""
+    """Read `weights`, config, step and samplers of an r2flow `.safetensors`."""
     weights, metadata = read_tensors(path)
     notes = json.loads(metadata.get(NOTES, "{}"))
     if not isinstance(notes, dict) or notes.pop("digest", None) != state_hash(weights, notes):
         raise InputError(f"{path} is not a model of r2flow, or damaged: its checksum differs. Use another checkpoint.")
-    config, step = notes["config"], int(notes["step"])
-    check_tree(config)
-    state = {PREFIX + name: value for name, value in weights.items()}
-    drawing = {key: notes.get(key) for key in ("sampler", "few", "fixed")}
-    return {"config": config, "global_step": step, "state_dict": state, **drawing}
+    check_tree(notes["config"])
+    return notes | {"weights": weights}
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Trained generators by name: `r2flow.load("street")`, `r2flow sample street`, `stage.init=street`."""
+"""Trained generators by name: `r2flow.load("street")`, `r2flow sample street`, `stage.parent=street`."""
 
 import hashlib
 from dataclasses import dataclass

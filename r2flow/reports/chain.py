@@ -85,7 +85,9 @@ Open {out / "chain.png"} first.""",
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
     """Validation scans of a run, (N, 2 or 1, H, W) in metres and reflectance."""
     config = read_config(run) or flow.config  # the folder's config has the current path of the scans
-    _, held = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **config["data"]).sources()
+    data = ScanDataModule(**config["data"], sensor=config["sensor"], encoding=config["encoding"], seed=config["seed"])
+    data.setup()
+    held = data.validation_source
     return np.stack([held[i] for i in track(range(len(held)), "reading held-out scans", "scans")])
 
 

@@ -125,7 +125,7 @@ def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
     if config["data"]["name"] == "simulated":
         then = "train data=kitti_raw data.root=FOLDER backbone=hdit_small"
     elif experiment:
-        then = f"train experiment={experiment} {as_override('stage.init', run)}{plugins}"
+        then = f"train experiment={experiment} {as_override('stage.parent', run)}{plugins}"
     else:
         then = f"evaluate REAL {quoted}{plugins}"
     return f"""

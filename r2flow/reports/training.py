@@ -70,7 +70,7 @@ def smooth(steps: np.ndarray, values: np.ndarray) -> Curve:
     return np.convolve(steps, kernel, "valid"), np.convolve(values, kernel, "valid")
 
 
-def finish(run: Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int, kept: bool) -> None:
+def finish(run: Path, samples: Mapping[str, Any], seed: int, device: str, finished: bool, kept: bool) -> None:
     """Draw the loss curve and a few scans of a run; print its files and the commands that come next.
 
     `kept`: the run keeps checkpoints.
@@ -82,8 +82,8 @@ def finish(run: Path, samples: Mapping[str, Any], seed: int, device: str, max_st
         print("stopped before a checkpoint was kept: the same command starts it again" if kept else configured)
         return
     checkpoint = load_checkpoint(run, device)
-    if checkpoint.step < max_steps:
-        print(f"stopped at step {checkpoint.step} of {max_steps}: the same command resumes from here")
+    if not finished:
+        print(f"stopped at step {checkpoint.step}: the same command resumes from here")
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
         single = " (single batches: too few to compare)" if tenth == 1 and name.startswith("train/") else ""

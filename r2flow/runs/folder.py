@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from r2flow.config import at_most_three, check_tree, differences, flatten, rule
 from r2flow.errors import InputError, check
 from r2flow.files import write_file
-from r2flow.model.checkpoint import FOLDER, checkpoints_of, read_checkpoint, step_of
+from r2flow.model.checkpoint import FOLDER, HYPER, NOTES, checkpoints_of, read_checkpoint, step_of
 
 log = logging.getLogger(__name__)
 
@@ -43,31 +43,43 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
 
 
 def read_config(run: str | Path) -> dict[str, Any] | None:
-    """The config of a run folder, or None. If the file is missing, the config of the newest checkpoint."""
+    """The config of a run folder, or None."""
     path = Path(run, CONFIG)
     if not path.is_file():
-        stored = (content.get("config") for _, content in _readable(run))
-        return next((config for config in stored if isinstance(config, dict)), None) or None
+        return None
     try:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
         check_tree(config)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
-        raise InputError(
-            f"{path} is damaged ({str(error).splitlines()[0]}); remove it, and r2flow takes the config of the run's "
-            "newest checkpoint."
-        ) from None
+        raise InputError(f"{path} is damaged ({str(error).splitlines()[0]}); the checkpoints are usable.") from None
     return dict(config) or None
+
+
+def has_ended(run: str | Path) -> bool:
+    """Whether a run's last checkpoint is that of its last step."""
+    config = read_config(run)
+    last = next(iter(checkpoints_of(run)), None)
+    if config is None or last is None:
+        return False
+    options = config["trainer"]
+    total = options["max_steps"]
+    if options["max_epochs"] != -1:
+        total = read_checkpoint(last)[NOTES]["total_steps"]
+    return 0 < total <= step_of(last)
 
 
 def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) -> Path | None:
     """The newest readable checkpoint to resume a run from, or None for a new run; writes if its folder is `locked`."""
     for leftover in Path(run, FOLDER).glob(".*.part") if locked else ():  # of killed writers
         leftover.unlink(missing_ok=True)
-    old, last = read_config(run), None
-    if old and (last := next((path for path, _ in _readable(run, RESUMED)), None)):
+    old = read_config(run)
+    last = next((path for path, _ in _readable(run, RESUMED)), None)
+    if last is not None and old is None:
+        raise InputError(f"{run} has checkpoints without their {CONFIG}: give name=OTHER stage.parent={last}.")
+    if old is not None and last is not None:
         _refuse_another_config(run, old, config)
         samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]
-        if samplers and step_of(last) >= config["trainer"]["max_steps"]:
+        if samplers and has_ended(run):
             raise InputError(
                 f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the setting, and draw with "
                 f"another sampler by r2flow sample {run} --sampler NAME --steps N."
@@ -82,7 +94,7 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     old = read_config(run)
     if old is None or not checkpoints_of(run):
         return
-    later = ("scans.", "parent.", "encoding.reflectance.", "encoding.levels.", "data.pairs.parent.")
+    later = ("scans.", "stage.parent.", "encoding.reflectance.", "encoding.levels.", "data.pairs.parent.")
     there, here = ({k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config))
     _refuse_another_config(run, there, here, alone=False)
 
@@ -91,14 +103,14 @@ def _refuse_another_config(run: str | Path, old: Mapping[str, Any], new: Mapping
     if differing := contradictions(old, new):
         length = alone and all(text.startswith("trainer.max_steps=") for text in differing)
         last = next((path for path, _ in _readable(run)), run)  # not the folder: the run may not be finished
-        more_steps = f", stage.init={last} name=OTHER to learn on from its weights" if length else ""
+        more_steps = f", stage.parent={last} name=OTHER to learn on from its weights" if length else ""
         raise InputError(
             f"{run} holds a run of another config: {at_most_three(differing)}. "
             f"Give the same settings and scans to resume it{more_steps}, or name=OTHER for a new one."
         )
 
 
-RESUMED = ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step")
+RESUMED = (HYPER, NOTES, "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step")
 
 
 def _readable(run: str | Path, needed: Sequence[str] = ()) -> Iterator[tuple[Path, dict[str, Any]]]:

@@ -10,7 +10,7 @@ import re
 import signal
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -25,9 +25,8 @@ from omegaconf import DictConfig, OmegaConf
 from r2flow.config import key_of, override
 from r2flow.errors import InputError
 from r2flow.plugins import load_plugins
-from r2flow.registry import check_options
-from r2flow.runs.composing import CONF, WRONG, Keys, add_choices, as_hydra_takes, compose, explain, plain, with_choices
-from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening
+from r2flow.runs.composing import CONF, WRONG, add_choices, as_hydra_takes, in_one_line, plain, with_choices
+from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, run_process
 
 
 class JobEnded(RuntimeError):
@@ -37,10 +36,11 @@ class JobEnded(RuntimeError):
 def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str] = ()) -> int:
     """Compose a command line's config and execute it: a run, a chain of runs or a sweep; return the exit code.
 
-    Arguments are Hydra's overrides and flags. `command` starts this program, for the processes of sweeps and chains.
+    Arguments are Hydra's overrides and flags. `command` starts this program, for the processes of sweeps.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself, over many lines, and exits with 1
-    codes, errors = list[int](), list[Exception]()  # of jobs
+    codes: list[int] = []  # of jobs
+    errors: list[Exception] = []
     # SLURM signals every process of a job: a run handles the signal, a chain waits for the run.
     ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
     try:
@@ -57,13 +57,14 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
         # A remote launcher raises the first only.
         jobs = [job.args for job in errors or [error]]
         failed = [folder for code, folder in jobs if code != LATER]
-        number, names = (len(failed or jobs) if errors else "some"), "; ".join(failed or [folder for _, folder in jobs])
+        number = len(failed or jobs) if errors else "some"
+        names = "; ".join(failed or [folder for _, folder in jobs])
         if failed:
             raise InputError(f"{number} of the sweep's jobs failed: {names}") from None
         print(f"{number} of the sweep's jobs resume with the same command: {names}")
         return LATER
     except WRONG as error:
-        raise InputError(explain(error)) from None
+        raise InputError(in_one_line(error)) from None
     except RecursionError:
         raise InputError("a config contains itself, or is nested too deeply.") from None
 
@@ -72,7 +73,8 @@ def _with_plugins(arguments: Sequence[str], plugins: Sequence[str]) -> list[str]
     """Load the plug-ins of a command line, in any form, and collect them into one `plugins=[...]`."""
     given = [text for text in arguments if text.lstrip("+").startswith("plugins=")]
     listed = [name.strip(" '\"") for text in given for name in text.partition("=")[2].strip("[]").split(",")]
-    others, names = [text for text in arguments if text not in given], list(filter(None, [*plugins, *listed]))
+    others = [text for text in arguments if text not in given]
+    names = list(filter(None, [*plugins, *listed]))
     if not names:
         return others
     load_plugins(names)
@@ -103,7 +105,9 @@ def _parsed(arguments: Sequence[str]) -> Namespace:
 def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], errors: list[Exception]) -> None:
     """Run the command line's job, or those of its sweep; collects exit codes, and errors, which Hydra would print."""
     folders = [os.path.abspath(parsed.config_dir)] if parsed.config_dir else []
-    command, launcher = [*command, *(part for folder in folders for part in ("--config-dir", folder))], os.getpid()
+    for folder in folders:
+        command = [*command, "--config-dir", folder]
+    launcher = os.getpid()
     original = sys.argv
 
     def job(config: DictConfig) -> None:
@@ -117,9 +121,8 @@ def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], erro
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 return _sweep_job(command, given)
             settings = plain(config)
-            check_options("the config", Keys, settings)
             if settings["chain"]:
-                codes.append(_chain(settings, given, command, folders))
+                codes.append(_chain(settings, given, folders))
             else:  # imported here, so that errors in the config are reported before torch is loaded
                 from r2flow.training import build, fit
 
@@ -152,8 +155,6 @@ def job_folder(given: Sequence[str], overrides: str) -> str:
 
 def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
     """Run a job of a sweep in its own process, so that its failure or DDP relaunch does not affect other jobs."""
-    from r2flow.runs.chain import run_process
-
     run_dir = HydraConfig.get().runtime.output_dir
     code = run_process([*command, *given, override("run_dir", str(run_dir))])
     if code in map(code_of, STOPPING):
@@ -162,66 +163,44 @@ def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
         raise JobEnded(code, str(run_dir))
 
 
-def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str], folders: Sequence[str]) -> int:
-    from r2flow.runs.chain import has_ended, is_finished, is_noted, links_of, note, run_process
+def _chain(settings: dict[str, Any], given: Sequence[str], folders: Sequence[str]) -> int:
+    from r2flow.runs.chain import links_of, train_links
+    from r2flow.runs.folder import has_ended
 
     if settings["trainer"]["fast_dev_run"]:
         raise InputError("a chain's links start from earlier runs, and trainer.fast_dev_run leaves none.")
     folder = Path(settings["run_dir"])
     links = links_of(settings["chain"], folder, given, folders)
-    if not all(map(is_finished, links)):
-        _check_links(links, folders)
-    if model := settings["preview"]:  # scans of a trained model, while the chain trains
-        from r2flow.model.checkpoint import load_checkpoint
-        from r2flow.models import find_model
-        from r2flow.reports.outputs import write_samples
-
-        picture = folder / "preview" / "samples.png"
-        if not picture.is_file():
-            write_samples(load_checkpoint(find_model(model)), picture.parent, num=4, seed=0)
-        print(f"preview: scans of the model {model} in {picture}, point clouds next to it", flush=True)
-    unchanged = True
-    for number, link in enumerate(links, 1):
-        # After a link that had to run, later links check by themselves whether they still match it.
-        unchanged = unchanged and is_finished(link)
-        print(f"[{number}/{len(links)}] {link.name}: {'finished before, ' * unchanged}{link.run_dir}", flush=True)
-        if unchanged:
-            continue
-        if code := run_process([*command, *link.overrides]) or (0 if has_ended(link.run_dir) else LATER):
-            if code != 2:  # a user error, already printed
-                print(f"the chain stopped in {link.name}; the same command resumes there", file=sys.stderr, flush=True)
-            return code
-        note(link.run_dir, link)
+    if settings["preview"]:  # scans of a trained model, while the chain trains
+        _draw_preview(settings["preview"], folder / "preview")
     out = folder / "report"
-    if unchanged and is_noted(out, *links):
-        print(f"report: finished before, {out / 'chain.md'}")
-        return 0
-    import torch
+    finished = out.is_dir() and all(has_ended(link.run_dir) for link in links)
+    if code := train_links(links, folders):
+        return code
+    if finished:
+        print(f"report: finished before, {out}")
+    elif int(os.environ.get("LOCAL_RANK", "0")) == 0:
+        from r2flow.reports.chain import report
 
-    from r2flow.reports.chain import report
-
-    device, cards = "cpu", settings["trainer"]["devices"]
-    if torch.cuda.is_available() and settings["trainer"]["accelerator"] != "cpu":
-        device = f"cuda:{cards[0]}" if isinstance(cards, list) else "cuda"
-    report({link.name: link.run_dir for link in links}, out, device=device)
-    note(out, *links)
+        report({link.name: link.run_dir for link in links}, out, device=_report_device(settings["trainer"]))
     return 0
 
 
-def _check_links(links: Sequence[Any], folders: Sequence[str]) -> None:
-    """Compose and build every link before the first one runs, so that errors are reported early."""
-    from r2flow.model.checkpoint import FOLDER
-    from r2flow.runs.lineage import Parent
-    from r2flow.training import check
+def _draw_preview(model: str, out: Path) -> None:
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.models import find_model
+    from r2flow.reports.outputs import write_samples
 
-    configs = dict[str, Any]()
-    for link in links:
-        config, parent = compose(link.overrides, folders), None
-        if link.parent is not None:
-            before = configs[link.parent]
-            steps = before["trainer"]["max_steps"]
-            parent = Parent(before, Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt"), steps)
-        try:
-            configs[link.name] = check(config, link.overrides, parent)
-        except InputError as error:
-            raise InputError(f"chain.{link.name}: {error} For another link alone: +chain.LINK.KEY=VALUE.") from None
+    picture = out / "samples.png"
+    if not picture.is_file():
+        write_samples(load_checkpoint(find_model(model)), out, num=4, seed=0)
+    print(f"preview: scans of the model {model} in {picture}, point clouds next to it", flush=True)
+
+
+def _report_device(trainer: Mapping[str, Any]) -> str:
+    import torch
+
+    if not torch.cuda.is_available() or trainer["accelerator"] == "cpu":
+        return "cpu"
+    cards = trainer["devices"]
+    return f"cuda:{cards[0]}" if isinstance(cards, list) else "cuda"

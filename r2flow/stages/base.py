@@ -1,8 +1,9 @@
-"""Base classes of stages: a generator in training, its optimisers, and the notes in its checkpoints."""
+"""Base classes of stages: LightningModules that train a generator."""
 
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any, ClassVar
 
 import lightning as L
@@ -11,17 +12,25 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from r2flow.data.loader import Further
-from r2flow.errors import InputError, check, naming
+from r2flow.data.loader import ItemFormat
+from r2flow.errors import InputError, naming
 from r2flow.flow.times import golden_sequence
-from r2flow.generators import Generator
-from r2flow.model.checkpoint import COMPILED, check_weights
+from r2flow.generators import Generator, build_generator
+from r2flow.lidar.encoding import Encoding, ModelSpace
+from r2flow.lidar.sensors import Sensor
+from r2flow.metrics import METRICS
+from r2flow.model.checkpoint import COMPILED, MODEL, NOTES, check_weights
+from r2flow.model.lineage import Parent, find_parent, model_options, plain
+from r2flow.model.sampling import draw
 from r2flow.noise import seed_torch
+from r2flow.plugins import loaded_plugins
 from r2flow.processes import average_gradients
-from r2flow.registry import Count, Natural, NonNegative, Portion
+from r2flow.registry import Natural, NonNegative, Portion, Seed
+from r2flow.samplers import build_sampler
 from r2flow.stages.muon import Muon
 
 Batch = dict[str, Tensor]
+Options = Mapping[str, Any]
 
 
 class Stage(L.LightningModule):
@@ -29,95 +38,197 @@ class Stage(L.LightningModule):
 
     A batch has the keys `x_1`, scans in model space, (B, C, H, W); `x_0`, noise, (B, *noise_shape); `u`, uniform draws
     in [0, 1), (B,); and `k`, the number of each image in the run, (B,), which seeds further draws (`r2flow.noise`).
+    Of a batch without noise, or scans alone, the others are drawn by torch's global generator.
 
     A stage with several losses and optimisers sets `automatic_optimization = False`, creates the optimisers by
     `optimizers_for` and, in every `training_step`, calls `take_step(optimizer, loss)` for each of `own_optimizers()`.
 
     Args:
-        generator: The generator to train; commands load it from a checkpoint without the stage.
-        learning_rate: AdamW's learning rate; linear warm-up, then a cosine to 0 at the run's last step.
+        backbone: Name or options of the network, as in conf/backbone; None: the parent's, else `hdit_tiny`.
+        sensor: Sensor of the images, its name, file or options; None: the parent's, else `hdl64e`.
+        encoding: Encoding of the images, a name in conf/encoding, or options; None: the parent's, else `logscale`.
+        generator: Name and options in `GENERATORS`, or a generator, which replaces the three options above; None: the
+            stage's, the parent's, or a rectified flow.
+        parent: Run folder, checkpoint or model to start from, with its averaged weights.
+        sampler: Name and options of the default sampler; None: the generator's.
+        few: Likewise for fewer steps than `sampler` has.
+        seed: Seed of the first weights and of draws in training.
+        learning_rate: AdamW's learning rate; linear warm-up, then a cosine to 0 at the last step.
         betas, weight_decay: AdamW's.
         muon: Learning rate of the weight matrices by `Muon`, with the same schedule; None: AdamW for all weights.
         warmup_images: Images seen during the warm-up.
-        batch_size: Images per step, to convert images into steps.
 
     Attributes:
-        config: The run's config, which its checkpoints store.
-        start: The step that it resumes from.
-        gradient_clip_val: Gradient clipping of the run, for a stage with manual optimisation.
-        further: Makes additional batch entries of x_1, (C, H, W), its sensor and draws of each image, in the loader.
+        generator: The generator in training.
+        gradient_clip_val: Gradient clipping of a stage with manual optimisation, which Lightning leaves to it.
+
+    Raises:
+        InputError: an unknown name or option, a parent that is missing, unfinished, or of another model.
     """
 
     learns: ClassVar[type[Generator]] = Generator  # class of the generators that it can train
     generator_name: ClassVar[str | None] = None  # generator to train; None: the parent's, or a rectified flow
     needs_pairs: ClassVar[bool] = False  # whether it trains on pairs of x_0 and x_1
-    needs_parent: ClassVar[bool] = False  # whether it must start from another run, even if it trains on scans
+    takes_pairs: ClassVar[bool] = False  # whether it can
+    needs_parent: ClassVar[bool] = False  # whether it must start from another run
     several_sensors: ClassVar[bool] = False  # whether the parts of a mixture may be scans of different sensors
-    anneals: ClassVar[bool] = True  # whether the learning rate decays to 0 at the run's last step
+    anneals: ClassVar[bool] = True  # whether the learning rate decays to 0 at the last step
 
     def __init__(
         self,
-        generator: Generator,
+        backbone: str | Options | None = None,
+        sensor: str | Options | Sensor | None = None,
+        encoding: str | Options | Encoding | None = None,
+        generator: str | Options | Generator | None = None,
+        *,
+        parent: str | Path | Options | Parent | None = None,
+        sampler: str | Options | None = None,
+        few: str | Options | None = None,
+        seed: Seed = 0,
         learning_rate: NonNegative = 2e-3,
         betas: tuple[Portion, Portion] = (0.9, 0.99),
         weight_decay: NonNegative = 0.0,
         muon: NonNegative | None = None,
         warmup_images: Natural = 400,
-        batch_size: Count = 8,
-        seed: int = 0,
     ) -> None:
-        if not isinstance(generator, self.learns):
-            expected, actual = self.learns.__name__, type(generator).__name__
-            raise InputError(f"{type(self).__name__} learns a {expected}, found a {actual}: give another stage.")
         super().__init__()
-        self.generator = generator
-        self.learning_rate, self.betas, self.weight_decay = learning_rate, (betas[0], betas[1]), weight_decay
-        self.muon = muon
-        self.warmup_steps = warmup_images // batch_size
-        self.seed = seed
-        self.config: dict[str, Any] = {}
-        self.start = 0
+        self.save_hyperparameters(ignore=["parent", "sensor", "encoding", "generator"])
+        source = None if parent is None or isinstance(parent, Mapping) else find_parent(parent)
+        if parent is None and not isinstance(generator, Generator) and (self.needs_parent or self.needs_pairs):
+            raise InputError(f"{type(self).__name__} starts from a trained model: give parent=RUN.")
+        if isinstance(generator, Generator):
+            self.generator = generator
+            options: dict[str, Any] = dict.fromkeys(MODEL)
+        else:
+            given = {"backbone": backbone, "sensor": sensor, "encoding": encoding, "generator": generator}
+            options = model_options(given, source, self.generator_name, self.needs_pairs)
+            with torch.random.fork_rng(devices=[]):
+                seed_torch(seed, "weights")
+                self.generator = build_generator(options)
+        if not isinstance(self.generator, self.learns):
+            learned, found = self.learns.__name__, type(self.generator).__name__
+            raise InputError(f"{type(self).__name__} learns a {learned}, found a {found}: give another stage.")
+        if not hasattr(self.generator, "backbone"):  # it has its own network
+            options["backbone"] = None
+        if source and source.checkpoint:
+            self.generator.start_from(source.checkpoint.generator)
+        self.prepare_generator()
+        chosen = {"name": sampler} if isinstance(sampler, str) else dict(sampler or {})
+        own = self.generator.choose(**chosen)
+        if own.completes:
+            raise InputError(f"sampler {own.name} completes scans: give it to r2flow complete by --sampler.")
+        if few is not None:
+            self.generator.few = build_sampler(few)
+            self.generator.few.check(self.generator)
+        self.generator.run_by(own, self.generator.few, self.generator.fixed)
+        record = source.record() if source else parent
+        complete = {**self.hparams, **options, "parent": record, "sampler": own.asdict()}
+        self.save_hyperparameters({name: plain(value) for name, value in complete.items()})
         self.gradient_clip_val: float | None = None
-        self.further: Further | None = None
 
-    def check_data(self, name: str, data: Mapping[str, Any]) -> None:
-        """Refuse a config's `data` that the stage of this name cannot train on."""
-        on_pairs = data["name"] == "pairs"
-        check(on_pairs or not self.needs_pairs, f"stage={name} learns from pairs: give data=pairs, not {data['name']}.")
-        if data.get("scans") is not None:
-            raise InputError(f"stage={name} learns from pairs alone: leave data.scans out, or give stage=flow_map.")
-        check(self.needs_pairs or not on_pairs, f"stage={name} learns from scans, not data=pairs; give stage=reflow.")
+    def prepare_generator(self) -> None:
+        """Set the sampler that this stage trains the generator for; it may be replaced by the options `sampler`."""
 
-    def setup(self, stage: str) -> None:
-        here = self.start, self.config.get("scans")
-        alike = self.trainer.strategy.reduce_boolean_decision(here == self.trainer.strategy.broadcast(here))
-        start = f"process {self.global_rank} starts from step {self.start}, on {self.config.get('scans')}"
-        check(alike, f"{start}, others do not: run_dir and data.root must be folders that all machines share.")
+    @property
+    def space(self) -> ModelSpace:
+        """Model space of the images."""
+        return self.generator.space
+
+    @property
+    def encoding(self) -> Encoding:
+        """Encoding between model space and metres."""
+        return self.generator.space.encoding
+
+    @property
+    def sensor(self) -> Sensor:
+        """Sensor of the images."""
+        return self.generator.space.sensor
+
+    @property
+    def item_format(self) -> ItemFormat:
+        """What the items of a batch are, as `ScanDataModule` makes them."""
+        return ItemFormat(self.encoding, self.generator.noise_shape, several_sensors=self.several_sensors)
+
+    @property
+    def images_per_step(self) -> int:
+        """Images of an optimiser step, on all devices."""
+        data = self.trainer.datamodule
+        if data is not None and hasattr(data, "batch_size"):
+            return int(data.batch_size)
+        self.trainer.fit_loop.setup_data()
+        loader = self.trainer.train_dataloader
+        return loader.batch_size * self.trainer.world_size * self.trainer.accumulate_grad_batches
+
+    @property
+    def total_steps(self) -> float:
+        """Optimiser steps of the run; infinite if only time limits it."""
+        return self.trainer.estimated_stepping_batches
+
+    @property
+    def progress(self) -> float:
+        """Share of the run's steps that were taken; 0 without an end."""
+        return min(self.global_step / self.total_steps, 1.0)
+
+    def whole_batch(self, batch: Any) -> Batch:
+        """A batch with all its keys; torch's global generator draws those that a loader did not give."""
+        if isinstance(batch, list | tuple):
+            batch = batch[0]
+        if isinstance(batch, Tensor):
+            batch = {"x_1": batch}
+        if "x_0" not in batch:
+            x_1 = batch["x_1"]
+            batch["x_0"] = torch.randn(len(x_1), *self.generator.noise_shape, device=x_1.device)
+            batch["u"] = torch.rand(len(x_1), device=x_1.device)
+            batch["k"] = torch.randint(2**31, (len(x_1),), device=x_1.device)
+        return batch
 
     def on_train_start(self) -> None:
-        wrapped = any(COMPILED in name for name, _ in self.generator.named_parameters())
-        check(not wrapped, "torch.compile(module) renames the weights in checkpoints: use module.compile() instead.")
+        if any(COMPILED in name for name, _ in self.generator.named_parameters()):
+            raise InputError("torch.compile(module) renames the weights in checkpoints: use module.compile() instead.")
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout uses torch's global generator: seeding it by position makes a resumed run draw the same numbers.
-        seed_torch(self.seed, "dropout", batch_idx * self.trainer.world_size + self.global_rank)
+        parts = self.trainer.accumulate_grad_batches
+        position = self.global_step * parts + batch_idx % parts
+        seed_torch(self.hparams.seed, "dropout", position * self.trainer.world_size + self.global_rank)
+
+    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Scans of the numbers `k`: range in metres and reflectance, (B, 2 or 1, H, W), 0 without a return."""
+        numbers = self.whole_batch(batch)["k"].tolist()
+        return draw(self.generator, numbers, self.hparams.seed).images
+
+    def on_test_start(self) -> None:
+        self.panel = METRICS["panel"](sensor=self.sensor)
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        batch = self.whole_batch(batch)
+        self.panel.update(self.space.decode(batch["x_1"]).cpu(), real=True)
+        self.panel.update(self.predict_step(batch, batch_idx).cpu(), real=False)
+
+    def on_test_epoch_end(self) -> None:
+        """Log the panel's distances between held-out and generated scans, `test/panel` their mean."""
+        self.log_dict({f"test/{name}": value for name, value in self.panel.compute().items()})
 
     def configure_optimizers(self) -> Any:
         return self.optimizers_for(self.parameters())
 
     def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
         """AdamW or `Muon` with a schedule for each group of parameters, in the format of `configure_optimizers`."""
-        options: dict[str, Any] = {"lr": self.learning_rate, "betas": self.betas, "weight_decay": self.weight_decay}
-        total = max(int(self.trainer.max_steps), 1)
-        warmup = min(self.warmup_steps, total)
+        options = self.hparams
+        adam = {"lr": options.learning_rate, "betas": tuple(options.betas), "weight_decay": options.weight_decay}
+        optimizers: list[torch.optim.Optimizer] = []
+        for group in groups:
+            muon = options.muon
+            optimizers.append(torch.optim.AdamW(group, **adam) if muon is None else Muon(group, muon, **adam))
+        warmup = options.warmup_images // self.images_per_step
 
         def factor(step: int) -> float:
-            return learning_rate_factor(step, warmup, total) if self.anneals or step < warmup else 1.0
+            if step < warmup:
+                return step / warmup
+            if step == 0 or not self.anneals:  # the number of steps is known when training has begun
+                return 1.0
+            return learning_rate_factor(step, warmup, self.total_steps)
 
-        optimizers = [
-            torch.optim.AdamW(group, **options) if self.muon is None else Muon(group, self.muon, **options)
-            for group in groups
-        ]
         schedules = [torch.optim.lr_scheduler.LambdaLR(optimizer, factor) for optimizer in optimizers]
         return optimizers, [{"scheduler": schedule, "interval": "step"} for schedule in schedules]
 
@@ -153,8 +264,14 @@ class Stage(L.LightningModule):
             self.clip_gradients(optimizer, self.gradient_clip_val)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["config"] = self.config
-        checkpoint |= self.generator.drawing()
+        from r2flow.stages import STAGES  # the registry of the classes of this module
+
+        checkpoint[NOTES] = {
+            "stage": STAGES.name_of(type(self)),
+            "plugins": loaded_plugins(),
+            "total_steps": self.total_steps if self._trainer else None,
+            **self.generator.drawing(),
+        }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if "state_dict" in checkpoint:  # a sharded strategy reads its own
@@ -172,21 +289,23 @@ class SingleLoss(Stage):
         raise NotImplementedError
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        batch = self.whole_batch(batch)
         loss = self.regression_loss(batch, batch["u"])
-        usable = isinstance(loss, Tensor) and loss.numel() == 1 and loss.requires_grad
-        check(usable, f"regression_loss of a {type(self).__name__} must be one number with a gradient.")
+        if not (isinstance(loss, Tensor) and loss.numel() == 1 and loss.requires_grad):
+            raise InputError(f"regression_loss of a {type(self).__name__} must be one number with a gradient.")
         part = batch_idx % (self._trainer.accumulate_grad_batches if self._trainer else 1)
         self._sum = loss.detach() + (self._sum if part else 0.0)
-        self.log("train/loss", self._sum / (part + 1), prog_bar=True, sync_dist=True)
+        self.log("train/loss", self._sum / (part + 1), prog_bar=True, sync_dist=True, batch_size=len(batch["x_1"]))
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         # A low-discrepancy sequence over [0, 1) instead of random times reduces the variance over few scans.
+        batch = self.whole_batch(batch)
         loss = self.regression_loss(batch, golden_sequence(batch["k"]))
         self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)
 
 
-def learning_rate_factor(step: int, warmup: int, total: int) -> float:
+def learning_rate_factor(step: int, warmup: int, total: float) -> float:
     """step / warmup during the warm-up, then (1 + cos(pi s)) / 2 with s from 0 to 1 over the remaining steps."""
     if step < warmup:
         return step / warmup

@@ -1,7 +1,6 @@
 """Flow map training: jumps of any length, from the paths of an earlier flow, its pairs or scans."""
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -10,10 +9,10 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, straight
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
-from r2flow.generators import FlowMap, Generator
+from r2flow.generators import FlowMap
 from r2flow.registry import Positive, construct
 from r2flow.samplers import Jump
-from r2flow.stages.base import Batch
+from r2flow.stages.base import Batch, Options
 from r2flow.stages.rectify import Reflow
 
 
@@ -34,28 +33,32 @@ class LearnFlowMap(Reflow):
     generator: FlowMap
     generator_name = "flow_map"
     needs_pairs = False
+    default_time: ClassVar[Options] = {"name": "uniform"}
 
     def __init__(
         self,
-        generator: Generator,
+        *model: Any,
         objective: str = "consistency",
-        jumps: Mapping[str, Any] | None = None,
+        jumps: Options | None = None,
         rho: Positive = 0.01,
         **options: Any,
     ) -> None:
-        if options.pop("time", None) is not None:
-            raise InputError("a flow map learns jumps between times: give stage.jumps and leave stage.time out.")
-        super().__init__(generator, time={"name": "uniform"}, **options)
-        self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
-        self.jumps = construct("stage.jumps", JumpTimes, jumps)
-        self.on_pairs = True
-        generator.run_by(Jump(grid=self.jumps.grid))
+        super().__init__(*model, **options)
+        if options.get("time") is not None:
+            raise InputError("a flow map learns jumps between times: give jumps and leave time out.")
+        self.objective = OBJECTIVES[objective]
+        self.rho = rho
 
-    def check_data(self, name: str, data: Mapping[str, Any]) -> None:
-        self.on_pairs = data["name"] == "pairs"
-        if data.get("scans") is not None and self.objective is not straight:
+    def prepare_generator(self) -> None:
+        self.jumps = construct("stage.jumps", JumpTimes, self.hparams.jumps)
+        self.generator.run_by(Jump(grid=self.jumps.grid))
+
+    def setup(self, stage: str) -> None:
+        data = self.trainer.datamodule
+        self.on_pairs = getattr(data, "pairs", None) is not None
+        if getattr(data, "scans", None) is not None and self.objective is not straight:
             raise InputError(
-                f"stage.objective={self.objective_name} learns jumps from velocities of pairs, which are not those of "
+                f"objective={self.hparams.objective} learns jumps from velocities of pairs, which are not those of "
                 "scans: leave data.scans out, or give stage.objective=straight."
             )
 
@@ -69,7 +72,7 @@ class LearnFlowMap(Reflow):
         if self.training:
             # With independent noise, x_1 is not the end of x_0's path.
             exact = diagonal | (self.on_pairs & (s - t == 1))
-            rho = torch.where(exact, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
+            rho = torch.where(exact, 1.0, self.rho**self.progress)
             aim = self.objective(u_ts, x_0, x_1, t, torch.where(diagonal, t, s), rho)
         else:  # the same validation loss for all objectives
             aim = straight(u_ts, x_0, x_1, t, s, torch.ones_like(t))

@@ -1,11 +1,10 @@
 """Velocity regression on straight lines from noise to data: 1-RF, and k-RF and k-TD on pairs of an earlier flow."""
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from torch import Tensor
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.flow.losses import LOSSES, Loss
 from r2flow.flow.path import interpolate
 from r2flow.flow.times import build_density
@@ -13,31 +12,34 @@ from r2flow.generators import Condition, Flow, Generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.registry import Count
 from r2flow.samplers import FixedSteps
-from r2flow.stages.base import Batch, SingleLoss
+from r2flow.stages.base import Batch, Options, SingleLoss
 
 
 class Rectify(SingleLoss):
     """1-RF: regress v(t, x_t) onto x_1 - x_0 for independent x_0 ~ N(0, I) and x_1 a scan (paper, eq. 2).
 
     Args:
-        loss: Name in `r2flow.flow.losses.LOSSES`.
-        time: Name and options of a density in `r2flow.flow.times.TIMES`.
+        model: Backbone, sensor, encoding and generator, as in `Stage`.
+        loss: Name in `r2flow.flow.losses.LOSSES`; None: `default_loss`.
+        time: Name and options of a density in `r2flow.flow.times.TIMES`; None: `default_time`.
+        options: Those of `Stage`.
 
     Raises:
         InputError: the generator is not a flow or takes a condition; an unknown loss or density.
     """
 
     learns: ClassVar[type[Generator]] = Flow
+    default_loss: ClassVar[str] = "mse"
+    default_time: ClassVar[Options] = {"name": "uniform"}
     generator: Flow
 
-    def __init__(
-        self, generator: Generator, loss: str = "mse", time: Mapping[str, Any] | None = None, **options: Any
-    ) -> None:
-        super().__init__(generator, **options)
-        given = not generator.told or type(self).condition is not Rectify.condition
-        check(given, f"a {type(generator).__name__} needs a condition: give stage=transfer, or its own stage.")
-        self.loss = LOSSES[loss]
-        self.time = build_density(time or {"name": "uniform"})
+    def __init__(self, *model: Any, loss: str | None = None, time: Options | None = None, **options: Any) -> None:
+        super().__init__(*model, **options)
+        if self.generator.told and type(self).condition is Rectify.condition:
+            name = type(self.generator).__name__
+            raise InputError(f"a {name} needs a condition: give stage=transfer, or its own stage.")
+        self.loss = LOSSES[loss or self.default_loss]
+        self.time = build_density(time or self.default_time)
 
     def condition(self, batch: Batch) -> Condition | None:
         """Condition of the velocity; None here."""
@@ -50,24 +52,26 @@ class Rectify(SingleLoss):
 
     def loss_of_each(self, loss: Loss, v_t: Tensor, u_t: Tensor) -> Tensor:
         """The loss of each scan of a batch, (B,); InputError: a loss of another shape."""
-        each, b = loss(v_t, u_t), len(v_t)
-        check(each.shape == (b,), f"a loss must give one value a scan, ({b},), found {tuple(each.shape)}.")
+        each = loss(v_t, u_t)
+        if each.shape != (len(v_t),):
+            raise InputError(f"a loss must give one value a scan, ({len(v_t)},), found {tuple(each.shape)}.")
         return each
 
 
 class Reflow(Rectify):
     """k-RF: regress v(t, x_t) onto x_1 - x_0 with x_1 the end of the earlier flow's path from x_0 (paper, eq. 3).
 
-    It starts from the earlier flow's averaged weights. The pairs (x_0, x_1) come from `data=pairs`.
+    It starts from the earlier flow's averaged weights (`parent`). Its pairs (x_0, x_1) are those of `data=pairs`.
     """
 
     needs_pairs = True
+    takes_pairs = True
+    default_loss = "pseudo_huber"
+    default_time: ClassVar[Options] = {"name": "u_shaped", "a": 4.0}
 
-    def __init__(
-        self, generator: Generator, loss: str = "pseudo_huber", time: Mapping[str, Any] | None = None, **options: Any
-    ) -> None:
-        super().__init__(generator, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
-        generator.run_by(ode_sampler(self.generator), generator.few)  # fresh noise would break the pairing
+    def prepare_generator(self) -> None:
+        # The ODE alone: fresh noise on the way would break the pairing.
+        self.generator.run_by(ode_sampler(self.generator), self.generator.few)
 
 
 class Distill(Reflow):
@@ -78,8 +82,11 @@ class Distill(Reflow):
         grid: Time grid: uniform as in the paper, or another one of `r2flow.flow.solvers.fixed.named_grid`.
     """
 
-    def __init__(self, generator: Generator, steps: Count = 1, grid: str = "uniform", **options: Any) -> None:
-        time = options.pop("time", None)
-        check(time is None, f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out.")
-        super().__init__(generator, time={"name": "discrete", "k": steps, "grid": grid}, **options)
-        generator.run_by(FixedSteps(steps, grid), fixed=True)
+    def __init__(self, *model: Any, steps: Count = 1, grid: str = "uniform", **options: Any) -> None:
+        super().__init__(*model, **options)
+        if options.get("time") is not None:
+            raise InputError(f"a distilled flow trains at the {steps} times that its steps visit; leave time out.")
+        self.time = build_density({"name": "discrete", "k": steps, "grid": grid})
+
+    def prepare_generator(self) -> None:
+        self.generator.run_by(FixedSteps(self.hparams.steps, self.hparams.grid), fixed=True)

@@ -1,7 +1,6 @@
 """Training of transfer flows on partially hidden scans."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -10,16 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.data.loader import ItemFormat
 from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
 from r2flow.generators.surroundings import steps_of
 from r2flow.generators.transfer import WEIGHTS, gain_of, scaled
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.lidar.known import every_row, random_points, random_rows
-from r2flow.lidar.sensors import Sensor, build_sensor
+from r2flow.lidar.known import Ray, every_row, random_points, random_rows
+from r2flow.lidar.sensors import Sensor
+from r2flow.model.completion import complete
 from r2flow.registry import Count, Portion, construct
-from r2flow.stages.base import Batch, SingleLoss
+from r2flow.stages.base import Batch, Options, SingleLoss
 
 
 @dataclass(frozen=True)
@@ -102,23 +102,22 @@ class Transfer(SingleLoss):
     generator_name = "transfer_flow"
     generator: TransferFlow
 
-    def __init__(self, generator: Generator, tasks: Mapping[str, Any] | None = None, **options: Any) -> None:
-        super().__init__(generator, **options)
+    def __init__(self, *model: Any, tasks: Options | None = None, **options: Any) -> None:
+        super().__init__(*model, **options)
         self.tasks = construct("stage.tasks", Tasks, tasks)
-        self.further = partial(self.tasks, generator.space)
 
-    def check_data(self, name: str, data: Mapping[str, Any]) -> None:
-        super().check_data(name, data)
-        crop = self.tasks.size(self.generator.space)
-        for number, part in enumerate(data.get("parts") or ()):
-            if part.get("sensor") is not None:
-                sensor = build_sensor(**part["sensor"])
-                if sensor.shape[0] < crop[0] or sensor.shape[1] < crop[1]:
-                    raise InputError(
-                        f"data.parts[{number}]: crops of {crop[0]} x {crop[1]} need images as large, {sensor.name} has "
-                        f"{sensor.shape[0]} x {sensor.shape[1]}: give sensor.rows and sensor.columns, or smaller "
-                        "stage.tasks.rows and stage.tasks.columns."
-                    )
+    @property
+    def item_format(self) -> ItemFormat:
+        smallest = self.tasks.size(self.generator.space)
+        return super().item_format._replace(further=partial(self.tasks, self.generator.space), smallest=smallest)
+
+    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Scans completed from every fourth row: range in metres and reflectance, (B, 2 or 1, H, W)."""
+        images = self.space.decode(batch["x_1"]).cpu()
+        state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.EMPTY))
+        state[:, torch.arange(images.shape[2]) % 4 != 0] = int(Ray.UNKNOWN)
+        answers = complete(self.generator, images, state, seed=self.hparams.seed)
+        return torch.cat([answer.images for answer in answers])
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         x_1 = batch["x_1"]

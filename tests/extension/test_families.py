@@ -86,7 +86,7 @@ def test_a_flow_is_straightened(tmp_path: Path, tmp_path_factory: pytest.TempPat
     sampler = ("data.pairs.sampler.name=euler", "data.pairs.sampler.steps=2")
     pairs = ("data.pairs.num=6", "data.pairs.batch_size=3", *sampler)
     tiny = [one for one in TINY if not one.startswith("data.scenes")]  # which are of scans
-    options = [BACKBONE.plugin, *tiny, "sampler.steps=2", *pairs, f"stage.init={run}", f"run_dir={tmp_path / 'two'}"]
+    options = [BACKBONE.plugin, *tiny, "sampler.steps=2", *pairs, f"stage.parent={run}", f"run_dir={tmp_path / 'two'}"]
     assert r2flow("train", "experiment=reflow", *options).said
     with loaded(BACKBONE):
         first, second = load_checkpoint(run), load_checkpoint(tmp_path / "two")

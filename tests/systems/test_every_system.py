@@ -98,7 +98,7 @@ FAMILIES = {
         "experiment=lidm_autoencoder", "size=small", *TINY, "callbacks.checkpoint.every=2",
         "generator.autoencoder.codes=16", "stage.adversarial_start=2",
     ],
-    "latent": ["experiment=lidm", "size=small", *FLOW, "generator.autoencoder.codes=16", "stage.init=first"],
+    "latent": ["experiment=lidm", "size=small", *FLOW, "generator.autoencoder.codes=16", "stage.parent=first"],
     "gan": [
         "experiment=dusty2", "size=small", *TINY, "callbacks.checkpoint.every=2", "generator.base_channels=4",
         "stage.discriminator.base_channels=4", "stage.warmup.images=4", "stage.augment.initial=0.5",

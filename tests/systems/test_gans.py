@@ -331,7 +331,7 @@ def test_each_row_of_the_log_has_the_augmentation_of_its_step_and_the_last_penal
     assert curves["train/augmented"][1].tolist() == pytest.approx(expected)
     assert len(set(expected)) == 3  # in five steps it moves after every second
     assert [len(set(each)) for each in curves["train/last_r1"]] == [4, 2]
-    assert fit(build(compose([*options, f"stage.init={tmp_path}", f"run_dir={tmp_path / 'tuned'}"]))).finished
+    assert fit(build(compose([*options, f"stage.parent={tmp_path}", f"run_dir={tmp_path / 'tuned'}"]))).finished
 
 
 @pytest.mark.slow

@@ -445,8 +445,8 @@ def test_a_published_recipe_is_built(name: str, tmp_path: Path):
 
 def test_the_published_recipe_with_positions_starts_from_its_autoencoder(tmp_path: Path, caplog: Any):
     common = ["data.root=/nowhere", "trainer.accelerator=cpu", f"run_dir={tmp_path}"]
-    with pytest.raises(InputError, match=r"give stage\.init=RUN"):
-        check(compose(["experiment=lidm", "stage.init=null", *common]))
+    with pytest.raises(InputError, match=r"give stage\.parent=RUN"):
+        check(compose(["experiment=lidm", "stage.parent=null", *common]))
     first = ["experiment=lidm_autoencoder", *common]
     check(compose([*first, "sensor.columns=1000"]))
     assert "16 x 125 latents: latent_diffusion takes at most 1 generator.unet.multipliers" in caplog.text

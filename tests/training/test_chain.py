@@ -113,10 +113,10 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(cha
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["experiment=reflow"], "stage=reflow starts from a trained run: give stage.init=RUN"),
-        (["experiment=reflow", "stage.init=RF1", "sensor=vlp16"], "the sensor is the parent's"),
-        (["experiment=reflow", "stage.init=RF1", "data.augment.flip=true"], "data.augment changes scans"),
-        (["experiment=reflow", "stage.init=RF1"], "holds other pairs"),
+        (["experiment=reflow"], "stage=reflow starts from a trained run: give stage.parent=RUN"),
+        (["experiment=reflow", "stage.parent=RF1", "sensor=vlp16"], "the sensor is the parent's"),
+        (["experiment=reflow", "stage.parent=RF1", "data.augment.flip=true"], "data.augment changes scans"),
+        (["experiment=reflow", "stage.parent=RF1"], "holds other pairs"),
     ],
 )
 def test_a_child_that_cannot_be_is_refused_in_one_line(chained, tmp_path, overrides, message):
@@ -131,16 +131,16 @@ def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple
     last, before = checkpoints_of(parent)
     last.unlink()
     options = ["experiment=reflow", "data.pairs.num=4", "data.pairs.batch_size=4", "trainer.max_steps=2"]
-    done = in_process(tmp_path, of_a_child(*options, "stage.init=2011"), check=False)
+    done = in_process(tmp_path, of_a_child(*options, "stage.parent=2011"), check=False)
     assert "has stopped at step 6 of 8: finish it, or name the checkpoint" in done.refusal
-    in_process(tmp_path, of_a_child(*options, f"stage.init={before}"))
+    in_process(tmp_path, of_a_child(*options, f"stage.parent={before}"))
     assert (parent / "pairs" / "manifest.json").is_file()
 
 
 def test_pairs_of_a_flow_map_can_be_its_jumps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     sampler = ("data.pairs.sampler.name=jump", "data.pairs.sampler.steps=4")
-    run = build(compose(["experiment=reflow", "stage.init=street", "data.root=pairs", "trainer=cpu", *sampler]))
+    run = build(compose(["experiment=reflow", "stage.parent=street", "data.root=pairs", "trainer=cpu", *sampler]))
     assert run.data.pair_store.sampler.name == "jump"
 
 
@@ -148,7 +148,7 @@ def test_pairs_of_a_flow_map_can_be_its_jumps(tmp_path: Path, monkeypatch: pytes
 def test_two_devices_make_the_pairs_that_one_makes(chained: tuple[Path, str], tmp_path: Path):
     # Lightning starts the second device by the process's own command line, which must not be that of these tests.
     options = of_a_child(
-        "experiment=reflow", f"stage.init={chained[0] / 'rf1'}", "trainer.strategy=ddp", "trainer.devices=2",
+        "experiment=reflow", f"stage.parent={chained[0] / 'rf1'}", "trainer.strategy=ddp", "trainer.devices=2",
         f"data.root={tmp_path / 'pairs'}", "data.pairs.num=8", "data.pairs.batch_size=4",
         "data.pairs.sampler.name=midpoint", "data.pairs.sampler.steps=8", "trainer.max_steps=2",
     )  # fmt: skip
@@ -176,7 +176,7 @@ def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone()
         "backbone.depths=[1]", "trainer.max_steps=5", "run_dir='runs/x/rf1'",
     )  # fmt: skip
     assert second.overrides == (
-        "experiment=reflow", "stage.loss=mse", "stage.init='runs/x/rf1'", "seed=3", "data.pairs.num=9",
+        "experiment=reflow", "stage.loss=mse", "stage.parent='runs/x/rf1'", "seed=3", "data.pairs.num=9",
         *ALL_LINKS, "seed=2", "run_dir='runs/x/rf2'",
     )  # fmt: skip
 
@@ -231,9 +231,9 @@ def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_optio
     ("overrides", "message"),
     [
         (["trainer.fast_dev_run=true"], "fast_dev_run leaves none"),
-        (["stage.init=x"], "stage.init is each link's own"),
-        (["chain.rf2.init=rf9"], "chain.rf2 starts from rf9; give init=EARLIER or an experiment"),
-        (["+chain.fr2.trainer.max_steps=9"], "chain.fr2 starts from nothing; give init=EARLIER"),
+        (["stage.parent=x"], "stage.parent is each link's own"),
+        (["chain.rf2.parent=rf9"], "chain.rf2 starts from rf9; give parent=EARLIER or an experiment"),
+        (["+chain.fr2.trainer.max_steps=9"], "chain.fr2 starts from nothing; give parent=EARLIER"),
         (["~chain.rf9"], "no key 'chain.rf9'. See --cfg job"),
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),

@@ -125,7 +125,7 @@ LINKS = sorted({file.stem for file in (EXAMPLE / "experiment").glob("*.yaml")} -
 
 @pytest.mark.parametrize("name", LINKS)
 def test_an_example_lacks_its_files_alone(tmp_path: Path, name: str):
-    of_links = () if name == "street_1rf" else ("stage.init=street",)
+    of_links = () if name == "street_1rf" else ("stage.parent=street",)
     root = ("data.root=runs/street/scenes",) if name == "finetune_map" else ()
     command = ["--plugin", str(EXAMPLE / "street_stage.py"), "--config-dir", str(EXAMPLE), f"experiment={name}"]
     assert "runs/street/scenes" in in_process(tmp_path, [*command, *of_links, *root], check=False).refusal

@@ -53,11 +53,11 @@ def test_a_run_leaves_everything_in_its_folder_and_says_where(alone: tuple[Path,
 
 def test_next_is_what_has_not_been_done(alone: tuple[Path, str]):
     run, said = alone  # of a flow that was trained on scans in files
-    assert f"r2flow train experiment=reflow stage.init={run.relative_to(run.parents[1])}" in said
+    assert f"r2flow train experiment=reflow stage.parent={run.relative_to(run.parents[1])}" in said
     for stage, init, data, words in (
         ("rectify", None, "simulated", "data=kitti_raw data.root=FOLDER"),
         ("rectify", "street", "folder", "r2flow evaluate REAL a"),
-        ("reflow", "b", "pairs", "experiment=distill stage.init=a"),
+        ("reflow", "b", "pairs", "experiment=distill stage.parent=a"),
         ("distill", "b", "pairs", "r2flow evaluate REAL a"),
     ):
         config = {"stage": {"name": stage, "init": init}, "data": {"name": data}}
@@ -65,7 +65,7 @@ def test_next_is_what_has_not_been_done(alone: tuple[Path, str]):
     spaced = what_next(Path("a b"), Path("a b/samples"), config=config).split("r2flow ")[1:]
     assert [shlex.split(line)[1] for line in spaced] == ["a b", "a b/samples/000000.ply", "REAL"]
     plugged = {"stage": {"name": "rectify"}, "data": {"name": "folder"}, "plugins": ["mine.py"]}
-    assert what_next(Path("a"), Path("a/samples"), config=plugged).endswith("stage.init=a --plugin mine.py")
+    assert what_next(Path("a"), Path("a/samples"), config=plugged).endswith("stage.parent=a --plugin mine.py")
 
 
 def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
@@ -78,7 +78,7 @@ def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
 
 
 def test_a_run_from_weights_begins_with_their_validation_loss(train: Run, alone: tuple[Path, str], tmp_path: Path):
-    said = train("name='a b'", f"stage.init={alone[0]}", "loggers=[csv,tensorboard]", "trainer.max_steps=3").stdout
+    said = train("name='a b'", f"stage.parent={alone[0]}", "loggers=[csv,tensorboard]", "trainer.max_steps=3").stdout
     assert "tensorboard --logdir 'runs/a b/tensorboard'\n" in said
     before, after = (read_curves(run)["val/loss"][1] for run in (alone[0], tmp_path / "runs" / "a b"))
     assert len(after) == 2
@@ -160,7 +160,7 @@ def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
     checkpoints_of(copied)[0].unlink()  # not finished
     refusal = train("name=copied", "trainer.max_steps=5000", check=False).refusal
     assert (copied / "config.yaml").read_text() == before
-    (init,) = re.findall(r"(stage\.init=\S+) name=OTHER to learn on from its weights", refusal)
+    (init,) = re.findall(r"(stage\.parent=\S+) name=OTHER to learn on from its weights", refusal)
     train(init, "name=other", "trainer.max_steps=1")
     content = read_checkpoint(left := checkpoints_of(copied)[0])
     content["state_dict"]["generator.backbone.detokenizer.1.weight"] = torch.zeros(1)  # as of a changed plug-in

@@ -6,7 +6,6 @@ from typing import Any
 import torch.nn.functional as F
 from torch import Tensor
 
-from r2flow.generators import Generator
 from r2flow.registry import Positive, Registry
 from r2flow.stages.base import Batch, SingleLoss
 from r2flow.systems.diffusion.generator import Diffusion
@@ -36,14 +35,16 @@ class LearnDiffusion(SingleLoss):
 
     def __init__(
         self,
-        generator: Generator,
+        *model: Any,
         loss: str = "l2",
         min_snr: Positive | None = 5.0,
         paired: bool = True,
         **options: Any,
     ) -> None:
-        super().__init__(generator, **options)
-        self.error, self.min_snr, self.paired = ERRORS[loss], min_snr, paired
+        super().__init__(*model, **options)
+        self.error = ERRORS[loss]
+        self.min_snr = min_snr
+        self.paired = paired
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """Weighted mean error at t = u (t = 0: data, t = 1: noise)."""

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from r2flow.generators import Generator
 from r2flow.registry import Count, Natural, NonNegative, Portion, Registry, construct
 from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_gan
@@ -113,53 +112,54 @@ class LearnGan(Stage):
 
     def __init__(
         self,
-        generator: Generator,
+        *model: Any,
         discriminator: Mapping[str, Any] | None = None,
-        learning_rate: NonNegative = 2e-3,
         betas: tuple[Portion, Portion] = (0.0, 0.99),
         r1: NonNegative = 1.0,
         r1_every: Count = 16,
         warmup: Mapping[str, Any] | None = None,
         augment: Mapping[str, Any] | None = None,
-        batch_size: Count = 32,
-        seed: int = 0,
+        **options: Any,
     ) -> None:
-        super().__init__(generator, learning_rate, betas, warmup_images=0, batch_size=batch_size, seed=seed)
+        super().__init__(*model, betas=betas, **{"warmup_images": 0, **options})
         self.automatic_optimization = False
-        self.batch_size, self.r1, self.r1_every = batch_size, r1, r1_every
-        channels, h, w = generator.space.shape
+        self.r1 = r1
+        self.r1_every = r1_every
+        channels, h, w = self.space.shape
         self.discriminator: nn.Module = DISCRIMINATORS.build(discriminator or {"name": "dcgan"}, (h, w), channels)
         self.warmup = construct("stage.warmup", Warmup, warmup)
         self.augment = None if augment is None else construct("stage.augment", AdaptiveAugment, augment)
 
     def configure_optimizers(self) -> Any:
-        rate, lazy_betas = lazy_adam(self.learning_rate, self.betas, self.r1_every if self.r1 else 0)
+        learning_rate = self.hparams.learning_rate
+        betas = tuple(self.hparams.betas)
+        rate, lazy_betas = lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
         return [
-            torch.optim.Adam(self.generator.parameters(), self.learning_rate, self.betas),
+            torch.optim.Adam(self.generator.parameters(), learning_rate, betas),
             torch.optim.Adam(self.discriminator.parameters(), rate, lazy_betas),
         ]
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
         step = self.global_step + 1  # counted from 1, as published
         for_generator, for_discriminator = self.own_optimizers()
-        images, real = step * self.batch_size, batch["x_1"]
+        images, real = step * self.images_per_step, batch["x_1"]
 
-        draws = BatchDraws(self.seed, batch, GENERATOR)
+        draws = BatchDraws(self.hparams.seed, batch, GENERATOR)
         self.discriminator.requires_grad_(False)
         loss = generator_loss(self.discriminator(self.shown(self.make(batch["x_0"], draws), images, draws)))
         self.take_step(for_generator, loss)
         self.discriminator.requires_grad_(True)
 
-        draws = BatchDraws(self.seed, batch, FAKE)
+        draws = BatchDraws(self.hparams.seed, batch, FAKE)
         with torch.no_grad():
             fake = self.shown(self.make(draws.normal(self.generator.noise_shape).to(real.device), draws), images, draws)
-            seen = self.shown(real, images, BatchDraws(self.seed, batch, REAL))
+            seen = self.shown(real, images, BatchDraws(self.hparams.seed, batch, REAL))
         of_real, of_fake = self.discriminator(seen), self.discriminator(fake)
         wrong = discriminator_loss(of_real, of_fake)
         self.take_step(for_discriminator, wrong)
 
         if self.r1 and step % self.r1_every == 0:
-            penalty = self.penalty(real, images, BatchDraws(self.seed, batch, PENALTY))
+            penalty = self.penalty(real, images, BatchDraws(self.hparams.seed, batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
             self.log("train/last_r1", penalty, sync_dist=True)  # Lightning repeats it until the next one
         if self.augment is not None:

@@ -9,7 +9,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.generators import Generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.processes import averaged
 from r2flow.registry import Count, Natural, NonNegative, construct
@@ -111,7 +110,7 @@ class LearnAutoencoder(Stage):
 
     def __init__(
         self,
-        generator: Generator,
+        *model: Any,
         discriminator: Mapping[str, Any] | None = None,
         adversarial_weight: NonNegative = 0.6,
         adversarial_start: Natural = 1,
@@ -120,12 +119,12 @@ class LearnAutoencoder(Stage):
         mask_factor: NonNegative = 1.0,
         **options: Any,
     ) -> None:
-        super().__init__(generator, **options)
+        super().__init__(*model, **options)
         self.automatic_optimization = False
         self.autoencoder = self.generator.first_stage_model
-        channels = generator.space.shape[0] + self.autoencoder.mask
+        channels = self.space.shape[0] + self.autoencoder.mask
         self.discriminator = construct("stage.discriminator", PatchDiscriminator, discriminator, channels)
-        (rows, columns), latents = generator.space.shape[1:], self.generator.noise_shape[1:]
+        (rows, columns), latents = self.space.shape[1:], self.generator.noise_shape[1:]
         if min(rows, columns) < self.discriminator.smallest:
             raise InputError(
                 f"stage.discriminator judges images of at least {self.discriminator.smallest} rows and columns, found "
@@ -172,10 +171,9 @@ class LearnAutoencoder(Stage):
 
 
 class LearnLatentDiffusion(SingleLoss):
-    """Mean squared error of the noise in a trained autoencoder's latents, at steps drawn uniformly.
+    """Mean squared error of the noise in the latents of a trained and frozen autoencoder, at steps drawn uniformly.
 
     Args:
-        generator: A `LatentDiffusion`, whose autoencoder is frozen.
         options: Those of `Stage`. The learning rate does not fall.
     """
 
@@ -185,9 +183,9 @@ class LearnLatentDiffusion(SingleLoss):
     needs_parent = True
     anneals = False
 
-    def __init__(self, generator: Generator, **options: Any) -> None:
-        super().__init__(generator, **options)
-        generator.first_stage_model.requires_grad_(False)
+    def __init__(self, *model: Any, **options: Any) -> None:
+        super().__init__(*model, **options)
+        self.generator.first_stage_model.requires_grad_(False)
 
     def configure_optimizers(self) -> Any:
         return self.optimizers_for(self.generator.unet.parameters())

@@ -5,7 +5,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.generators import Generator
 from r2flow.registry import NonNegative
 from r2flow.stages.base import Batch, SingleLoss
 from r2flow.systems.score.generator import ScoreModel, score_loss
@@ -24,8 +23,8 @@ class MatchScore(SingleLoss):
     generator_name = "score"
     anneals = False
 
-    def __init__(self, generator: Generator, power: NonNegative = 2.0, **options: Any) -> None:
-        super().__init__(generator, **options)
+    def __init__(self, *model: Any, power: NonNegative = 2.0, **options: Any) -> None:
+        super().__init__(*model, **options)
         self.power = power
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:

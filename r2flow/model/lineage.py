@@ -1,0 +1,155 @@
+"""Lineage: what a stage takes from the trained model that it starts from."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from r2flow.backbones import BACKBONES
+from r2flow.data.pairs import default_folder
+from r2flow.data.reading import AUTO
+from r2flow.errors import InputError
+from r2flow.generators import GENERATORS
+from r2flow.lidar.encoding import encoding_options
+from r2flow.lidar.sensors import sensor_options
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint, weights_hash
+from r2flow.models import name_of
+from r2flow.registry import options_of
+
+FREE_BACKBONE = ("attention", "dropout")  # options that weights do not depend on
+DEFAULT_BACKBONE = "hdit_tiny"
+DEFAULT_SENSOR = "hdl64e"
+DEFAULT_ENCODING = "logscale"
+DEFAULT_GENERATOR = "rectified_flow"
+
+
+@dataclass(frozen=True)
+class Parent:
+    """The model that a stage starts from, or only its config if it has not been trained yet."""
+
+    config: Mapping[str, Any]
+    path: Path
+    step: int = 0
+    checkpoint: Checkpoint | None = None
+
+    def record(self) -> dict[str, Any]:
+        """Identity of the parent as plain values, as stored in the checkpoints of its children.
+
+        `weights` is the hash of its averaged weights; `first_pair` the first pair whose noise it was not trained on;
+        `pairs` the default folder of its pairs.
+        """
+        data = self.config.get("data", {})
+        pairs = data.get("pairs") if data.get("name") == "pairs" else None
+        return {
+            "path": str(self.path),
+            "weights": self.checkpoint and weights_hash(self.checkpoint),
+            "step": self.step,
+            "stage": (self.config.get("stage") or {}).get("name", "rectify"),
+            "first_pair": pairs["first"] + pairs["num"] if pairs else 0,
+            "pairs": str(default_folder(self.path)),
+        }
+
+
+def find_parent(name: "str | Path | Parent") -> Parent:
+    """The parent of a name. A run folder must be finished, a checkpoint may be of any step."""
+    if isinstance(name, Parent):
+        return name
+    checkpoint = load_checkpoint(str(name))
+    total = checkpoint.config.get("trainer", {}).get("max_steps") or 0
+    is_run = Path(str(name)).expanduser().is_dir() and name_of(checkpoint.path) is None
+    if is_run and checkpoint.step < total:
+        raise InputError(
+            f"{name} has stopped at step {checkpoint.step} of {total}: finish it, or name the checkpoint to start "
+            f"from, {checkpoint.path}."
+        )
+    return Parent(checkpoint.config, checkpoint.path, checkpoint.step, checkpoint)
+
+
+def model_options(
+    given: Mapping[str, Any], parent: Parent | None, generator_name: str | None, on_pairs: bool = False
+) -> dict[str, Any]:
+    """Complete options of a model: `backbone`, `sensor`, `encoding` and `generator`, as plain values.
+
+    What is not given comes from the parent, else it is the default. A model with the weights of a parent has its
+    encoding and backbone, and on pairs, which are images of the parent, its sensor.
+
+    Args:
+        given: Names, options or objects; None: not given. Options of a backbone without a name change the parent's.
+        generator_name: Generator of the stage; None: the parent's, or a rectified flow.
+
+    Raises:
+        InputError: an unknown name or option, or one that contradicts the parent.
+    """
+    theirs = parent.config if parent else {}
+    if parent and "published" in theirs and theirs["data"]["reading"]["projection"] == "unfolding":
+        raise InputError(
+            f"{parent.path} was trained on unfolded scans, whose rings a new run's sensor does not have; "
+            "start from a flow trained on spherical images."
+        )
+    sensor = given.get("sensor")
+    encoding = given.get("encoding")
+    generator = _generator(given.get("generator"), theirs.get("generator"), generator_name)
+    backbone = given.get("backbone")
+    if parent is None:
+        options = {
+            "backbone": BACKBONES.options(backbone or DEFAULT_BACKBONE),
+            "sensor": sensor_options(sensor or DEFAULT_SENSOR),
+            "encoding": encoding_options(encoding or DEFAULT_ENCODING),
+        }
+    else:
+        options = {
+            "backbone": _changed(theirs["backbone"], backbone, BACKBONES.options),
+            "sensor": _changed(theirs["sensor"], sensor, sensor_options),
+            "encoding": _changed(theirs["encoding"], encoding, encoding_options),
+        }
+        free: dict[str, tuple[str, ...]] = {"backbone": FREE_BACKBONE, "encoding": ("levels",)}
+        if on_pairs:
+            free["sensor"] = ("reflectance_scale",)
+        for group, keys in free.items():
+            _refuse_other(group, options[group], theirs[group], keys, parent.path)
+    if options["encoding"]["reflectance"] == AUTO:
+        options["encoding"] = {**options["encoding"], "reflectance": theirs.get("encoding", {}).get("reflectance", True)}
+    return {**options, "generator": generator}
+
+
+def _changed(
+    theirs: Mapping[str, Any] | None, given: Any, complete: Callable[[Any], dict[str, Any]]
+) -> dict[str, Any] | None:
+    """The parent's options of a group with those given; a name stands for all options."""
+    if given is None:
+        return None if theirs is None else dict(theirs)
+    if isinstance(given, Mapping) and "name" not in given and theirs:
+        return {**theirs, **given}
+    return complete(given)
+
+
+def _refuse_other(group: str, ours: Any, theirs: Any, free: tuple[str, ...], path: Path) -> None:
+    """Refuse options that differ from those of the weights; keys that only one side has are equal to the default."""
+    for key in (ours or {}).keys() & (theirs or {}).keys() - set(free):
+        if plain(ours[key]) != plain(theirs[key]):
+            raise InputError(
+                f"{group}.{key} is {ours[key]} here, but {theirs[key]} in {path}, whose weights this run starts from. "
+                f"Leave it out: the {group} is the parent's."
+            )
+
+
+def _generator(
+    given: str | Mapping[str, Any] | None, theirs: Mapping[str, Any] | None, of_stage: str | None
+) -> dict[str, Any]:
+    """The generator given, else the stage's, else the parent's, or what the parent's is fine-tuned as.
+
+    One that is not given has the parent's options as far as they apply.
+    """
+    if given:
+        return GENERATORS.options(given)
+    parental = theirs or {"name": DEFAULT_GENERATOR}
+    chosen = of_stage or GENERATORS[parental["name"]].goes_on_as or parental["name"]
+    shared = options_of(GENERATORS[chosen], given=2)
+    return {"name": chosen, **{key: value for key, value in parental.items() if key in shared}}
+
+
+def plain(value: Any) -> Any:
+    """A value with its sequences as lists and its mappings as dicts."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value

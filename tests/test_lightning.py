@@ -1,0 +1,183 @@
+"""Stages and scans in a Trainer of Lightning, as docs/lightning.md shows them."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import lightning as L
+import pytest
+import torch
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from torch.utils.data import DataLoader
+
+import r2flow
+from r2flow import Distill, Rectify, Reflow, ScanDataModule
+from r2flow.callbacks import EMA, ReflowPairs
+from tests.conftest import ROOT, quiet_trainer
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*")
+
+BLOCK = re.compile(r"^```python( script)?\n(.*?)^```", re.M | re.S)
+SENSOR = {"name": "hdl64e", "rows": 8, "columns": 64}
+BACKBONE = {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16}
+
+
+def scans(**options) -> ScanDataModule:
+    return ScanDataModule("simulated", sensor=SENSOR, scenes=12, batch_size=4, **options)
+
+
+def flow(**options) -> Rectify:
+    return Rectify(BACKBONE, SENSOR, warmup_images=8, **options)
+
+
+def test_the_page_runs_block_by_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    blocks = BLOCK.findall((ROOT / "docs" / "lightning.md").read_text())
+    assert len(blocks) == 8
+    for number, (is_script, code) in enumerate(blocks):
+        if is_script:
+            script = tmp_path / "script.py"
+            script.write_text(code)
+            environment = {"PYTHONPATH": str(ROOT), "PATH": "", "OMP_NUM_THREADS": "1", "HOME": str(tmp_path)}
+            subprocess.run([sys.executable, script], check=True, timeout=200, cwd=tmp_path, env=environment)
+        else:
+            exec(compile(code, f"docs/lightning.md, block {number + 1}", "exec"), names)  # noqa: S102
+    assert {"test/panel", "test/run lengths"} <= names["trainer"].callback_metrics.keys() | set(names["tested"])
+    assert names["scans"][0].shape == (4, 2, 32, 256)
+    assert names["flow"].hparams.learning_rate == 2e-3
+
+
+def test_an_epoch_is_a_pass_over_the_scans(tmp_path: Path):
+    data = scans(validation={"share": 0.4})  # 7 are left
+    data.setup("fit")
+    batches = list(data.train_dataloader())
+    assert [len(batch["k"]) for batch in batches] == [4]  # whole batches
+    data = scans(validation={"share": 0.3})  # 8 are left
+    seen: list[torch.Tensor] = []
+
+    class Recorder(L.Callback):
+        def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+            seen.append(batch["x_1"])
+
+    trainer = quiet_trainer(tmp_path, max_epochs=2, callbacks=[Recorder()])
+    trainer.fit(flow(), data)
+    assert trainer.global_step == 4
+    for epoch in (torch.cat(seen[:2]), torch.cat(seen[2:])):
+        assert len(torch.unique(epoch, dim=0)) == 8
+    assert not torch.equal(seen[0], seen[2])  # in another order
+
+
+def ended(trainer: L.Trainer) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in trainer.lightning_module.state_dict().items()}
+
+
+@pytest.mark.parametrize("stopped_at", [2, 3, 4])  # an epoch has 3 batches of 4 of the 12 - 2 scans ... 2 whole ones
+def test_a_run_resumed_anywhere_ends_with_the_same_bits(tmp_path: Path, stopped_at: int):
+    def trainer(steps: int, *callbacks: L.Callback) -> L.Trainer:
+        return quiet_trainer(tmp_path, max_steps=steps, callbacks=[EMA(every=1), *callbacks], gradient_clip_val=1.0)
+
+    whole = trainer(7)
+    whole.fit(flow(), scans())
+    keep = ModelCheckpoint(tmp_path, every_n_train_steps=stopped_at, save_top_k=1, monitor=None, filename="kept")
+    first = quiet_trainer(
+        tmp_path, max_steps=7, callbacks=[EMA(every=1), keep, StopAfter(stopped_at)], gradient_clip_val=1.0,
+        enable_checkpointing=True,
+    )  # fmt: skip
+    first.fit(flow(), scans())
+    assert first.global_step == stopped_at
+    second = trainer(7)
+    second.fit(flow(), scans(), ckpt_path=tmp_path / "kept.ckpt")
+    for name, value in ended(whole).items():
+        assert torch.equal(value, ended(second)[name]), name
+
+
+class StopAfter(L.Callback):
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+        trainer.should_stop = trainer.global_step == self.step
+
+
+def test_a_checkpoint_of_a_plain_trainer_is_complete(tmp_path: Path):
+    trainer = quiet_trainer(tmp_path, max_steps=2, callbacks=[EMA(every=1)])
+    data = scans()
+    trainer.fit(flow(learning_rate=1e-3, sampler={"steps": 3}, seed=5), data)
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    loaded = Rectify.load_from_checkpoint(tmp_path / "last.ckpt")
+    assert (loaded.hparams.learning_rate, loaded.hparams.seed, loaded.sensor.shape) == (1e-3, 5, (8, 64))
+    model = r2flow.load(tmp_path / "last.ckpt")
+    assert model.generator.sampler == loaded.generator.sampler
+    assert model.generator.sampler.steps == 3
+    for (name, value), other in zip(model.generator.named_parameters(), loaded.generator.parameters(), strict=True):
+        assert torch.equal(value, other), name
+    drawn = torch.cat(quiet_trainer(tmp_path).predict(loaded, data))
+    torch.testing.assert_close(drawn, model.sample(len(drawn), seed=5, batch_size=4))
+
+
+def test_lightning_s_options_work(tmp_path: Path):
+    stop = EarlyStopping("val/loss", patience=0, min_delta=1e9)
+    best = ModelCheckpoint(tmp_path / "best", monitor="val/loss")
+    trainer = quiet_trainer(tmp_path, max_epochs=9, callbacks=[stop, best], enable_checkpointing=True)
+    trainer.fit(flow(), scans())
+    assert trainer.current_epoch == 2  # the second epoch was not better by a thousand million
+    assert r2flow.load(best.best_model_path).step in (2, 4)
+    for options in (
+        {"fast_dev_run": True},
+        {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 1},
+        {"max_epochs": 2, "overfit_batches": 1},
+        {"max_epochs": 1, "accumulate_grad_batches": 2},
+        {"max_steps": 3, "val_check_interval": 1},
+        {"max_epochs": 1, "precision": "bf16-mixed"},
+        {"max_epochs": 1, "reload_dataloaders_every_n_epochs": 1},
+    ):
+        trainer = quiet_trainer(tmp_path, **options)
+        trainer.fit(flow(), scans())
+        assert trainer.global_step >= 1
+    (figures,) = quiet_trainer(tmp_path, limit_test_batches=1).test(flow(), scans(), verbose=False)
+    assert figures["test/panel"] > 0
+
+
+def test_overfitting_sees_the_same_scans(tmp_path: Path):
+    seen: list[torch.Tensor] = []
+    module = flow()
+    module.on_train_batch_end = lambda outputs, batch, batch_idx: seen.append(batch["x_1"])
+    quiet_trainer(tmp_path, max_epochs=3, overfit_batches=1).fit(module, scans())
+    assert len(seen) == 3
+    assert torch.equal(seen[0], seen[1])
+    assert torch.equal(seen[0], seen[2])
+
+
+def test_straightening_and_distilling(tmp_path: Path):
+    trainer = quiet_trainer(tmp_path, max_steps=1)
+    trainer.fit(flow(), scans())
+    trainer.save_checkpoint(tmp_path / "1rf.ckpt")
+    parent = "1rf"
+    for name, stage, first in (("2rf", Reflow, 0), ("2td", Distill, 8)):
+        data = ScanDataModule("pairs", pairs={"num": 8, "batch_size": 4, "sampler": {"name": "euler", "steps": 2}})
+        trainer = quiet_trainer(tmp_path, max_steps=1, callbacks=[ReflowPairs()])
+        trainer.fit(stage(parent=tmp_path / f"{parent}.ckpt"), data)
+        trainer.save_checkpoint(tmp_path / f"{name}.ckpt")
+        assert data.pairs.first == first  # the noise of new pairs was not learned from
+        assert len(list((tmp_path / f"{parent}-pairs").glob("*.safetensors"))) == 1
+        parent = name
+    child = Distill.load_from_checkpoint(tmp_path / "2td.ckpt")  # without its parent's file
+    assert child.hparams.parent["stage"] == "reflow"
+    assert child.generator.fixed
+
+
+def test_scans_of_any_loader(tmp_path: Path):
+    images = torch.rand(8, 2, 8, 64) * torch.tensor([50.0, 1.0])[:, None, None]
+    module = flow()
+    x_1 = module.encoding.encode(images)
+    trainer = quiet_trainer(tmp_path, max_epochs=1)
+    trainer.fit(module, DataLoader(x_1, batch_size=4), DataLoader(x_1, batch_size=4))
+    assert trainer.global_step == 2
+    assert trainer.callback_metrics["val/loss"] > 0
+
+
+def test_other_scans_than_the_module_s_are_refused(tmp_path: Path):
+    with pytest.raises(r2flow.errors.InputError, match="the module's images are 64x1024 of hdl64e, the data's 8x64"):
+        quiet_trainer(tmp_path, max_steps=1).fit(Rectify("hdit_tiny"), scans())
