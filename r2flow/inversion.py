@@ -17,7 +17,7 @@ from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.samplers import Adaptive
 
-TIGHT = Adaptive(tolerance=1e-5)
+_TIGHT = Adaptive(tolerance=1e-5)
 
 
 def real_scans(
@@ -27,21 +27,22 @@ def real_scans(
     most: int = 16,
     need_reflectance: bool = True,
 ) -> tuple[list[str], Tensor]:
-    """Read scans (`open_scans`), at most `most` per set, evenly spread, projected as the checkpoint's training scans.
+    """Read scans, at most `most` per set, evenly spread, projected as the checkpoint's.
 
-    Returns names, and range in metres and reflectance, (N, 2 or 1, H, W). `reflectance_scale` is the value of full
-    reflectance in the files; None: by `reading_for`. `need_reflectance`: a set without reflectance is refused if the
-    checkpoint has it.
+    Returns names, and range in metres and reflectance, (N, 2 or 1, H, W). `reflectance_scale` is
+    the value of full reflectance in the files; None: by `reading_for`. `need_reflectance`: a set
+    without reflectance is refused if the checkpoint has it.
     """
     reflectance = checkpoint.encoding.reflectance and (need_reflectance or AUTO)
-    sets = []
+    names = []
+    images = []
     for spec in specs:
         reading = reading_for([spec], checkpoint, reflectance_scale=reflectance_scale)
         reading = replace(reading, reflectance=reflectance, on_bad_scan="error", within_limits=True)
-        sets.append(open_scans(spec, reading).spread(most))
-    stems = [Path(name).name.split(".")[0].replace(" ", "_") for scans in sets for name in scans.source.names]
-    names = [stem if stems.count(stem) == 1 else f"{stem}_{stems[:i].count(stem) + 1}" for i, stem in enumerate(stems)]
-    return names, torch.stack([torch.from_numpy(scans.source[i]) for scans in sets for i in range(len(scans))])
+        source = open_scans(spec, reading).spread(most).source
+        names += [Path(name).name.split(".")[0] for name in source.names]
+        images += [torch.from_numpy(source[i]) for i in range(len(source))]
+    return names, torch.stack(images)
 
 
 class Inversion(NamedTuple):
@@ -54,34 +55,44 @@ class Inversion(NamedTuple):
     converged: Tensor  # whether both directions are solved to the tolerance and finite, (B,) bool
 
 
-def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, progress: Progress = None) -> Inversion:
-    """Solve the flow's ODE backward from x_1 to x_0, and forward again, for images in metres, (B, 2 or 1, H, W).
+def invert(
+    checkpoint: Checkpoint, images: Tensor, sampler: Sampler = _TIGHT, progress: Progress = None
+) -> Inversion:
+    """Solve the ODE backward from x_1 to x_0 and forward again; images are (B, 2 or 1, H, W).
 
     A scan with NaN is not converged and has NaN as noise; other scans of the batch are unaffected.
     """
     flow = as_flow(checkpoint.generator, "inversion")
-    assert images.shape[2:] == checkpoint.sensor.shape
     x_1 = checkpoint.encoding.encode(images[:, : 1 + checkpoint.encoding.reflectance].cpu())
     backward = flow.solve(x_1, 1.0, 0.0, sampler=sampler, progress=progress)
     # The last state of an unconverged solution is not noise.
     x_0 = backward.x.cpu().masked_fill(~backward.converged.view(-1, 1, 1, 1), math.nan)
     again = flow.solve(x_0, sampler=sampler, progress=progress)
-    evaluations, converged = backward.evaluations + again.evaluations, backward.converged & again.converged
-    return Inversion(x_1, x_0, again.x.cpu(), evaluations, converged)
+    return Inversion(
+        x_1,
+        x_0,
+        again.x.cpu(),
+        backward.evaluations + again.evaluations,
+        backward.converged & again.converged,
+    )
 
 
 def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> dict[str, Tensor]:
     """Errors of scans after inversion and generation, each (B,); NaN for scans that are not finite.
 
-    `rms` in model space, [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`; `noise_std`, the standard
-    deviation of x_0, far from 1 for scans unlike the training set.
+    `rms` in model space, [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`; `noise_std`,
+    the standard deviation of x_0, far from 1 for scans unlike the training set.
     """
+    decode = checkpoint.encoding.decode
     error = rms(inversion.again - inversion.x_1)
-    median_m, rms_m, dropped = metres_apart(*(checkpoint.encoding.decode(x) for x in (inversion.x_1, inversion.again)))
+    median_m, rms_m, dropped = metres_apart(decode(inversion.x_1), decode(inversion.again))
     return {
-        "rms": error, "median_m": median_m, "rms_m": rms_m, "dropped": dropped.masked_fill(error.isnan(), math.nan),
+        "rms": error,
+        "median_m": median_m,
+        "rms_m": rms_m,
+        "dropped": dropped.masked_fill(error.isnan(), math.nan),
         "noise_std": inversion.x_0.double().flatten(1).std(1),
-    }  # fmt: skip
+    }
 
 
 def rms(x: Tensor) -> Tensor:
@@ -92,34 +103,40 @@ def rms(x: Tensor) -> Tensor:
 def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Errors between decoded images, (B, 2 or 1, H, W), per scan, each (B,) float64.
 
-    Lower median and root mean square of |r' - r| in metres over the rays that return in both, NaN without any; share of
-    all rays that return in only one.
+    Lower median and root mean square of |r' - r| in metres over the rays that return in both, NaN
+    without any; share of all rays that return in only one.
     """
-    before, after = image[:, 0].double(), other[:, 0].double()
-    apart = (after - before).abs().masked_fill((before <= 0) | (after <= 0), math.nan).flatten(1)
-    dropped = ((before > 0) != (after > 0)).flatten(1).double().mean(1)
+    before = image[:, 0].double().flatten(1)
+    after = other[:, 0].double().flatten(1)
+    returned = before > 0
+    returns = after > 0
+    apart = (after - before).abs().masked_fill(~(returned & returns), math.nan)
+    dropped = (returned != returns).double().mean(1)
     return apart.nanmedian(1).values, apart.square().nanmean(1).sqrt(), dropped
 
 
 def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
-    """Spherical linear interpolation, (sin((1 - w) a) x + sin(w a) y) / sin a, with a the angle between x and y.
+    """Spherical linear interpolation, (sin((1 - w) a) x + sin(w a) y) / sin a, a the angle.
 
-    Unlike linear interpolation, it keeps the norm of noise, since independent samples are nearly orthogonal (Shoemake
-    1985, "Animating rotation with quaternion curves"). For a vanishing angle it is linear. Ends are (...), neither zero
-    nor opposite, weights w (N,), the result (N, ...).
+    Unlike linear interpolation, it keeps the norm of noise, since independent samples are nearly
+    orthogonal (Shoemake 1985, "Animating rotation with quaternion curves"). For a vanishing angle
+    it is linear. Ends are (...), neither zero nor opposite, weights w (N,), the result (N, ...).
     """
-    u, v = (end.double().flatten() / torch.linalg.vector_norm(end.double()) for end in (x, y))
+    ends = torch.stack([x, y]).double()
+    u, v = ends / ends.flatten(1).norm(dim=1).view(-1, *(1,) * x.ndim)
     # arccos of the inner product would lose half the digits of a small angle.
-    angle = 2 * torch.atan2(torch.linalg.vector_norm(u - v), torch.linalg.vector_norm(u + v)) / math.pi
+    angle = 2 / math.pi * torch.atan2((u - v).norm(), (u + v).norm())
     w = weights.double().view(-1, *(1,) * x.ndim)
-    of_x, of_y = (share * torch.sinc(share * angle) / torch.sinc(angle) for share in (1 - w, w))
-    return (of_x * x.double() + of_y * y.double()).to(x.dtype)
+    shares = torch.stack([1 - w, w], 1)
+    return (shares * torch.sinc(shares * angle) / torch.sinc(angle) * ends).sum(1).to(x.dtype)
 
 
 class Interpolation(NamedTuple):
     ends: Inversion  # inversion of the two given scans
     weights: Tensor  # interpolation weight of each frame, (N,), from 0 to 1
-    images: Tensor  # range in metres and reflectance, (N, 2 or 1, H, W); first and last are round trips of the ends
+    # Range in metres and reflectance, (N, 2 or 1, H, W); first and last are round trips of the
+    # ends.
+    images: Tensor
     evaluations: Tensor  # network evaluations of each frame, (N,); of both directions for the ends
     converged: Tensor  # whether each frame is solved, (N,) bool; others are not samples of the flow
 
@@ -128,21 +145,22 @@ def interpolate_scans(
     checkpoint: Checkpoint,
     pair: Tensor,
     frames: int,
-    sampler: Sampler = TIGHT,
+    sampler: Sampler = _TIGHT,
     progress: Progress = None,
     arrived: Callable[[int], None] = lambda done: None,
 ) -> Interpolation:
-    """Invert two scans, (2, 2 or 1, H, W), `slerp` between their noise, and generate scans: the paper's figure 3.
+    """Invert two scans, (2, 2 or 1, H, W), `slerp` their noise, generate: the paper's figure 3.
 
-    `frames`, at least 2, counts both ends; `arrived` is called with the number of finished frames, the ends first.
+    `frames`, at least 2, counts both ends; `arrived` is called with the number of finished frames,
+    the ends first.
     """
     flow = as_flow(checkpoint.generator, "interpolation")
     ends = invert(checkpoint, pair, sampler, progress)
     if not ends.converged.all():
         which = "last" if ends.converged[0] else "first"
         raise InputError(
-            f"the {which} scan cannot be carried to its noise and back by {sampler.name}: try another sampler, "
-            "a larger tolerance or more steps."
+            f"the {which} scan cannot be carried to its noise and back by {sampler.name}: try "
+            "another sampler, a larger tolerance or more steps."
         )
     arrived(2)
     weights = torch.linspace(0, 1, frames, dtype=torch.float64, device="cpu")

@@ -1,8 +1,9 @@
-"""Flow maps: X_{t->s} maps the flow's state at t to its state at s, by the mean velocity u between t and s.
+"""Flow maps: X_{t->s} maps the flow's state at t to that at s, by the mean velocity u between.
 
     X_{t->s}(x) = x + (s - t) u(x, t, s),    u(x, t, t) = v(t, x)
 
-An objective returns a point x_t and the regression target of u there, without forward-mode derivatives.
+An objective returns a point x_t and the regression target of u there, without forward-mode
+derivatives.
 """
 
 import math
@@ -13,14 +14,15 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import selected
 from r2flow.flow.times import build_density
 from r2flow.registry import Portion, Registry
 
-MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # u(t, x, s), in the argument order of backbones
+# u(t, x, s), in the argument order of backbones.
+MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
@@ -29,19 +31,22 @@ def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
 
 
 class JumpTimes:
-    """Distribution of the jumps (t, s) in training: steps of time grids, velocities (s = t), jumps to s = 1, others.
+    """Distribution of the jumps (t, s) in training: steps of grids, velocities, ends, others.
 
     Args:
-        steps: Numbers of steps of the grids, drawn uniformly; repeat a number to draw it more often.
+        steps: Numbers of steps of the grids, drawn uniformly; repeat a number to draw it more
+            often.
         grid: Time grid of the steps (`r2flow.flow.solvers.fixed.named_grid`).
         share: Share of jumps that are steps of these grids.
         diagonal: Share of the rest with s = t.
         ends: Share of the rest with s = 1 and t from the density `time`.
-        time: Time density (`r2flow.flow.times.TIMES`) for s = t and s = 1; None: `u_shaped`, as in reflow.
+        time: Time density (`r2flow.flow.times.TIMES`) for s = t and s = 1; None: `u_shaped`, as in
+            reflow.
 
     Attributes:
         velocities: The time density: maps uniform draws to times, (B,) each.
-        times: The time grid of each number of steps, (len(steps), max(steps) + 1) float64, padded with NaN.
+        times: The time grid of each number of steps, (len(steps), max(steps) + 1) float64, padded
+            with NaN.
     """
 
     def __init__(
@@ -53,28 +58,33 @@ class JumpTimes:
         ends: Portion = 0.0,
         time: Mapping[str, Any] | None = None,
     ) -> None:
-        check(steps and min(steps) >= 1, f"the steps of a flow map's jumps must be at least 1, found {steps}.")
-        check(diagonal + ends <= 1, f"diagonal + ends must be at most 1; found {diagonal}, {ends}.")
-        self.grid, self.share, self.diagonal, self.ends = grid, share, diagonal, ends
+        if diagonal + ends > 1:
+            raise InputError(f"diagonal + ends must be at most 1; found {diagonal}, {ends}.")
+        self.grid = grid
+        self.share = share
+        self.diagonal = diagonal
+        self.ends = ends
         self.velocities = build_density(time or {"name": "u_shaped"})
-        self.steps = torch.tensor(tuple(steps))
+        self.steps = torch.tensor(steps)
         grids = [build_grid(grid, 0.0, 1.0, count) for count in steps]
         self.times = pad_sequence(grids, batch_first=True, padding_value=math.nan)
 
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Draw t and s, (B,) each, from uniform numbers in [0, 1), (B, 3)."""
         which, a, b = u.unbind(1)
-        times, counts = self.times.to(u), self.steps.to(u.device)
+        times = self.times.to(u)
+        counts = self.steps.to(u.device)
         row = (a * len(counts)).long()
         step = (b * counts[row]).long()
-        low, high = torch.minimum(a, b), torch.maximum(a, b)
-        rest = (which - self.share) / (1 - self.share)
         velocity = self.velocities(a)
-        low, high = (torch.where(rest < self.diagonal, velocity, time) for time in (low, high))
+        rest = (which - self.share) / (1 - self.share)
+        diagonal = rest < self.diagonal
         to_end = rest >= 1 - self.ends
-        low, high = torch.where(to_end, velocity, low), torch.where(to_end, 1.0, high)
+        low = torch.where(diagonal | to_end, velocity, torch.minimum(a, b))
+        high = torch.where(diagonal, velocity, torch.maximum(a, b)).masked_fill(to_end, 1.0)
         on_grid = which < self.share
-        return torch.where(on_grid, times[row, step], low), torch.where(on_grid, times[row, step + 1], high)
+        low = torch.where(on_grid, times[row, step], low)
+        return low, torch.where(on_grid, times[row, step + 1], high)
 
 
 class Aim(NamedTuple):
@@ -84,33 +94,40 @@ class Aim(NamedTuple):
     target: Tensor
 
 
-Objective = Callable[[MeanVelocity, Tensor, Tensor, Tensor, Tensor, Tensor], Aim]  # of u, x_0, x_1, t, s, rho
+# Of u, x_0, x_1, t, s, rho.
+_Objective = Callable[[MeanVelocity, Tensor, Tensor, Tensor, Tensor, Tensor], Aim]
 
 
 def straight(u: MeanVelocity, x_0: Tensor, x_1: Tensor, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """Target u(x_t, t, s) = x_1 - x_0 on the straight line from x_0 to x_1, for every s: k-TD's regression."""
+    """Target u(x_t, t, s) = x_1 - x_0 on the line from x_0 to x_1, for every s, as in k-TD."""
     return Aim(*interpolate(x_0, x_1, t))
 
 
-def consistency(u: MeanVelocity, x_0: Tensor, x_1: Tensor, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """Target u(x_t, t, s) = rho v + (1 - rho) u(x_l, l, s), l = t + rho (s - t), x_l = x_t + rho (s - t) v.
+def consistency(
+    u: MeanVelocity, x_0: Tensor, x_1: Tensor, t: Tensor, s: Tensor, rho: Tensor
+) -> Aim:
+    """Target u(x_t, t, s) = rho v + (1 - rho) u(x_l, l, s) from the map itself at a later time.
 
-    x_t lies on the straight line from x_0 to x_1, v = x_1 - x_0; the target has no gradient (Luo et al. 2025, SoFlow;
-    Zhang et al. 2025, alpha-Flow). rho = 1 is `straight`; rho -> 0 gives MeanFlow.
+        l = t + rho (s - t),    x_l = x_t + rho (s - t) v
+
+    x_t lies on the straight line from x_0 to x_1, v = x_1 - x_0; the target has no gradient (Luo et
+    al. 2025, SoFlow; Zhang et al. 2025, alpha-Flow). rho = 1 is `straight`; rho -> 0 gives
+    MeanFlow.
     """
     x_t, v = interpolate(x_0, x_1, t)
-    target, learned = v.clone(), (rho < 1).nonzero()[:, 0]  # the only device synchronisation
+    target = v.clone()
+    learned = (rho < 1).nonzero()[:, 0]  # the only device synchronisation
     if len(learned):
-        t, s, rho, v = t[learned], s[learned], rho[learned], v[learned]
-        ahead, share = rho * (s - t), expand_time(rho, v)
-        u = selected(u, learned)
+        t, s, rho, v, x = (part[learned] for part in (t, s, rho, v, x_t))
+        ahead = rho * (s - t)
+        share = expand_time(rho, v)
         with torch.no_grad():
-            later = u(t + ahead, x_t[learned] + expand_time(ahead, v) * v, s)
+            later = selected(u, learned)(t + ahead, x + expand_time(ahead, v) * v, s)
         target[learned] = share * v + (1 - share) * later
     return Aim(x_t, target)
 
 
-OBJECTIVES: Registry[Objective] = Registry(
+OBJECTIVES: Registry[_Objective] = Registry(
     "objective of a flow map",
     straight=straight,
     consistency=consistency,

@@ -9,6 +9,6 @@ def expand_time(t: Tensor, x: Tensor) -> Tensor:
 
 
 def interpolate(x_0: Tensor, x_1: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """x_t = (1 - t) x_0 + t x_1 and its velocity u_t = x_1 - x_0 (paper, eq. 1-2) at times t in [0, 1], (B,)."""
+    """x_t = (1 - t) x_0 + t x_1 and its velocity u_t = x_1 - x_0 (paper, eq. 1-2); t is (B,)."""
     t = expand_time(t, x_1)
     return (1 - t) * x_0 + t * x_1, x_1 - x_0

@@ -1,14 +1,15 @@
 """Test problems for solvers: flows with a known solution.
 
-States have any shape (B, ...). `Gaussian`, `Anisotropic`, the mixtures and `PointMass` are rectified flows:
-x_0 ~ N(0, 1), x_1 independent of x_0, v(t, x) = E[x_1 - x_0 | x_t = x]. `Straight` is a reflowed Gaussian. The others
-do not model data; each has a different difficulty for solvers.
+States have any shape (B, ...). `Gaussian`, `Anisotropic`, the mixtures and `PointMass` are
+rectified flows: x_0 ~ N(0, 1), x_1 independent of x_0, v(t, x) = E[x_1 - x_0 | x_t = x]. `Straight`
+is a reflowed Gaussian. The others do not model data; each has a different difficulty for solvers.
 """
 
-import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,7 +28,8 @@ class Problem(ABC):
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
         """x_t, (B, ...) float64, of the path that starts at x_0; t of shape () or (B,)."""
         x_0 = x_0.double()
-        return self.path(x_0, expand_time(torch.as_tensor(t, dtype=torch.float64, device=x_0.device), x_0))
+        t = torch.as_tensor(t, dtype=torch.float64, device=x_0.device)
+        return self.path(x_0, expand_time(t, x_0))
 
     @abstractmethod
     def velocity(self, t: Tensor, x: Tensor) -> Tensor: ...
@@ -36,18 +38,17 @@ class Problem(ABC):
     def path(self, x_0: Tensor, t: Tensor) -> Tensor: ...
 
 
+@dataclass(frozen=True)
 class Gaussian(Problem):
     """x_1 ~ N(mean, std^2): x_t = t mean + sigma_t x_0 with sigma_t^2 = (1 - t)^2 + t^2 std^2.
 
     A smaller std gives later and sharper turns of the paths.
     """
 
+    std: float = 0.25
     mean = 0.7
 
-    def __init__(self, std: float = 0.25) -> None:
-        self.std = std
-
-    def deviation(self, x: Tensor) -> Tensor | float:
+    def deviation(self, x: Tensor) -> Any:
         """std, broadcastable with x."""
         return self.std
 
@@ -70,44 +71,51 @@ class Anisotropic(Gaussian):
 
 
 def _normal_cdf(x: Tensor) -> Tensor:
-    """Phi(x), accurate in the lower tail, where `torch.special.ndtr` loses all digits beyond 6 standard deviations."""
+    """Phi(x), accurate in the lower tail, where `torch.special.ndtr` loses digits beyond 6."""
     return torch.special.erfc(-x / math.sqrt(2)) / 2
 
 
 class GaussianMixture(Problem):
     """x_1 from a mixture of Gaussians, independently in every element.
 
-    In component i, x_t has mean t m_i and variance c_i = (1 - t)^2 + t^2 s_i^2, and x_1 - x_0 the conditional mean
-    m_i + (t s_i^2 - (1 - t)) (x - t m_i) / c_i; v is their mean over the posterior of i. Paths of a scalar do not
-    cross; the distribution function is therefore constant along a path: x_t solves F_t(x_t) = F_0(x_0).
+    In component i, x_t has mean t m_i and variance c_i = (1 - t)^2 + t^2 s_i^2, and x_1 - x_0 the
+    conditional mean m_i + (t s_i^2 - (1 - t)) (x - t m_i) / c_i; v is their mean over the posterior
+    of i. Paths of a scalar do not cross; the distribution function is therefore constant along a
+    path: x_t solves F_t(x_t) = F_0(x_0).
+
+    Args:
+        weights, means, stds: One for each component.
     """
 
-    def __init__(self, weights: Sequence[float], means: Sequence[float], stds: Sequence[float]) -> None:
-        self.weights, self.means, self.stds = tuple(weights), tuple(means), tuple(stds)
+    def __init__(self, *components: tuple[float, ...]) -> None:
+        self.components = components
+
+    def _at(self, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Weights, means and deviations of x_1, variances of x_t; components first."""
+        weights, means, stds = x.new_tensor(self.components).view(3, -1, *(1,) * x.ndim)
+        return weights, means, stds, (1 - t) ** 2 + (t * stds) ** 2
 
     def velocity(self, t: Tensor, x: Tensor) -> Tensor:
-        scores, slopes = [], []
-        for weight, mean, std in zip(self.weights, self.means, self.stds, strict=True):
-            variance = (1 - t) ** 2 + (t * std) ** 2
-            offset = x - t * mean
-            scores.append(math.log(weight) - 0.5 * variance.log() - 0.5 * offset.square() / variance)
-            slopes.append(mean + (t * std**2 - (1 - t)) / variance * offset)
-        return (torch.stack(scores).softmax(0) * torch.stack(slopes)).sum(0)
+        weights, means, stds, variances = self._at(t, x)
+        offsets = x - t * means
+        scores = weights.log() - variances.log() / 2 - offsets.square() / variances / 2
+        slopes = means + (t * stds**2 - (1 - t)) / variances * offsets
+        return (scores.softmax(0) * slopes).sum(0)
 
     def path(self, x_0: Tensor, t: Tensor) -> Tensor:
-        """x_t by bisection, to full precision: the quantile of a mixture lies between those of its components."""
-        means = torch.stack([t * mean + torch.zeros_like(x_0) for mean in self.means])
-        stds = torch.stack([((1 - t) ** 2 + (t * std) ** 2).sqrt() + torch.zeros_like(x_0) for std in self.stds])
-        weights = torch.tensor(self.weights, dtype=torch.float64, device=x_0.device).view(-1, *(1,) * x_0.ndim)
+        """x_t by bisection, to full precision, between the quantiles of the components."""
+        weights, means, _, variances = self._at(t, x_0)
         # Compare the tail in which x_0 lies: 1 - F(x) would lose digits.
         side = torch.where(x_0 < 0, 1.0, -1.0)
         level = _normal_cdf(side * x_0)
-        low, high = (means + stds * x_0).amin(0), (means + stds * x_0).amax(0)
+        quantiles = t * means + variances.sqrt() * x_0
+        low, high = quantiles.aminmax(dim=0)
         for _ in range(64):
             middle = (low + high) / 2
-            tail = (weights * _normal_cdf(side * (middle - means) / stds)).sum(0)
-            above = (tail - level) * side > 0
-            low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+            tails = _normal_cdf(side * (middle - t * means) / variances.sqrt())
+            above = ((weights * tails).sum(0) - level) * side > 0
+            low = torch.where(above, low, middle)
+            high = torch.where(above, middle, high)
         return (low + high) / 2
 
 
@@ -119,7 +127,7 @@ class TwoModes(GaussianMixture):
 
 
 class RayDrop(GaussianMixture):
-    """Mixture like a pixel of a scan: -1 (within `std`) for a dropped ray, else a range around 0.3."""
+    """Mixture like a pixel of a scan: -1 (within `std`) for a dropped ray, else around 0.3."""
 
     def __init__(self, dropped: float = 0.3, std: float = 1e-3) -> None:
         super().__init__((dropped, 1 - dropped), (-1.0, 0.3), (std, 0.3))
@@ -138,7 +146,8 @@ class PointMass(Problem):
 class Straight(Problem):
     """A reflowed Gaussian, x_1 = mean + std x_0: one Euler step is exact."""
 
-    mean, std = 0.7, 0.25
+    mean = 0.7
+    std = 0.25
 
     def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         return self.mean + (self.std - 1) / (1 - t + t * self.std) * (x - t * self.mean)
@@ -147,31 +156,34 @@ class Straight(Problem):
         return (1 - t) * x_0 + t * (self.mean + self.std * x_0)
 
 
+@dataclass(frozen=True)
 class Rotating(Problem):
-    """x' = w J x: pairs of elements, from the first and the second half, make `turns` full rotations until t = 1."""
+    """x' = w J x: pairs of elements, one of each half, make `turns` rotations until t = 1."""
 
-    def __init__(self, turns: float = 0.5) -> None:
-        self.speed = 2 * math.pi * turns
+    turns: float = 0.5
 
     def velocity(self, t: Tensor, x: Tensor) -> Tensor:
-        first, second = x.flatten(1).chunk(2, 1)
-        return self.speed * torch.cat([-second, first], 1).view(x.shape)
+        return 2 * math.pi * self.turns * self._quarter(x)
 
     def path(self, x_0: Tensor, t: Tensor) -> Tensor:
-        first, second = x_0.flatten(1).chunk(2, 1)
-        angle = self.speed * t.view(-1, 1)
-        c, s = angle.cos(), angle.sin()
-        return torch.cat([c * first - s * second, s * first + c * second], 1).view(x_0.shape)
+        angle = 2 * math.pi * self.turns * t
+        return angle.cos() * x_0 + angle.sin() * self._quarter(x_0)
+
+    def _quarter(self, x: Tensor) -> Tensor:
+        """J x, a quarter of a rotation."""
+        first, second = x.flatten(1).chunk(2, 1)
+        return torch.cat([-second, first], 1).view(x.shape)
 
 
+@dataclass(frozen=True)
 class StiffLinear(Problem):
     """x' = -rate (x - sin t) + cos t: all paths approach a slow one within a time of 1 / rate.
 
-    Prothero, Robinson, On the stability and accuracy of one-step methods for solving stiff systems, 1974.
+    Prothero, Robinson, On the stability and accuracy of one-step methods for solving stiff systems,
+    1974.
     """
 
-    def __init__(self, rate: float = 1e2) -> None:
-        self.rate = rate
+    rate: float = 1e2
 
     def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         return t.cos() - self.rate * (x - t.sin())
@@ -180,11 +192,12 @@ class StiffLinear(Problem):
         return t.sin() + x_0 * (-self.rate * t).exp()
 
 
+@dataclass(frozen=True)
 class Discontinuous(Problem):
     """x' = -x before t = `at`, -x + jump from there."""
 
-    def __init__(self, jump: float = 3.0, at: float = math.sqrt(2) - 1) -> None:
-        self.jump, self.at = jump, at
+    jump: float = 3.0
+    at: float = math.sqrt(2) - 1
 
     def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         return self.jump * (t >= self.at) - x
@@ -193,11 +206,12 @@ class Discontinuous(Problem):
         return x_0 * (-t).exp() - self.jump * torch.expm1(-(t - self.at).clamp(min=0))
 
 
+@dataclass(frozen=True)
 class NarrowJet(Problem):
-    """x' = -x + N(t; at, width^2): an impulse of 1 within a few widths, which a long step can miss."""
+    """x' = -x + N(t; at, width^2): an impulse of 1 in a few widths, which a long step can miss."""
 
-    def __init__(self, width: float = 2e-3, at: float = 0.6) -> None:
-        self.width, self.at = width, at
+    width: float = 2e-3
+    at: float = 0.6
 
     def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         z = (t - self.at) / self.width
@@ -205,19 +219,20 @@ class NarrowJet(Problem):
 
     def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         w = self.width
-        passed = _normal_cdf((t - self.at) / w - w) - _normal_cdf(t.new_tensor(-self.at / w - w))
+        passed = _normal_cdf((t - self.at) / w - w) - _normal_cdf((0 * t - self.at) / w - w)
         return x_0 * (-t).exp() + (self.at - t + w**2 / 2).exp() * passed
 
 
+@dataclass(frozen=True)
 class Pulse(Problem):
     """x' = 1 / width within width / 2 of `at`, else 0, for any x: moves all paths by 1."""
 
-    def __init__(self, width: float = 0.2, at: float = 0.45) -> None:
-        self.width, self.at = width, at
+    width: float = 0.2
+    at: float = 0.45
 
     def velocity(self, t: Tensor, x: Tensor) -> Tensor:
         inside = (t - self.at).abs() < self.width / 2
-        return (inside / self.width).to(x.dtype) + torch.zeros_like(x)
+        return inside / self.width + torch.zeros_like(x)
 
     def path(self, x_0: Tensor, t: Tensor) -> Tensor:
         return x_0 + ((t - self.at) / self.width + 0.5).clamp(0, 1)
@@ -227,14 +242,14 @@ PROBLEMS: Registry = Registry(
     "problem",
     straight=Straight,
     gaussian=Gaussian,
-    narrow_gaussian=functools.partial(Gaussian, std=0.01),
+    narrow_gaussian=partial(Gaussian, std=0.01),
     two_modes=TwoModes,
     ray_drop=RayDrop,
     point_mass=PointMass,
     anisotropic=Anisotropic,
-    stiff_1e2=functools.partial(StiffLinear, rate=1e2),
-    stiff_1e4=functools.partial(StiffLinear, rate=1e4),
-    stiff_1e6=functools.partial(StiffLinear, rate=1e6),
+    stiff_1e2=partial(StiffLinear, rate=1e2),
+    stiff_1e4=partial(StiffLinear, rate=1e4),
+    stiff_1e6=partial(StiffLinear, rate=1e6),
     discontinuous=Discontinuous,
     narrow_jet=NarrowJet,
     pulse=Pulse,

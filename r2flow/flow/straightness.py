@@ -1,9 +1,9 @@
-"""Straightness of a flow's paths: the paper's s(t) (eq. 6), its integral, and the most curved pixels.
+"""Straightness of a flow's paths: the paper's s(t) (eq. 6), its integral, the most curved pixels.
 
     s(t) = |d - v_t|^2,  d = Phi(x_0, 1) - x_0,  v_t = v(t, Phi(x_0, t)),
 
-which is 0 on a straight path, where one Euler step is exact. d is known only at the end, so that the velocities of a
-path are kept until then: as many images as steps.
+which is 0 on a straight path, where one Euler step is exact. d is known only at the end, so that
+the velocities of a path are kept until then: as many images as steps.
 
 An untrained flow with v = 0 is perfectly straight: report s together with s / |d|^2.
 """
@@ -24,7 +24,8 @@ class Straightness(NamedTuple):
     t: Tensor  # the times 0, 1/n, ..., (n - 1)/n, (n,), float64
     s: Tensor  # s(t), (N, n), float64; the mean over t is the integral
     squared_length: Tensor  # |d|^2, (N,), float64
-    bends: Tensor  # int_0^1 (d - v_t)^2 dt of the most curved elements, decreasing, -inf if not finite, (k,)
+    # The integral of (d - v_t)^2 over t of the most curved elements, decreasing; -inf: not finite.
+    bends: Tensor
     trajectories: Tensor  # values of these elements at 0, 1/n, ..., 1, (k, n + 1)
 
     @property
@@ -35,11 +36,16 @@ class Straightness(NamedTuple):
 
 @torch.no_grad()
 def straightness(
-    velocity: Velocity, x_0: Tensor, steps: int = 256, most_curved: int = 0, progress: Callable[[], None] | None = None
+    velocity: Velocity,
+    x_0: Tensor,
+    steps: int = 256,
+    most_curved: int = 0,
+    progress: Callable[[], None] | None = None,
 ) -> Straightness:
-    """s(t) per scan at the times of `steps` Euler steps from noise, (N, ...), and the `most_curved` elements.
+    """s(t) per scan in `steps` Euler steps from noise, (N, ...), and the `most_curved` elements.
 
-    The integral is a left sum, too small where v changes near t = 1: two thirds of it for data of deviation 0.01.
+    The integral is a left sum, too small where v changes near t = 1: two thirds of it for data of
+    deviation 0.01.
     """
     velocities: list[Tensor] = []
 
@@ -48,12 +54,19 @@ def straightness(
         return velocities[-1]
 
     d = solve(recorded, x_0, steps=steps, progress=progress).x - x_0
-    bends, s = torch.zeros_like(d, dtype=torch.float64), []
+    bends = torch.zeros_like(d, dtype=torch.float64)
+    s = []
     for v in velocities:
         squares = (d - v).double().square()
         bends += squares / steps
         s.append(squares.flatten(1).sum(1))
-    most, pixels = bends.flatten().nan_to_num(-math.inf, -math.inf).topk(min(most_curved, bends.numel()))
-    moves = torch.stack([x_0.flatten()[pixels], *(v.flatten()[pixels] / steps for v in velocities)], 1)
-    length = d.double().square().flatten(1).sum(1)
-    return Straightness(torch.arange(steps).double() / steps, torch.stack(s, 1), length, most, moves.double().cumsum(1))
+    bends = bends.flatten().nan_to_num(-math.inf, -math.inf)
+    most, pixels = bends.topk(min(most_curved, len(bends)))
+    moves = [x_0.flatten()[pixels], *(v.flatten()[pixels] / steps for v in velocities)]
+    return Straightness(
+        torch.arange(steps).double() / steps,
+        torch.stack(s, 1),
+        d.double().square().flatten(1).sum(1),
+        most,
+        torch.stack(moves, 1).double().cumsum(1),
+    )

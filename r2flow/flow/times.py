@@ -1,7 +1,7 @@
 """Time densities p(t) for training, given by their inverse CDF.
 
-A density maps u ~ Uniform[0, 1) to t. The caller draws u (counter-based, one per image), so that the time of image k
-depends on k alone.
+A density maps u ~ Uniform[0, 1) to t. The caller draws u (counter-based, one per image), so that
+the time of image k depends on k alone.
 """
 
 import math
@@ -11,14 +11,14 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.registry import Bound, Count, Portion, Positive, Registry
 
-GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer
-PLASTIC = -4521708957497675121, -7935046062780286180  # 1/p and 1/p^2 of 2^64, p^3 = p + 1
+_GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer
+_PLASTIC = -4521708957497675121, -7935046062780286180  # 1/p and 1/p^2 of 2^64, p^3 = p + 1
 
-TimeDensity = Callable[[Tensor], Tensor]
+_TimeDensity = Callable[[Tensor], Tensor]
 
 
 class Uniform:
@@ -31,11 +31,14 @@ class Uniform:
 class UShaped:
     """p(t) proportional to e^(a t) + e^(a (1 - t)), a = 4 (Lee et al. 2024, as the paper uses it).
 
-    The paper prints e^(-a t) for the second term, which is not U-shaped on [0, 1]: a typo. Each branch has probability
-    1/2; the first has the inverse CDF t = ln(u (e^a - 1) + 1) / a, the second is its mirror image.
+    The paper prints e^(-a t) for the second term, which is not U-shaped on [0, 1]: a typo. Each
+    branch has probability 1/2; the first has the inverse CDF t = ln(u (e^a - 1) + 1) / a, the
+    second is its mirror image.
     """
 
-    def __init__(self, a: Annotated[float, Bound("above 0 and at most 80", lambda a: 0 < a <= 80)] = 4.0) -> None:
+    def __init__(
+        self, a: Annotated[float, Bound("above 0 and at most 80", lambda a: 0 < a <= 80)] = 4.0
+    ) -> None:
         self.a = a
 
     def __call__(self, u: Tensor) -> Tensor:
@@ -50,7 +53,8 @@ class LogitNormal:
     """logit(t) ~ N(mean, std^2) (Esser et al. 2024): most weight in the middle of the path."""
 
     def __init__(self, mean: float = 0.0, std: Positive = 1.0) -> None:
-        self.mean, self.std = mean, std
+        self.mean = mean
+        self.std = std
 
     def __call__(self, u: Tensor) -> Tensor:
         normal = torch.special.ndtri(u.double().clamp(1e-12, 1 - 1e-12))
@@ -58,13 +62,16 @@ class LogitNormal:
 
 
 class Late:
-    """p(t) = 1 - share + share q(t) with logit(t) ~ N(mean, std^2) under q: uniform, with more weight near t = 1.
+    """p(t) = 1 - share + share q(t) with logit(t) ~ N(mean, std^2) under q: uniform, with more
+    weight near t = 1.
 
-    Surfaces become smooth in the last few hundredths before t = 1, which a uniform density rarely draws.
+    Surfaces become smooth in the last few hundredths before t = 1, which a uniform density rarely
+    draws.
     """
 
     def __init__(self, share: Portion = 0.5, mean: float = 2.0, std: Positive = 1.6) -> None:
-        self.share, self.logit_normal = share, LogitNormal(mean, std)
+        self.share = share
+        self.logit_normal = LogitNormal(mean, std)
 
     def __call__(self, u: Tensor) -> Tensor:
         late = u < self.share
@@ -73,33 +80,39 @@ class Late:
 
 
 class Discrete:
-    """t uniform on the times at which k Euler steps begin, {0, 1/k, ..., (k-1)/k} on a uniform grid (k-TD)."""
+    """t uniform on the times at which k Euler steps begin, {0, 1/k, ..., (k-1)/k} on a uniform grid
+    (k-TD).
+    """
 
     def __init__(self, k: Count, grid: str = "uniform") -> None:
-        self.k, self.times = k, build_grid(grid, 0.0, 1.0, k)
+        self.k = k
+        self.times = build_grid(grid, 0.0, 1.0, k)
 
     def __call__(self, u: Tensor) -> Tensor:
         return self.times.to(u)[(u * self.k).long()]
 
 
 def golden_sequence(k: Tensor) -> Tensor:
-    """(k + 1/2) (sqrt(5) - 1) / 2 mod 1 for integers k, float32: a low-discrepancy sequence over [0, 1).
+    """(k + 1/2) (sqrt(5) - 1) / 2 mod 1 for integers k, float32: a low-discrepancy sequence over
+    [0, 1).
 
     Computed in 64-bit integers that wrap around, so that any k is valid.
     """
-    return _turns(k, GOLDEN)
+    return _turns(k, _GOLDEN)
 
 
 def plastic_sequence(k: Tensor) -> Tensor:
-    """Low-discrepancy sequence over [0, 1)^2, (..., 2) float32: steps 1/p, 1/p^2, p^3 = p + 1 (Roberts 2018, R2)."""
-    return torch.stack([_turns(k, step) for step in PLASTIC], -1)
+    """Low-discrepancy sequence over [0, 1)^2, (..., 2) float32: steps 1/p, 1/p^2, p^3 = p + 1
+    (Roberts 2018, R2).
+    """
+    return torch.stack([_turns(k, step) for step in _PLASTIC], -1)
 
 
 def _turns(k: Tensor, step: int) -> Tensor:
     return (k.long() * step + step % 2**64 // 2 >> 40 & 0xFFFFFF).float() / 2**24
 
 
-TIMES: Registry[Callable[..., TimeDensity]] = Registry(
+TIMES: Registry[Callable[..., _TimeDensity]] = Registry(
     "time density",
     uniform=Uniform,
     u_shaped=UShaped,
@@ -109,10 +122,16 @@ TIMES: Registry[Callable[..., TimeDensity]] = Registry(
 )
 
 
-def build_density(config: Mapping[str, Any]) -> TimeDensity:
-    """Build a density of `TIMES`; InputError: it maps uniform numbers in [0, 1) to others than times, as p(t) does."""
-    density, u = TIMES.build(config), torch.arange(64) / 64
+def build_density(config: Mapping[str, Any]) -> _TimeDensity:
+    """Build a density of `TIMES`; InputError: it maps uniform numbers in [0, 1) to others than
+    times, as p(t) does.
+    """
+    density = TIMES.build(config)
+    u = torch.arange(64) / 64
     t = density(u)
-    within = isinstance(t, Tensor) and t.shape == u.shape and ((t >= 0) & (t <= 1)).all()
-    check(within, f"time density {config['name']!r} must map u in [0, 1), (B,), to t in [0, 1], (B,): its inverse CDF.")
+    if not (isinstance(t, Tensor) and t.shape == u.shape and ((t >= 0) & (t <= 1)).all()):
+        raise InputError(
+            f"time density {config['name']!r} must map u in [0, 1), (B,), to t in [0, 1], (B,): "
+            "its inverse CDF."
+        )
     return density

@@ -3,8 +3,8 @@
     build_sampler({"name": "adams3", "steps": 16})
     build_sampler("jump", steps=2)
 
-To add a sampler, derive a dataclass from `Sampler` and call `SAMPLERS.add(name, cls)`. Every solver in
-`r2flow.flow.solvers.SOLVERS` is also a sampler.
+To add a sampler, derive a dataclass from `Sampler` and call `SAMPLERS.add(name, cls)`. Every solver
+in `r2flow.flow.solvers.SOLVERS` is also a sampler.
 """
 
 import re
@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.flow.solvers import SOLVERS, usual_grid
 from r2flow.registry import Registry, lazy
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _plain
@@ -22,9 +22,10 @@ from r2flow.samplers.posterior import MMPS, Posterior, Repaint, Replace
 from r2flow.samplers.stochastic import SDE
 
 __all__ = [
-    "MMPS", "SAMPLERS", "SDE", "Adaptive", "Condition", "FixedSteps", "Generated", "Jump", "Noise",
-    "ODESampler", "OnGrid", "Posterior", "Progress", "Refine", "Renoise", "Repaint", "Replace", "Sampler",
-    "TorchDiffEq", "Transport", "build_sampler", "parse_sampler", "split_samplers",
+    "MMPS", "SAMPLERS", "SDE", "Adaptive", "Condition", "FixedSteps", "Generated", "Jump",
+    "Noise", "ODESampler", "OnGrid", "Posterior", "Progress", "Refine", "Renoise", "Repaint",
+    "Replace", "Sampler", "TorchDiffEq", "Transport", "build_sampler", "parse_sampler",
+    "split_samplers",
 ]  # fmt: skip
 
 
@@ -46,7 +47,8 @@ class _Samplers(Registry[Any]):
 
     def name_of(self, kind: type[Sampler]) -> str:
         reference = lazy(f"{kind.__module__}:{kind.__qualname__}")
-        return next((n for n, entry in self._entries.items() if entry is kind or entry == reference), kind.__name__)
+        names = (name for name, entry in self._entries.items() if entry in (kind, reference))
+        return next(names, kind.__name__)
 
 
 SAMPLERS = _Samplers(
@@ -72,7 +74,8 @@ def parse_sampler(text: str) -> dict[str, Any]:
     """Parse `NAME[:FIELD=VALUE]...`, as `sde:steps=16:grid=power:2`, into name and fields."""
     from omegaconf import OmegaConf
 
-    name, *fields = re.split(r":(?=\w+=)", re.sub(r"=0+(?=\d+(?::|$))", "=", text))  # YAML's 010 is eight
+    decimal = re.sub(r"=0+(?=\d+(?::|$))", "=", text)  # YAML's 010 is eight
+    name, *fields = re.split(r":(?=\w+=)", decimal)
     try:
         return {"name": name, **OmegaConf.to_object(OmegaConf.from_dotlist(fields))}  # type: ignore[dict-item]
     except Exception as error:  # of YAML, or of an interpolation
@@ -85,7 +88,7 @@ def split_samplers(text: str) -> list[str]:
 
 
 def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
-    """Build a sampler from name and fields, or from a text (`parse_sampler`). `steps` follows from a grid of times."""
-    options = parse_sampler(options) if isinstance(options, str) else options
-    check(isinstance(options, Mapping), f"a sampler needs a 'name' and its fields, found {options!r}.")
+    """Build a sampler from name and fields, or from a text; a grid of times gives `steps`."""
+    if isinstance(options, str):
+        options = parse_sampler(options)
     return SAMPLERS.build(_plain({**options, **fields}))

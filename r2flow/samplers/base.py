@@ -2,16 +2,16 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, wide
-from r2flow.registry import Bound, check_options, options_of
+from r2flow.registry import Bound
 
 Condition = Mapping[str, Tensor]
 """Conditions of each scan by name: tensors of shape (B, ...)."""
@@ -35,7 +35,7 @@ class Generated:
 
     @classmethod
     def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:
-        """Scans after as many evaluations each; `converged`, (B,) bool, is whether x is finite by default."""
+        """Scans after as many evaluations each; `converged`, (B,) bool, is `finite` by default."""
         counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
         return cls(wide(x), counted, finite(x) if converged is None else converged)
 
@@ -49,17 +49,20 @@ def last_of(states: Iterable[Tensor], progress: Call) -> Tensor:
 
 
 class Sampler(ABC):
-    """How a generator is run. A subclass is a frozen dataclass in `SAMPLERS`; configs, checkpoints and the command line
-    store its name and fields.
+    """How a generator is run. A subclass is a frozen dataclass in `SAMPLERS`; configs, checkpoints
+    and the command line store its name and fields.
     """
 
     draws: ClassVar[bool] = False  #: whether the sampler is stochastic: it draws noise after x_0
-    paired: ClassVar[bool] = True  #: whether x_1 depends on x_0 closely enough for a reflow pair (x_0, x_1)
+    #: Whether x_1 depends on x_0 closely enough for a reflow pair (x_0, x_1).
+    paired: ClassVar[bool] = True
     completes: ClassVar[bool] = False  #: whether a condition is required
     needs: ClassVar[str] = "velocity"  #: attribute that a generator must have
 
     @abstractmethod
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
         """Generate x_1 in model space, (B, C, H, W).
 
         Args:
@@ -82,42 +85,54 @@ class Sampler(ABC):
 
     def check(self, generator: Any) -> None:
         """Refuse a generator that the sampler cannot run."""
-        drawn, kind = getattr(generator, "draws", True), type(generator).__name__
+        kind = type(generator).__name__
+        draws = getattr(generator, "draws", True)
         if getattr(generator, self.needs, None) is None:
-            check(drawn or generator.told, f"a {kind} draws no scans: give a model of its latents, a latent diffusion.")
-            raise InputError(f"sampler {self.name} needs a generator with a {self.needs}; a {kind} has none.")
-        anew = self.draws and self.needs in ("velocity", "map")  # others know what their generator starts from
-        check(drawn or not anew, f"{self.name} adds noise of N(0, 1); a {kind} starts from other: give jump.")
+            reason = "has none" if draws or generator.told else "draws no scans"
+            raise InputError(
+                f"sampler {self.name} needs a generator with a {self.needs}; a {kind} {reason}."
+            )
+        if self.draws and not draws and self.needs in ("velocity", "map"):
+            raise InputError(
+                f"{self.name} adds noise of N(0, 1); a {kind} starts from other: give jump."
+            )
         if getattr(generator, "fixed", False) and self != generator.sampler:
-            raise InputError(f"this model is distilled for {generator.sampler} alone: use these, or its parent flow.")
+            raise InputError(
+                f"this model is distilled for {generator.sampler} alone: use these, or its parent "
+                "flow."
+            )
 
-    def changed(self, **options: Any) -> Self:
+    def changed(self, **options: Any) -> "Sampler":
         """A copy with the options that are not None."""
+        from r2flow.samplers import build_sampler
+
+        given = self.asdict()
         options = _plain(options)
-        check_options(f"sampler '{self.name}'", type(self), {**self._fields(), **options})
-        grid = getattr(self, "grid", None)
-        if isinstance(grid, tuple) and options.get("steps", len(grid) - 1) != len(grid) - 1:
-            options.setdefault("grid", options_of(type(self))["grid"])
-        return replace(self, **options)  # type: ignore[type-var]
+        times = isinstance(given.get("grid"), list)
+        if times and options.get("steps", given["steps"]) != given["steps"]:
+            del given["grid"]  # its times are of another number of steps
+        return build_sampler(given | options)
 
     def asdict(self) -> dict[str, Any]:
         """Name and fields as plain values, as stored in a config or a checkpoint."""
-        return {"name": self.name, **self._fields()}
-
-    def _fields(self) -> dict[str, Any]:
-        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
-        if values.get("method") == self.name:  # a solver's name is its method
-            del values["method"]
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+        values: dict[str, Any] = {"name": self.name}
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if (field.name, value) != ("method", self.name):  # a solver's name is its method
+                values[field.name] = list(value) if isinstance(value, tuple) else value
+        return values
 
     @property
     def text(self) -> str:
         """`NAME:FIELD=VALUE:...`, as `parse_sampler` reads it."""
-        return ":".join([self.name, *(f"{key}={value}" for key, value in self._fields().items() if value is not None)])
+        _, *given = [f"{key}={value}" for key, value in self.asdict().items() if value is not None]
+        return ":".join([self.name, *given])
 
     def __str__(self) -> str:
         steps = getattr(self, "steps", None)
-        return self.name if steps is None else f"{self.name}, {steps} step{'s' * (steps > 1)}"
+        if steps is None:
+            return self.name
+        return f"{self.name}, 1 step" if steps == 1 else f"{self.name}, {steps} steps"
 
 
 @dataclass(frozen=True)
@@ -130,9 +145,12 @@ class OnGrid(Sampler):
     def __post_init__(self) -> None:
         if isinstance(self.grid, list | tuple):
             object.__setattr__(self, "grid", tuple(float(t) for t in self.grid))
-            steps = len(self.grid) - 1
-            check(steps == self.steps, f"the time grid has {steps} steps, found steps={self.steps}.")
-            check(not getattr(self, "finish", 0) or self.steps == 1, "a grid has its own last step: give finish=0.")
+            if len(self.grid) != self.steps + 1:
+                raise InputError(
+                    f"the time grid has {len(self.grid) - 1} steps, found steps={self.steps}."
+                )
+            if getattr(self, "finish", 0) and self.steps > 1:
+                raise InputError("a grid has its own last step: give finish=0.")
         self.times()
 
     def times(self) -> Tensor:
@@ -141,7 +159,11 @@ class OnGrid(Sampler):
 
 
 def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that are not None, with plain values for NumPy's and torch's, and `steps` of a grid of times."""
-    plain = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
-    grid = plain.get("grid")
-    return plain if not isinstance(grid, list | tuple) else {**plain, "steps": plain.get("steps", len(grid) - 1)}
+    """The options that are not None, in values of Python, and `steps` of a grid of times."""
+    plain = {key: value for key, value in options.items() if value is not None}
+    for key, value in plain.items():
+        if hasattr(value, "tolist"):  # NumPy's and torch's
+            plain[key] = value.tolist()
+    if isinstance(plain.get("grid"), list | tuple):
+        plain.setdefault("steps", len(plain["grid"]) - 1)
+    return plain

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Sa
 class Jump(OnGrid):
     """Apply X_{t->s} from each time of the grid to the next."""
 
-    needs: ClassVar[str] = "map"
+    needs = "map"
 
     steps: Steps = 4
 
@@ -27,15 +27,21 @@ class Jump(OnGrid):
         """x_s; e is fresh noise if the sampler is stochastic."""
         return jump(u, t, x, s)
 
-    def start(self, generator: Any, noise: Tensor, condition: Given, progress: Call) -> tuple[int, Tensor, Tensor]:
-        """Number of steps before the first jump, the state after them, and which scans are finite, (B,)."""
+    def start(
+        self, generator: Any, noise: Tensor, condition: Given, progress: Call
+    ) -> tuple[int, Tensor, Tensor]:
+        """Number of steps before the first jump, the state after them, and whether it is finite."""
         return 0, noise, finite(noise)
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
         first, x, alive = self.start(generator, noise, condition, progress)
-        u, times = generator.map(condition), self.times().to(noise)[first:]
+        u = generator.map(condition)
+        times = self.times().to(noise)[first:]
         for j, (t, s) in enumerate(pairwise(times), start=1):
-            e = draws(j) if draws and self.draws and j < len(times) - 1 else x.new_zeros(())
+            last = j == len(times) - 1
+            e = draws(j) if self.draws and draws and not last else x.new_zeros(())
             x, alive = stepped(x, self.step(u, t, x, s, e), alive)
             progress()
         return Generated.after(x, self.steps, alive)
@@ -43,19 +49,20 @@ class Jump(OnGrid):
 
 @dataclass(frozen=True)
 class Renoise(Jump):
-    """x_s = (1 - s) e + s X_{t->1}(x_t) with fresh noise e (Song et al. 2023, consistency models, algorithm 1).
+    """x_s = (1 - s) e + s X_{t->1}(x_t), e ~ N(0, 1) (Song et al. 2023, algorithm 1).
 
-    For the exact map of a 1-RF (not of a 2-RF), x_1 has the right distribution, but is not the end of the path of x_0.
-    Without a grid, 1 - t_j is log-spaced from 1 / 2 to 1 / 64 (`late`): fresh noise lets early jumps be corrected.
+    For the exact map of a 1-RF (not of a 2-RF), x_1 has the right distribution, but is not the end
+    of the path of x_0. Without a grid, 1 - t_j is log-spaced from 1 / 2 to 1 / 64 (`_late`): fresh
+    noise lets early jumps be corrected.
     """
 
-    draws: ClassVar[bool] = True
+    draws = True
 
     steps: Steps = 8
-    grid: Grid | None = None  # type: ignore[assignment]  # None: `late`
+    grid: Grid | None = None  # type: ignore[assignment]  # None: `_late`
 
     def times(self) -> Tensor:
-        return late(self.steps, 1 / 2) if self.grid is None else super().times()
+        return _late(self.steps, 1 / 2) if self.grid is None else super().times()
 
     def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
         return s * jump(u, t, x, torch.ones_like(t)) + (1 - s) * e
@@ -63,10 +70,11 @@ class Renoise(Jump):
 
 @dataclass(frozen=True)
 class Refine(Renoise):
-    """Solve the ODE by `adams3` to t = `until`, then renoise: `jumps` of the steps, at most half of them.
+    """Solve the ODE by `adams3` to t = `until`, then renoise in `jumps` steps, at most half.
 
-    The ODE places objects that early jumps lose; jumps draw surfaces that the velocity blurs near t = 1. It is
-    `renoise` where this leaves fewer than four steps to the ODE. A grid gives all times, instead of `until`.
+    The ODE places objects that early jumps lose; jumps draw surfaces that the velocity blurs near t
+    = 1. It is `renoise` where this leaves fewer than four steps to the ODE. A grid gives all times,
+    instead of `until`.
     """
 
     steps: Steps = 12
@@ -83,35 +91,48 @@ class Refine(Renoise):
         if self.grid is not None or not self.leading:
             return super().times()
         leading = build_grid("power:1.5", 0.0, self.until, self.leading)
-        return torch.cat([leading, late(self.steps - self.leading, 1 - self.until)[1:]])
+        return torch.cat([leading, _late(self.steps - self.leading, 1 - self.until)[1:]])
 
-    def start(self, generator: Any, noise: Tensor, condition: Given, progress: Call) -> tuple[int, Tensor, Tensor]:
-        if not (steps := self.leading):
+    def start(
+        self, generator: Any, noise: Tensor, condition: Given, progress: Call
+    ) -> tuple[int, Tensor, Tensor]:
+        if not self.leading:
             return super().start(generator, noise, condition, progress)
-        field, times = generator.field(condition), self.times()[: steps + 1]
-        end = solve(field, noise, 0.0, float(times[-1]), method="adams3", steps=steps, grid=times, progress=progress)
-        return steps, end.x, end.converged.to(end.x.device)
+        times = self.times()[: self.leading + 1]
+        end = solve(
+            generator.field(condition),
+            noise,
+            t_1=float(times[-1]),
+            method="adams3",
+            grid=times,
+            progress=progress,
+        )
+        return self.leading, end.x, end.converged.to(end.x.device)
 
 
 @dataclass(frozen=True)
 class Transport(Sampler):
-    """One evaluation: map the noise of each ray to the predicted density (`TransferFlow.transported`)."""
+    """One evaluation: map the noise of each ray to its density (`TransferFlow.transported`)."""
 
-    needs: ClassVar[str] = "transported"
+    needs = "transported"
 
-    residual: NonNegative = 1.0  # factor of a ray's deviation from its drawn candidate: less is sharper, but too sure
+    # Factor of a ray's deviation from its drawn candidate: less is sharper, but too sure.
+    residual: NonNegative = 1.0
 
     def evaluations(self, generator: Any = None) -> int:
         return 1
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
         x = generator.transported(noise, condition, self.residual)
         progress()
         return Generated.after(x, 1)
 
 
-def late(steps: int, widest: float) -> Tensor:
-    """Time grid, (N + 1,) float64 on the CPU, 1 - t_j log-spaced from `widest` to 1 / 64 at middles of N - 1 parts:
+def _late(steps: int, widest: float) -> Tensor:
+    """Time grid, (N + 1,) float64 on the CPU, 1 - t_j log-spaced from `widest` to 1 / 64 at middles
+    of N - 1 parts:
 
     1 - t_j = widest (1 / (64 widest))^((j - 1/2) / (N - 1)) for j = 1 to N - 1 of N steps.
     """

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, solve
 from r2flow.registry import Count, Portion, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Sampler
@@ -21,10 +21,15 @@ class ODESampler(Sampler):
 
     def check(self, generator: Any) -> None:
         super().check(generator)
-        wrong = getattr(generator, "singular", False) and getattr(method_of(self.options()["method"]), "at_end", False)
-        check(not wrong, f"{self.name} needs v at t = 1, which this model lacks: give jump or euler.")
+        method = method_of(self.options()["method"])
+        if getattr(generator, "singular", False) and getattr(method, "at_end", False):
+            raise InputError(
+                f"{self.name} needs v at t = 1, which this model lacks: give jump or euler."
+            )
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
         end = solve(generator.field(condition), noise, progress=progress, **self.options())
         return Generated(end.x, end.evaluations, end.converged)
 
@@ -34,26 +39,38 @@ class FixedSteps(OnGrid, ODESampler):
     """Fixed steps of a solver."""
 
     method: str = "euler"  # name of the solver, and of the sampler
-    finish: Portion = 0.0  # length of a last Euler step, which smooths surfaces of a flow undertrained near t = 1
+    # Length of a last Euler step, which smooths surfaces of a flow undertrained near t = 1.
+    finish: Portion = 0.0
 
     @property
     def name(self) -> str:
         return self.method
 
     def evaluations(self, generator: Any) -> int:
-        final = int(bool(self.finish) and self.steps > 1)
-        return (self.steps - final) * SOLVERS[self.method].evaluations + final  # type: ignore[union-attr]
+        each: int = SOLVERS[self.method].evaluations  # type: ignore[union-attr]
+        if not self._finishes:
+            return self.steps * each
+        return (self.steps - 1) * each + 1
+
+    @property
+    def _finishes(self) -> bool:
+        return self.finish > 0 and self.steps > 1
 
     def options(self) -> dict[str, Any]:
         return {"method": self.method, "steps": self.steps, "grid": self.grid}
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        if not self.finish or self.steps == 1:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
+        if not self._finishes:
             return super().__call__(generator, noise, condition, draws, progress)
-        v, t = generator.field(condition), 1 - self.finish
-        near = solve(v, noise, 0.0, t, progress=progress, **(self.options() | {"steps": self.steps - 1}))
+        v = generator.field(condition)
+        t = 1 - self.finish
+        options = self.options() | {"steps": self.steps - 1}
+        near = solve(v, noise, 0.0, t, progress=progress, **options)
         last = solve(v, near.x, t, steps=1, progress=progress)
-        return Generated(last.x, near.evaluations + last.evaluations, near.converged & last.converged)
+        evaluations = near.evaluations + last.evaluations
+        return Generated(last.x, evaluations, near.converged & last.converged)
 
 
 @dataclass(frozen=True)
@@ -61,7 +78,8 @@ class Adaptive(ODESampler):
     """Adaptive steps of a solver, chosen per scan."""
 
     method: str = "dopri5"  # name of the solver, and of the sampler
-    tolerance: Positive = 1e-5  # absolute and relative, of the local error (`r2flow.flow.solvers.solve`)
+    # Absolute and relative, of the local error (`r2flow.flow.solvers.solve`).
+    tolerance: Positive = 1e-5
 
     @property
     def name(self) -> str:
@@ -86,4 +104,8 @@ class TorchDiffEq(ODESampler):
         return None
 
     def options(self) -> dict[str, Any]:
-        return {"method": TORCHDIFFEQ + self.method, "steps": self.steps, "tolerance": self.tolerance}
+        return {
+            "method": TORCHDIFFEQ + self.method,
+            "steps": self.steps,
+            "tolerance": self.tolerance,
+        }

@@ -1,34 +1,35 @@
-"""Posterior samplers: sample x_1 given a part of it, by a flow that was trained without a condition.
+"""Posterior samplers: sample x_1 given a part of it, by a flow trained without a condition.
 
-With u = v(t, x_t), x_1hat = x_t + (1 - t) u is the mean E[x_1 | x_t]. With a flow map, `Replace` and `Repaint` jump to
-the next time; `MMPS` needs the mean and takes the map's velocity u(x, t, t).
+With u = v(t, x_t), x_1hat = x_t + (1 - t) u is the mean E[x_1 | x_t]. With a flow map, `Replace`
+and `Repaint` jump to the next time; `MMPS` needs the mean and takes the map's velocity u(x, t, t).
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, ClassVar
+from itertools import count, pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.registry import Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid, Steps
 from r2flow.samplers.stochastic import SDE, back, sde
 
-GROWN = 10.0  # largest growth of |y - A x_1hat|^2 in conjugate gradients: a larger residual has diverged
-EARLIEST = 0.1  # earliest time of the Jacobian in `MMPS`: Cov(x_1 | x_t) divides it by t
+# Largest growth of |y - A x_1hat|^2 in conjugate gradients: a larger residual has diverged.
+_GROWN = 10.0
+_EARLIEST = 0.1  # earliest time of the Jacobian in `MMPS`: Cov(x_1 | x_t) divides it by t
 
 
 @dataclass(frozen=True)
 class Posterior(OnGrid):
-    """A sampler conditioned on `image` and `known` of each scan; known values are returned unchanged."""
+    """A sampler conditioned on `image` and `known` of each scan, which keeps known values."""
 
-    completes: ClassVar[bool] = True
-    paired: ClassVar[bool] = False
+    completes = True
+    paired = False
 
     steps: Steps = 10
     grid: Grid = "power:2"
@@ -37,45 +38,65 @@ class Posterior(OnGrid):
         return self.steps
 
     @abstractmethod
-    def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Any) -> Tensor:
+    def run(
+        self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Any
+    ) -> Tensor:
         """x_1 from noise x, (B, ...), given the values of y where `known`, (B, ...) bool."""
 
     def check(self, generator: Any) -> None:
         super().check(generator)
-        check(not generator.told, f"sampler {self.name} needs an unconditional flow; for this model give jump.")
+        if generator.told:
+            raise InputError(
+                f"sampler {self.name} needs an unconditional flow; for this model give jump."
+            )
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
         if condition is None:
-            raise InputError(f"{self.name} completes scans: it needs a condition (r2flow complete).")
+            raise InputError(
+                f"{self.name} completes scans: it needs a condition (r2flow complete)."
+            )
 
         def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
             velocity: Tensor = generator.mean_velocity(t, x, s).to(x)
             progress()
             if velocity.requires_grad:
-                velocity.register_hook(lambda _: progress())  # one call per product with the Jacobian
+                # One call per product with the Jacobian.
+                velocity.register_hook(lambda _: progress())
             return velocity
 
         y, known = condition["image"].to(noise), condition["known"].to(noise) > 0
-        return Generated.after(self.given(u, noise, y, known, self.times(), draws), self.evaluations(generator))
+        x = self.given(u, noise, y, known, self.times(), draws)
+        return Generated.after(x, self.evaluations(generator))
 
     def given(
-        self, u: MeanVelocity, x_0: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Fresh = None
+        self,
+        u: MeanVelocity,
+        x_0: Tensor,
+        y: Tensor,
+        known: Tensor,
+        times: Tensor,
+        noise: Fresh = None,
     ) -> Tensor:
         """x_1 given y, (B, ...), on a time grid from 0 to 1."""
-        if torch.is_inference_mode_enabled():  # vector-Jacobian products need tensors that autograd can save
-            with torch.inference_mode(False), torch.no_grad():
-                return self.given(u, x_0.clone(), y.clone(), known.clone(), times.clone(), noise)
-        return torch.where(known, y, self.run(u, x_0, y, known, times.to(x_0), noise))
+        with torch.inference_mode(False), torch.no_grad():
+            # Vector-Jacobian products need tensors that autograd can save.
+            x_0, y, known, times = (part.clone() for part in (x_0, y, known, times.to(x_0)))
+            return torch.where(known, y, self.run(u, x_0, y, known, times, noise))
 
 
 @dataclass(frozen=True)
 class Replace(Posterior):
     """Euler steps, each followed by replacing the known values by the line from x_0 to y.
 
-    x_t' = M (t' y + (1 - t') x_0) + (1 - M) (x_t + (t' - t) u). One evaluation per step, deterministic.
+    x_t' = M (t' y + (1 - t') x_0) + (1 - M) (x_t + (t' - t) u). One evaluation per step,
+    deterministic.
     """
 
-    def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Any) -> Tensor:
+    def run(
+        self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Any
+    ) -> Tensor:
         x_0 = x
         for t, s in pairwise(times):
             x = torch.where(known, s * y + (1 - s) * x_0, jump(u, t, x, s))
@@ -86,12 +107,12 @@ class Replace(Posterior):
 class Repaint(Posterior):
     """`Replace` with fresh noise and repeated steps (Lugmayr et al. 2022, RePaint, algorithm 1).
 
-    Before repeating a step, it goes back from t' to t by fresh noise (`back`), which preserves the distribution of x_t.
-    The first step is taken once, since x_0 does not depend on x_t'. If the generator has a method `repaint`, as a
-    diffusion model has, that method is used instead.
+    Before repeating a step, it goes back from t' to t by fresh noise (`back`), which preserves the
+    distribution of x_t. The first step is taken once, since x_0 does not depend on x_t'. If the
+    generator has a method `repaint`, as a diffusion model has, that method is used instead.
     """
 
-    draws: ClassVar[bool] = True
+    draws = True
 
     repeats: Count = 4  # how often each step is taken
     jump: Count = 1  # number of equal parts of a step
@@ -104,20 +125,22 @@ class Repaint(Posterior):
     def evaluations(self, generator: Any = None) -> int:
         return self.jump * (1 + self.repeats * (self.steps - 1))
 
-    def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Noise) -> Tensor:
-        j = 0
+    def run(
+        self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Noise
+    ) -> Tensor:
+        draws = map(noise, count(1))
         for first in range(0, len(times) - 1, self.jump):
             part = times[first : first + self.jump + 1]
             for again in range(self.repeats if first else 1):
                 if again:
-                    j += 1
-                    x = back(x, float(part[-1]), float(part[0]), noise(j))
+                    x = back(x, float(part[-1]), float(part[0]), next(draws))
                 for t, s in pairwise(part):
-                    j += 1
-                    x = torch.where(known, s * y + (1 - s) * noise(j), jump(u, t, x, s))
+                    x = torch.where(known, s * y + (1 - s) * next(draws), jump(u, t, x, s))
         return x
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
         if condition is None or not hasattr(generator, "repaint"):
             return super().__call__(generator, noise, condition, draws, progress)
         y, known = condition["image"].to(noise), condition["known"].to(noise) > 0
@@ -127,12 +150,13 @@ class Repaint(Posterior):
 
 @dataclass(frozen=True)
 class MMPS(Posterior):
-    """Moment matching posterior sampling (Rozet et al. 2024): posterior mean by the flow's covariance.
+    """Moment matching posterior sampling (Rozet et al. 2024): mean by the flow's covariance.
 
-    Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J with J = d x_1hat / d x_t, the second-order Tweedie formula of a 1-RF: then
-    E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T)^-1 (y - A x_1hat), which is exact if x_1 is Gaussian given x_t. Conjugate
-    gradients (`_solved`) solve the linear system with one product with J per iteration; they stop at a direction in
-    which C is not positive, which a network does not exclude. `sde` takes the steps with this mean.
+    Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J with J = d x_1hat / d x_t, the second-order Tweedie
+    formula of a 1-RF: then E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T)^-1 (y - A x_1hat), which is
+    exact if x_1 is Gaussian given x_t. Conjugate gradients (`_solved`) solve the linear system with
+    one product with J per iteration; they stop at a direction in which C is not positive, which a
+    network does not exclude. `sde` takes the steps with this mean.
     """
 
     draws = SDE.draws
@@ -144,16 +168,20 @@ class MMPS(Posterior):
         """Network evaluations per scan; a vector-Jacobian product counts as one."""
         return self.steps * (1 + self.products)
 
-    def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Noise) -> Tensor:
+    def run(
+        self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Noise
+    ) -> Tensor:
         def mean(t: Tensor, x: Tensor) -> Tensor:
-            at = t.clamp(min=EARLIEST)
+            at = t.clamp(min=_EARLIEST)
             with torch.enable_grad():
-                scale = torch.where(t < at, (1 - at) / (1 - t), 1)  # 0 / 0 at a late t that float32 rounds to 1
+                # 0 / 0 at a late t that float32 rounds to 1.
+                scale = torch.where(t < at, (1 - at) / (1 - t), 1)
                 state = (x * scale).detach().requires_grad_()
                 x_1 = state + (1 - at) * u(at, state, at)
 
             def multiply(p: Tensor) -> tuple[Tensor, Tensor]:
-                moved = (1 - at) ** 2 / at * torch.autograd.grad(x_1, state, p, retain_graph=True)[0]
+                (product,) = torch.autograd.grad(x_1, state, p, retain_graph=True)
+                moved = (1 - at) ** 2 / at * product
                 return moved, known * moved
 
             residual = torch.where(known, y - x_1.detach(), 0)
@@ -166,30 +194,38 @@ class MMPS(Posterior):
 def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, steps: int) -> Tensor:
     """B S^-1 r for a positive S, per scan, with `multiply(p)` = (B p, S p), by conjugate gradients.
 
-    Where their squared residual exceeds `GROWN` r r, as a network's J is not exactly symmetric, it is the combination
-    of the same directions with the smallest residual. A scan stops at a residual of 0 or if S is not positive along p.
+    Where their squared residual exceeds `_GROWN` r r, as a network's J is not exactly symmetric, it
+    is the combination of the same directions with the smallest residual. A scan stops at a residual
+    of 0 or if S is not positive along p.
     """
-    p, rr, solution = r, _dot(r, r), r.new_zeros(())
+    p = r
+    rr = _dot(r, r)
+    tolerance = torch.finfo(r.dtype).eps ** 2 * rr
+    limit = _GROWN * rr
     active = torch.ones_like(rr, dtype=torch.bool)
-    tolerance, limit = torch.finfo(r.dtype).eps ** 2 * rr, GROWN * rr
-    least_residual, least = r, r.new_zeros(())
-    last: tuple[Tensor, Tensor] | None = None  # the previous B p and S p, the S p being orthonormal
+    rest = r  # the smallest residual
+    solution = least = last = last_image = torch.zeros_like(r)
     for _ in range(steps):
-        product, q = multiply(p)
-        curvature = _dot(p, q)
+        product, image = multiply(p)
+        curvature = _dot(p, image)
         active = active & (rr > tolerance) & (curvature > 0)
         step = torch.where(active, rr / curvature, 0)
-        solution, r = solution + step * product, r - step * q
-        previous, rr = rr, _dot(r, r)
-        p = r + torch.where(active, rr / previous, 0) * p
-        if last is not None:
-            share = _dot(last[1], q)
-            product, q = product - share * last[0], q - share * last[1]
-        length = _dot(q, q).sqrt()
+        solution = solution + step * product
+        r = r - step * image
+        before = rr
+        rr = _dot(r, r)
+        p = r + torch.where(active, rr / before, 0) * p
+        # The smallest residual, by images S p made orthonormal to the one before.
+        share = _dot(last_image, image)
+        last = product - share * last
+        last_image = image - share * last_image
+        length = _dot(last_image, last_image).sqrt()
         active = active & (length > 0)
-        last = torch.where(active, product / length, 0), torch.where(active, q / length, 0)
-        share = _dot(least_residual, last[1])
-        least, least_residual = least + share * last[0], least_residual - share * last[1]
+        last = torch.where(active, last / length, 0)
+        last_image = torch.where(active, last_image / length, 0)
+        share = _dot(rest, last_image)
+        least = least + share * last
+        rest = rest - share * last_image
     return torch.where(rr <= limit, solution, least)
 
 

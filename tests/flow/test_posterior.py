@@ -12,7 +12,7 @@ from r2flow.flow.solvers import named_grid
 from r2flow.generators import build_generator
 from r2flow.noise import Draws
 from r2flow.samplers import MMPS, Repaint, build_sampler
-from r2flow.samplers.posterior import GROWN, _solved
+from r2flow.samplers.posterior import _GROWN, _solved
 from tests.fields import CONFIG, Field
 
 WIDTH = 32
@@ -61,7 +61,7 @@ def test_each_scan_whose_residual_grows_tenfold_gets_the_least_one():
     found = _solved(lambda p: (p, p @ matrix.T), r, 1)
     moved = r @ matrix.T
     left = r - (r * r).sum(1, keepdim=True) / (r * moved).sum(1, keepdim=True) * moved
-    assert ((left * left).sum(1) > GROWN * (r * r).sum(1)).tolist() == [True, False]
+    assert ((left * left).sum(1) > _GROWN * (r * r).sum(1)).tolist() == [True, False]
     least = (r * moved).sum(1) / (moved * moved).sum(1)
     gradients = (r * r).sum(1) / (r * moved).sum(1)
     torch.testing.assert_close(found, torch.stack([least[0] * r[0], gradients[1] * r[1]]))

@@ -1,34 +1,41 @@
 """Defect control: detects pulses between the stages of a step, and jumps of the velocity in time.
 
-A Runge-Kutta method evaluates the velocity only at its stages. If the velocity jumps between two stages, dopri5's error
-estimate can be 200 times smaller than the error; a pulse between two stages is missed entirely. Therefore the velocity
-is compared with the slope of the step's interpolant at additional times (Enright, A new error control for initial value
-solvers, 1989): if two evaluations are more than `UNSEEN` apart, or if one gap between two stages has most of the
-velocity's change. Bisection locates a jump; the step before the jump ends at it.
+A Runge-Kutta method evaluates the velocity only at its stages. If the velocity jumps between two
+stages, dopri5's error estimate can be 200 times smaller than the error; a pulse between two stages
+is missed entirely. Therefore the velocity is compared with the slope of the step's interpolant at
+additional times (Enright, A new error control for initial value solvers, 1989): if two evaluations
+are more than `_UNSEEN` apart, or if one gap between two stages has most of the velocity's change.
+Bisection locates a jump; the step before the jump ends at it.
 """
 
 import math
-from dataclasses import dataclass
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from r2flow.flow.path import expand_time
-from r2flow.flow.solvers.batched import norms, powered, rows, unpowered, weighted
+from r2flow.flow.solvers.batched import norms, powered, unpowered, weighted
 from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.step_size import REMEMBERED, SHRINK, StepController
 
-UNSEEN = 0.15  # longest part of the interval between two evaluations
-OFF_CENTRE = 0.5 - 1 / math.sqrt(5)  # offset of a probe in its part of a gap, against aliasing with regular patterns
-# Thresholds on the third difference of v over a step: in tolerances, and relative to the extrapolation from the step
-# before. Above both: compare v once in an accepted step; bisect (two pairs); bisect a step rejected for the first time.
-COMPARED, BISECTED, FROM_REST, REJECTED = (100.0, 2.5), (40.0, 12.0), (10.0, 1e3), (40.0, 1e5)
-EVEN = 0.25  # share of a change in the other half of its bracket; a jump has less
-POLE = 4.0  # growth of a change while its bracket shrinks: constant for a jump, unbounded for a pole
-CROSSING = 0.2  # largest error of crossing a jump, in tolerances
+_UNSEEN = 0.15  # longest part of the interval between two evaluations
+# Offset of a probe in its part of a gap, against aliasing with regular patterns.
+_OFF_CENTRE = 0.5 - 1 / math.sqrt(5)
+# Thresholds on the third difference of v over a step: in tolerances, and relative to the
+# extrapolation from the step before. Above both: compare v once in an accepted step; bisect (two
+# pairs); bisect a step rejected for the first time.
+_COMPARED = (100.0, 2.5)
+_BISECTED = (40.0, 12.0)
+_FROM_REST = (10.0, 1e3)
+_REJECTED = (40.0, 1e5)
+_EVEN = 0.25  # share of a change in the other half of its bracket; a jump has less
+# Growth of a change while its bracket shrinks: constant for a jump, unbounded for a pole.
+_POLE = 4.0
+_CROSSING = 0.2  # largest error of crossing a jump, in tolerances
 
 
 class Tried(NamedTuple):
@@ -36,148 +43,128 @@ class Tried(NamedTuple):
 
     method: EmbeddedMethod
     x: Tensor  # state before, (B, ...)
-    y: Tensor  # state after
     k: list[Tensor]  # stages
     h: Tensor  # signed length, (B,)
     scale: Tensor  # tolerance of every element's error, (B, ...)
 
-    def of(self, places: np.ndarray) -> "Tried":
+    def of(self, places: ndarray) -> "Tried":
         """The step of the scenes with these indices."""
-        x, y, h, scale = (rows(part, places) for part in (self.x, self.y, self.h, self.scale))
-        return Tried(self.method, x, y, [rows(part, places) for part in self.k], h, scale)
+        k = [stage[places] for stage in self.k]
+        return Tried(self.method, self.x[places], k, self.h[places], self.scale[places])
 
-    def at(self, theta: np.ndarray) -> tuple[Tensor, Tensor]:
+    def at(self, theta: ndarray) -> tuple[Tensor, Tensor]:
         """State and slope of the interpolant at theta in [0, 1] of the step, for every scene."""
-        state, slope = (torch.from_numpy(w).to(self.x.device, self.x.dtype) for w in self.method.interpolant(theta))
-        shift, slope = (weighted([expand_time(w, self.x) for w in weights], self.k) for weights in (state, slope))
+        scenes = (-1, len(theta), *(1,) * (self.x.ndim - 1))
+        weights = self.x.new_tensor(self.method.interpolant(theta)).view(2, *scenes)
+        shift, slope = (weights * torch.stack(self.k)).sum(1)
         return torch.addcmul(self.x, shift, expand_time(self.h, self.x)), slope
 
-    def changes(self, *differences: Tensor) -> np.ndarray:
+    def changes(self, *differences: Tensor) -> ndarray:
         """Norms of h times differences of velocities, in tolerances, (N, B)."""
         length = expand_time(self.h, self.x) / self.scale
         return unpowered(norms(*(powered(difference * length) for difference in differences)))
 
 
-@dataclass
-class _Bracket:
-    """An interval of a step, in shares of its length, in which v may jump."""
-
-    left: float
-    right: float
-    before: Tensor  # v at the left end, minus its smooth trend
-    after: Tensor  # at the right end
-    change: float  # norm of h (after - before), in tolerances
-    trend: Tensor  # slope of v per step, the median over the gaps between stages, per element
-    most: float = 0.0  # largest change of any half so far
-    whole: float = math.inf  # change over the first bracket
-
-    @classmethod
-    def first(cls, step: Tried, also: dict[float, Tensor]) -> "_Bracket":
-        """The first pair of neighbouring values (stages and `also`) with at least half of the largest change of v."""
-        points = sorted({**{theta: step.k[i] for theta, i in step.method.distinct.items()}, **also}.items())
-        slopes = [(after - before) / (right - left) for (left, before), (right, after) in pairwise(points)]
-        trend = torch.stack(slopes).median(0).values
-        values = [(theta, value - theta * trend) for theta, value in points]
-        changes = step.changes(*(after - before for (_, before), (_, after) in pairwise(values)))[:, 0]
-        begin = int((changes >= changes.max() / 2).argmax())
-        (left, before), (right, after) = values[begin : begin + 2]
-        return cls(left, right, before[0], after[0], changes[begin], trend[0], whole=changes[begin])
-
-    @property
-    def middle(self) -> float:
-        return (self.left + self.right) / 2
-
-    def halve(self, value: Tensor, first: float, second: float) -> bool:
-        """Continue in the half with the jump; False if v does not jump: it changes in both halves, or has a pole."""
-        most, middle = max(first, second), self.middle
-        smooth = min(first, second) > EVEN * most and self.change > 1.2 * most  # less: a pulse
-        self.most = max(self.most, most)
-        if smooth or self.most > POLE * self.whole or not self.most / 2 <= most < math.inf:
-            return False
-        if first >= most / 2:
-            self.right, self.after, self.change = middle, value, first
-        else:
-            self.left, self.before, self.change = middle, value, second
-        return True
-
-    def error(self) -> float:
-        """Error of a trapezoidal step across the bracket, in tolerances."""
-        return self.change * (self.right - self.left) / 2
-
-
-def probes(method: EmbeddedMethod, share: float) -> list[float]:
-    """Times, as shares of a step, at which v is compared if the step spans this share of the interval."""
+def _probes(method: EmbeddedMethod, share: float) -> list[float]:
+    """Times, in shares of a step, to compare v at if it spans this share of the interval."""
     thetas = []
     # Only stages with a weight in the error estimate count.
     for left, right in pairwise(theta for theta, i in method.distinct.items() if method.error[i]):
-        pieces = math.ceil((right - left) * share / UNSEEN)
-        thetas += [left + (right - left) * (i + OFF_CENTRE) / pieces for i in range(1, pieces)]
+        pieces = math.ceil((right - left) * share / _UNSEEN)
+        thetas += [left + (right - left) * (i + _OFF_CENTRE) / pieces for i in range(1, pieces)]
     return thetas
 
 
 @torch.no_grad()
-def inspect(control: StepController, tried: Tried, good: np.ndarray) -> np.ndarray:
-    """Which of the accepted steps remain accepted, (B,) bool; tells the controller where the others must end."""
+def inspect(control: StepController, tried: Tried, good: ndarray) -> ndarray:
+    """Which good steps remain so, (B,) bool; tells the controller where the others must end."""
     control.roughness = tried.changes(weighted(tried.method.third_difference, tried.k))[0]
-    compared, bisected = control.rougher(*COMPARED), control.rougher(*BISECTED) | control.rougher(*FROM_REST)
-    bisected &= good | (control.troubled == REMEMBERED) | control.rougher(*REJECTED)
-    planned: dict[int, list[float]] = {}
+    suspect = control.rougher(*_BISECTED) | control.rougher(*_FROM_REST)
+    suspect &= good | (control.troubled == REMEMBERED) | control.rougher(*_REJECTED)
+    compared = control.rougher(*_COMPARED)
+    planned = {}
     for place in good.nonzero()[0]:
-        single = [0.5 + OFF_CENTRE] if compared[place] else []
-        planned[int(place)] = probes(tried.method, control.h[place] / control.length) or single
-    brackets = {int(place): _Bracket.first(tried.of(np.array([place])), {}) for place in bisected.nonzero()[0]}
+        once = [0.5 + _OFF_CENTRE] if compared[place] else []
+        planned[place] = _probes(tried.method, control.h[place] / control.length) or once
     held = good.copy()
-    for turn in range(max(map(len, planned.values()), default=0)):
-        places = np.array([place for place, thetas in planned.items() if held[place] and turn < len(thetas)], int)
+    found: dict[int, dict[float, Tensor]] = {}  # v at the probe that shows a change, by its time
+    for turn in count():
+        due = [place for place in planned if held[place] and turn < len(planned[place])]
+        places = np.array(due, int)
         if not len(places):
             break
-        theta, step = np.array([planned[place][turn] for place in places]), tried.of(places)
+        theta = np.array([planned[place][turn] for place in places])
+        step = tried.of(places)
         state, slope = step.at(theta)
-        v_probe = _ask(control, places, theta, state)
-        (sizes,) = step.changes(v_probe - slope)
-        for row, place in enumerate(places):
-            if not sizes[row] <= tried.method.defect:
-                held[place] = False
-                also = {float(theta[row]): v_probe[row : row + 1]}
-                brackets[int(place)] = _Bracket.first(tried.of(np.array([place])), also)
-    if brackets:
-        _locate(control, tried, brackets, held)
+        v = _velocity(control, places, theta, state)
+        agrees = step.changes(v - slope)[0] <= tried.method.defect
+        held[places] = agrees
+        for row in (~agrees).nonzero()[0]:
+            found[places[row]] = {theta[row].item(): v[row : row + 1]}
+    for place in (suspect | (good & ~held)).nonzero()[0]:
+        step = tried.of(np.array([place]))
+        held[place] = _locate(control, step, place, found.get(place, {}), held[place])
     return held
 
 
-def _locate(control: StepController, tried: Tried, brackets: dict[int, _Bracket], held: np.ndarray) -> None:
-    """Bisect every bracket until its jump is located or excluded; reject steps with a jump."""
-    least = control.shortest() / control.h
-    while brackets:
-        places = np.array(sorted(brackets))
-        step, ordered = tried.of(places), [brackets[place] for place in sorted(brackets)]
-        theta = np.array([bracket.middle for bracket in ordered])
-        trends, before, after = (
-            torch.stack([getattr(bracket, name) for bracket in ordered]) for name in ("trend", "before", "after")
-        )
-        v_middle = _ask(control, places, theta, step.at(theta)[0])
-        v_middle -= trends * expand_time(torch.from_numpy(theta).to(trends), trends)
-        changes = step.changes(v_middle - before, after - v_middle)
-        for row, (place, bracket) in enumerate(zip(places, ordered, strict=True)):
-            if not bracket.halve(v_middle[row], *changes[:, row]):
-                if not held[place]:
-                    control.shorten(place, max(bracket.left, bracket.right - bracket.left))
-            elif bracket.right - bracket.left <= least[place] and bracket.error() > CROSSING:
-                control.shorten(place, SHRINK)  # a pole: no step across it meets the tolerance
-                held[place] = False
-            elif bracket.error() <= CROSSING:
-                control.stop_at(place, bracket.left, bracket.right)
-                held[place] = False
-            else:
-                continue
-            del brackets[int(place)]
+def _locate(
+    control: StepController, step: Tried, place: int, also: dict[float, Tensor], held: bool
+) -> bool:
+    """Bisect a scene's step until a jump is located or excluded; whether the step remains `held`.
+
+    The bracket begins as the first pair of neighbouring values (stages and `also`) with at least
+    half of the largest change of v. v counts without its smooth trend, the median slope over the
+    gaps between stages, per element.
+    """
+    stages = {theta: step.k[i] for theta, i in step.method.distinct.items()}
+    points = sorted((stages | also).items())
+    slopes = [
+        (after - before) / (right - left) for (left, before), (right, after) in pairwise(points)
+    ]
+    trend = torch.stack(slopes).median(0).values
+    values = [value - theta * trend for theta, value in points]
+    changes = step.changes(*(after - before for before, after in pairwise(values)))[:, 0]
+    first = int((changes >= changes.max() / 2).argmax())
+    left = points[first][0]
+    right = points[first + 1][0]
+    before = values[first]
+    after = values[first + 1]
+    change = changes[first]  # norm of h (after - before), in tolerances
+    most = 0.0  # largest change of any half so far
+    while True:
+        middle = np.array([(left + right) / 2])
+        state, _ = step.at(middle)
+        value = _velocity(control, np.array([place]), middle, state) - trend * middle.item()
+        halves = step.changes(value - before, after - value)[:, 0]
+        larger = halves.max()
+        most = max(most, larger)
+        smooth = halves.min() > _EVEN * larger and change > 1.2 * larger  # less: a pulse
+        if smooth or most > _POLE * changes[first] or not most / 2 <= larger < math.inf:
+            if not held:  # v does not jump: it changes in both halves, or has a pole
+                control.shorten(place, max(left, right - left))
+            return held
+        if halves[0] >= larger / 2:
+            right = middle.item()
+            after = value
+            change = halves[0]
+        else:
+            left = middle.item()
+            before = value
+            change = halves[1]
+        # The error of a trapezoidal step across the bracket.
+        if change * (right - left) / 2 <= _CROSSING:
+            control.stop_at(place, left, right)
+            return False
+        if right - left <= control.shortest()[place] / control.h[place]:
+            control.shorten(place, SHRINK)  # a pole: no step across it meets the tolerance
+            return False
 
 
-def _ask(control: StepController, places: np.ndarray, theta: np.ndarray, x: Tensor) -> Tensor:
+def _velocity(control: StepController, places: ndarray, theta: ndarray, x: Tensor) -> Tensor:
     """v of some scenes at shares theta of their steps; NaN for scenes without budget."""
-    values, able = torch.full_like(x, math.nan), control.able(places)
-    if able.any():
-        t = torch.from_numpy(control.time(control.reached[places] + theta * control.h[places])).to(x.device, x.dtype)
-        chosen = able.nonzero()[0]
-        values[torch.from_numpy(able).to(x.device)] = control.v.some(places[able], rows(t, chosen), rows(x, chosen))
+    values = torch.full_like(x, math.nan)
+    able = (control.budget()[places] > 0).nonzero()[0]
+    if len(able):
+        t = control.time(control.reached[places] + theta * control.h[places])[able]
+        values[able] = control.v.some(places[able], x.new_tensor(t), x[able])
     return values

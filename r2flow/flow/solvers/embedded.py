@@ -1,22 +1,22 @@
 """Tableaus of embedded Runge-Kutta methods."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
+from numpy import ndarray
 from torch import Tensor
 
-from r2flow.flow.solvers.solution import Evaluations, Limits, Solution
+from r2flow.flow.solvers.solution import Evaluations, Solution
 
 
 @dataclass(frozen=True)
 class EmbeddedMethod:
-    """The Butcher tableau of an explicit embedded method whose last stage is the next step's first (FSAL).
+    """Butcher tableau of an explicit embedded method; its last stage is the next one's first.
 
     Its last two stages are at the same t; stiffness detection compares them.
     """
 
-    adapts: ClassVar[bool] = True  # whether step sizes follow from a tolerance
+    adapts = True  # whether step sizes follow from a tolerance
 
     order: int  # of the propagated solution
     nodes: tuple[float, ...]  # c_i of stages 2 to s
@@ -24,16 +24,20 @@ class EmbeddedMethod:
     error: tuple[float, ...]  # b_i - b*_i, the weights of the error estimate
     safety: float  # factor of the step size controller
     grow: float  # largest factor between one step size and the next
-    stability: float  # |h lambda| of stiff steps: near the end of the stability region on the negative real axis
+    # |h lambda| of stiff steps: near the end of the stability region on the negative real axis.
+    stability: float
     bump: tuple[float, ...]  # d_i, the weights of the quartic term of the interpolant
-    rough: tuple[int, int, int, int]  # stages of the third divided difference, the roughness of v along a step
-    defect: float  # largest of a step in tolerances: several times that of accurate steps of the exact problems
+    # Stages of the third divided difference, the roughness of v along a step.
+    rough: tuple[int, int, int, int]
+    # Largest of a step in tolerances: several times that of accurate steps of the exact problems.
+    defect: float
 
-    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
+    @np.errstate(all="ignore")
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor) -> Solution:
         """Solve every scene of x, (B, ...), from the first time to the last with its own steps."""
         from r2flow.flow.solvers.adaptive import advance
 
-        return v.solution(advance(v, x, float(times[0]), float(times[-1]), self, limits))
+        return v.solution(advance(v, x, float(times[0]), float(times[-1]), self))
 
     @property
     def distinct(self) -> dict[float, int]:
@@ -41,28 +45,30 @@ class EmbeddedMethod:
         return dict(sorted({c: i for i, c in enumerate((0.0, *self.nodes))}.items()))
 
     @property
-    def third_difference(self) -> tuple[float, ...]:
-        """Weights of the stages that annihilate quadratic functions of t, normalised to a largest weight of 1."""
-        times, rough = np.array((0.0, *self.nodes)), list(self.rough)
+    def third_difference(self) -> list[float]:
+        """Weights of the stages that annihilate quadratic functions of t; the largest is 1."""
+        times = np.array((0.0, *self.nodes))
         weights = np.zeros_like(times)
-        weights[rough] = np.linalg.inv(np.vander(times[rough], increasing=True))[-1]
-        return tuple((weights / np.abs(weights).max()).tolist())
+        stages = list(self.rough)
+        weights[stages] = np.linalg.inv(np.vander(times[stages], increasing=True))[-1]
+        return (weights / np.abs(weights).max()).tolist()
 
-    def interpolant(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """w_i and dw_i / dtheta of x + h sum_i w_i(theta) k_i, each (stages + 1, B).
+    def interpolant(self, theta: ndarray) -> ndarray:
+        """w_i and dw_i / dtheta of x + h sum_i w_i(theta) k_i, (2, stages + 1, B).
 
-        Cubic Hermite interpolant plus a quartic bump, continuously differentiable: Hairer, Norsett, Wanner, Solving
-        Ordinary Differential Equations I, II.6.
+        Cubic Hermite interpolant plus a quartic bump, continuously differentiable: Hairer, Norsett,
+        Wanner, Solving Ordinary Differential Equations I, II.6.
         """
-        last = len(self.nodes)
-        b, d = (np.array([*row, *[0.0] * (last + 1 - len(row))])[:, None] for row in (self.rows[-1], self.bump))
-        first, end = (np.eye(last + 1)[[i]].T for i in (0, last))
+        b = np.array([*self.rows[-1], 0.0])[:, None]
+        d = np.array(self.bump)[:, None]
         rest = 1 - theta
         state = b * (theta**2 * (3 - 2 * theta)) + d * (theta * rest) ** 2
+        state[0] += theta * rest**2
+        state[-1] -= theta**2 * rest
         slope = b * (6 * theta * rest) + d * (2 * theta * rest * (1 - 2 * theta))
-        state += first * (theta * rest**2) - end * (theta**2 * rest)
-        slope += first * (rest * (1 - 3 * theta)) - end * (theta * (2 - 3 * theta))
-        return state, slope
+        slope[0] += rest * (1 - 3 * theta)
+        slope[-1] -= theta * (2 - 3 * theta)
+        return np.stack([state, slope])
 
 
 # Dormand, Prince, A family of embedded Runge-Kutta formulae, 1980.

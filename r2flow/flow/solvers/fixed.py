@@ -1,16 +1,17 @@
 """Fixed-step solvers, Runge-Kutta and Adams methods, and their time grids."""
 
-import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError, check
-from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity, finite, stepped
+from r2flow.errors import InputError
+from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, stepped
 
 
 def uniform(t_0: float, t_1: float, steps: int) -> Tensor:
@@ -19,22 +20,19 @@ def uniform(t_0: float, t_1: float, steps: int) -> Tensor:
 
 
 def power(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
-    """t = 1 - (1 - u)^p at equal steps of u: for p > 1 denser towards t = 1, where a 1-RF is most curved."""
-    check(max(t_0, t_1) <= 1, "a power grid ends at the time towards which it gets denser: give grid=uniform.")
+    """t = 1 - (1 - u)^p at equal steps of u: denser towards t = 1, where a 1-RF is most curved."""
     return 1 - uniform((1 - t_0) ** (1 / p), (1 - t_1) ** (1 / p), steps) ** p
 
 
 def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
-    """A time grid by name, uniform or power:P with 1 <= P <= 10, the same forward and backward in time."""
+    """A time grid by name, uniform or power:P, 1 <= P <= 10, the same backward in time."""
     if name == "uniform":
         return uniform
-    kind, _, text = name.partition(":")
-    try:
-        p = float(text)
-    except ValueError:
-        p = math.nan
-    check(kind == "power" and 1 <= p <= 10, f"a time grid is uniform or power:P with P from 1 to 10; found {name!r}.")
-    return lambda t_0, t_1, steps: power(t_0, t_1, steps, p)
+    found = re.fullmatch(r"power:(\d+\.?\d*)", name)
+    p = float(found[1]) if found else 0.0
+    if not 1 <= p <= 10:
+        raise InputError(f"a time grid is uniform or power:P with P from 1 to 10; found {name!r}.")
+    return partial(power, p=p)
 
 
 def build_grid(grid: str | Sequence[float] | Tensor, t_0: float, t_1: float, steps: int) -> Tensor:
@@ -42,12 +40,15 @@ def build_grid(grid: str | Sequence[float] | Tensor, t_0: float, t_1: float, ste
     if isinstance(grid, str):
         times = named_grid(grid)(t_0, t_1, steps)
     else:
-        times = torch.as_tensor(grid, dtype=torch.float64, device="cpu").detach().clone()
-    one_way = times.ndim == 1 and len(times) > 1 and bool((times.diff() * (t_1 - t_0) > 0).all())
+        times = torch.as_tensor(grid, dtype=torch.float64, device="cpu").clone()
+    one_way = len(times) > 1 and (times.diff() * (t_1 - t_0) > 0).all()
     if not one_way or max(abs(times[0] - t_0), abs(times[-1] - t_1)) > 1e-6:
-        given = grid if not isinstance(grid, str) else f"{steps} steps on {grid}, too short for float64"
-        raise InputError(f"a time grid must be (N + 1,) times one way from {t_0:g} to {t_1:g}, found {given}.")
-    times[0], times[-1] = float(t_0), float(t_1)  # undo rounding by float32 or powers
+        raise InputError(
+            f"a time grid must have times that differ in float64, one way from {t_0:g} to {t_1:g}; "
+            f"found {steps} steps on {grid}."
+        )
+    times[0] = float(t_0)  # undo rounding by float32 or powers
+    times[-1] = float(t_1)
     return times
 
 
@@ -55,29 +56,33 @@ def build_grid(grid: str | Sequence[float] | Tensor, t_0: float, t_1: float, ste
 class FixedStep:
     """A fixed-step method x(t) -> x(t + h)."""
 
-    adapts: ClassVar[bool] = False  # whether step sizes follow from a tolerance
+    adapts = False  # whether step sizes follow from a tolerance
 
     step: Callable[..., Any]  # function of v, t, h and x: the next state
     order: int  # of the global error
     evaluations: int  # of v per step
     at_end: bool = False  # whether a step evaluates v at its end
-    multistep: bool = False  # whether `step` makes such a function from the times of a solution, (N + 1,) float64
+    # Whether `step` makes such a function from the times of a solution, (N + 1,) float64.
+    multistep: bool = False
 
-    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor) -> Solution:
         """Take the steps of a time grid, (N + 1,) float64.
 
-        A scene whose state becomes non-finite keeps its last finite state; other scenes are not affected.
+        A scene whose state becomes non-finite keeps its last finite state; other scenes are not
+        affected.
         """
         step = self.step(times) if self.multistep else self.step
-        low, high = sorted((float(times[0]), float(times[-1])))
+        interval = sorted(times[[0, -1]].tolist())
 
         def inside(t: Tensor, state: Tensor) -> Tensor:
-            return v(t.clamp(low, high), state)  # t + h can round to 1 + 1e-7
+            return v(t.clamp(*interval), state)  # t + h can round to 1 + 1e-7
 
         alive = finite(x)
-        for t, h in zip(times[:-1].to(x), times.diff().to(x), strict=True):  # moved once, not per step
+        # Times are moved to the device once, not per step.
+        for t, h in zip(times[:-1].to(x), times.diff().to(x), strict=True):
             x, alive = stepped(x, step(inside, t, h, x), alive)
-        v.accepted[:], v.converged[:] = len(times) - 1, alive.cpu()
+        v.accepted[:] = len(times) - 1
+        v.converged[:] = alive.cpu()
         return v.solution(x)
 
 
@@ -106,23 +111,27 @@ def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
 
 
 class Adams3:
-    """Step function of one solution by an Adams method of order 3 for variable step sizes, one evaluation per step.
+    """Step function of one solution by an Adams method of order 3, one evaluation per step.
 
-    The predictor x_n + integral of P dt, where the line P interpolates the last two velocities, gives the point at
-    which v is evaluated next. The corrector repeats the step with this velocity included in P (PEC mode: Hairer,
-    Norsett, Wanner, Solving Ordinary Differential Equations I, III.1 and III.5). The last step is not corrected, which
-    would need v(1, x). The first steps have fewer velocities, which preserves the order.
+    The predictor x_n + integral of P dt, where the line P interpolates the last two velocities,
+    gives the point at which v is evaluated next. The corrector repeats the step with this velocity
+    included in P (PEC mode: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I,
+    III.1 and III.5). The last step is not corrected, which would need v(1, x). The first steps have
+    fewer velocities, which preserves the order.
 
-    The state between two steps is predicted: each call evaluates v there, corrects the previous step and predicts.
+    The state between two steps is predicted: each call evaluates v there, corrects the previous
+    step and predicts.
     """
 
     def __init__(self, times: Tensor) -> None:
-        self.times, self.taken = times.tolist(), 0
+        self.times = times.tolist()
+        self.taken = 0
         self.velocities: list[Tensor] = []  # at the last times, newest last
         self.corrected: Tensor | None = None  # state at which the last step starts
 
     def __call__(self, v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
-        n, self.velocities = self.taken, [*self.velocities, v(t, x)][-3:]
+        n = self.taken
+        self.velocities = [*self.velocities, v(t, x)][-3:]
         self.taken += 1
         self.corrected = x if self.corrected is None else self._moved(self.corrected, n - 1, 3)
         return self._moved(self.corrected, n, 2)
@@ -131,13 +140,15 @@ class Adams3:
         """x plus the integral, over a step, of the polynomial through the last velocities."""
         velocities = self.velocities[-nodes:]
         times = self.times[self.taken - len(velocities) : self.taken]
-        for weight, velocity in zip(weights(times, *self.times[step : step + 2]), velocities, strict=True):
+        for weight, velocity in zip(
+            _weights(times, *self.times[step : step + 2]), velocities, strict=True
+        ):
             x = x + weight * velocity
         return x
 
 
-def weights(nodes: Sequence[float], start: float, end: float) -> list[float]:
-    """w such that sum w_i f_i is the integral from start to end of the polynomial through (nodes_i, f_i)."""
+def _weights(nodes: Sequence[float], start: float, end: float) -> list[float]:
+    """w: sum w_i f_i is the integral of the polynomial through (nodes_i, f_i)."""
     powers = np.arange(1, len(nodes) + 1)
     basis = np.vander(np.subtract(nodes, start), increasing=True)
     return np.linalg.solve(basis.T, (end - start) ** powers / powers).tolist()

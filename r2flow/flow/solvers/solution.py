@@ -3,42 +3,46 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
-V = TypeVar("V", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
 class Solution:
     """The state at t_1, its cost and its accuracy."""
 
-    #: State at t_1, (B, ...), float32 (float64 if x_0 is); for a scene that has not converged, the last finite state.
+    #: State at t_1, (B, ...), float32 (float64 if x_0 is); for a scene that has not converged, the
+    #: last finite state.
     x: Tensor
-    evaluations: Tensor  #: network evaluations per scene, (B,) int64, including those of the error estimate
+    #: Network evaluations per scene, (B,) int64, including those of the error estimate.
+    evaluations: Tensor
     accepted: Tensor  #: steps taken per scene, (B,) int64
     rejected: Tensor  #: steps rejected per scene, (B,) int64; 0 for fixed steps
-    stiff: Tensor  #: scenes whose steps were limited by stability, not by accuracy, (B,) bool; False if not detected
+    #: Scenes whose steps were limited by stability, not by accuracy, (B,) bool; False if not
+    #: detected.
+    stiff: Tensor
     converged: Tensor  #: scenes that reached t_1 with finite values, (B,) bool
-    #: Estimated root mean square error over a scene's elements, (B,) float64; inf without an estimate for the scene;
-    #: None if not requested.
+    #: Estimated root mean square error over a scene's elements, (B,) float64; inf without an
+    #: estimate for the scene; None if not requested.
     global_error: Tensor | None = None
 
 
 class Limits(NamedTuple):
-    """Options of a solver."""
+    """Options of an adaptive method."""
 
     tolerance: float  #: requested absolute and relative tolerance of a step's error
     max_evaluations: int  #: budget per scene
+    max_step: float  #: longest step as a share of the interval
     tighter: float = 1.0  #: divisor of the attainable tolerance
-    max_step: float = 1.0  #: longest step as a share of the interval
 
 
 class Spent(Exception):
@@ -46,19 +50,28 @@ class Spent(Exception):
 
 
 class Evaluations:
-    """The velocity as called by solvers, in the state's type, and the record of each scene's solution.
+    """The velocity as called by solvers, in the state's type, and the record of each solution.
 
-    A velocity that differs between scenes has a method `select(scenes)`, which returns the velocity of these scenes,
-    int64 indices into its batch. The precision is the coarsest type among those of v, of the surrounding autocast, of a
-    module's parameters and of the velocity's attribute `precision`, if any.
+    A velocity that differs between scenes has a method `select(scenes)`, which returns the velocity
+    of these scenes, int64 indices into its batch. The precision is the coarsest type among those of
+    v, of the surrounding autocast, of a module's parameters and of the velocity's attribute
+    `precision`, if any.
 
     Attributes:
-        counts, accepted, rejected, stiff, converged: Those of `Solution`, (B,); methods set all but the counts.
+        counts, accepted, rejected, stiff, converged: Those of `Solution`, (B,); methods set all but
+            the counts.
         scenes: Scenes of the current state, indices into the batch.
         precision: Precision of the last evaluation.
     """
 
-    def __init__(self, velocity: Velocity, scenes: int, progress: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self,
+        velocity: Velocity,
+        scenes: int,
+        limits: Limits,
+        progress: Callable[[], None] | None = None,
+    ) -> None:
+        self.limits = limits
         self._whole = self._velocity = velocity
         self._progress = progress
         self.counts, self.accepted, self.rejected = np.zeros((3, scenes), dtype=np.int64)
@@ -71,60 +84,55 @@ class Evaluations:
         self.counts[self.scenes] += 1
         v = self._velocity(t.clone(), x.clone())  # it may edit them in place
         if v.shape != x.shape:
-            raise InputError(f"a velocity must have the state's shape {tuple(x.shape)}, found {tuple(v.shape)}.")
+            raise InputError(f"a velocity must have the state's shape {x.shape}, found {v.shape}.")
         self.precision = self.coarsest(v, x)
         if self._progress is not None:
             self._progress()
         return v.to(x.dtype, copy=True)  # a runtime may write each output into the same buffer
 
-    def of_one(self, t: Tensor, x: Tensor, limits: Limits) -> Tensor:
+    def of_one(self, t: Tensor, x: Tensor) -> Tensor:
         """v of a single scene; raises `Spent` if it has had `max_evaluations`."""
-        if self.counts[self.scenes[0]] >= limits.max_evaluations:
+        if self.counts[self.scenes[0]] >= self.limits.max_evaluations:
             raise Spent("its evaluations are used up")
         return self(t, x)
 
-    def some(self, places: np.ndarray, t: Tensor, x: Tensor) -> Tensor:
+    def some(self, places: ndarray, t: Tensor, x: Tensor) -> Tensor:
         """v of some scenes of the current state."""
         scenes = self.scenes
-        if len(places) < len(scenes):
-            self.only(scenes[places])
-        try:
-            return self(t, x)
-        finally:
-            if len(places) < len(scenes):
-                self.only(scenes)
+        self.only(scenes[places])
+        v = self(t, x)
+        self.only(scenes)
+        return v
 
     def coarsest(self, *tensors: Tensor) -> torch.dtype:
-        """The type with the fewest digits among those of the tensors, of autocast and of the velocity."""
+        """The type of fewest digits among those of tensors, autocast and velocity."""
+        types = [x.dtype for x in tensors] + self._own_types
         kind = tensors[0].device.type
-        autocast = [torch.get_autocast_dtype(kind)] if torch.is_autocast_enabled(kind) else []
-        return max([*(x.dtype for x in tensors), *autocast, *self._own_types], key=lambda dtype: torch.finfo(dtype).eps)
+        if torch.is_autocast_enabled(kind):
+            types.append(torch.get_autocast_dtype(kind))
+        return max(types, key=lambda dtype: torch.finfo(dtype).eps)
 
-    def only(self, scenes: np.ndarray) -> None:
+    def only(self, scenes: ndarray) -> None:
         """Set the scenes of the current state, indices into the original batch."""
         self.scenes = scenes
         self._velocity = selected(self._whole, torch.from_numpy(scenes))
 
     def solution(self, x: Tensor) -> Solution:
-        counts = self.counts, self.accepted, self.rejected, self.stiff, self.converged
-        evaluations, accepted, rejected, stiff, converged = (torch.from_numpy(count) for count in counts)
-        return Solution(x, evaluations, accepted, rejected, stiff, converged)
+        record = (self.counts, self.accepted, self.rejected, self.stiff, self.converged)
+        return Solution(x, *map(torch.from_numpy, record))
 
 
-def selected(velocity: V, scenes: Tensor) -> V:
+def selected(velocity: Any, scenes: Tensor) -> Any:
     """The velocity of some scenes, (N,) int64: by its method `select`, if any."""
-    select: Callable[[Tensor], V] | None = getattr(velocity, "select", None)
-    return velocity if select is None else select(scenes)
+    return velocity.select(scenes) if hasattr(velocity, "select") else velocity
 
 
-def _own_types(velocity: Velocity) -> set[torch.dtype]:
+def _own_types(velocity: Velocity) -> list[torch.dtype]:
     """Types of a module's parameters, and the attribute `precision`."""
-    precision = getattr(velocity, "precision", None)
-    types = {precision} if isinstance(precision, torch.dtype) else set()
-    module = velocity if isinstance(velocity, torch.nn.Module) else getattr(velocity, "__self__", None)
-    if isinstance(module, torch.nn.Module):
-        types |= {parameter.dtype for parameter in module.parameters() if parameter.is_floating_point()}
-    return types
+    module = getattr(velocity, "__self__", velocity)
+    parameters = module.parameters() if isinstance(module, torch.nn.Module) else ()
+    types = {parameter.dtype for parameter in parameters if parameter.is_floating_point()}
+    return [*types, getattr(velocity, "precision", torch.float64)]
 
 
 def finite(x: Tensor) -> Tensor:
@@ -143,6 +151,6 @@ def wide(x: Tensor) -> Tensor:
 
 
 def stepped(x: Tensor, following: Tensor, alive: Tensor) -> tuple[Tensor, Tensor]:
-    """States after a step, (B, ...), and which are still finite, (B,); non-finite scenes keep the last finite one."""
+    """States after a step, (B, ...), the last finite ones, and which are still finite, (B,)."""
     alive = alive & finite(following)
     return torch.where(expand_time(alive, x), following, x), alive
