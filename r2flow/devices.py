@@ -1,6 +1,6 @@
 """Choice of the device."""
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 
 
 def choose_device(name: str, option: str = "--device") -> str:
@@ -13,8 +13,10 @@ def choose_device(name: str, option: str = "--device") -> str:
         device = torch.device(name)
     except RuntimeError:
         device = torch.device("meta")
-    check(device.type in ("cpu", "cuda", "mps", "xpu"), f"{option} must be auto, cpu, cuda, cuda:1, ..., not {name!r}.")
+    if device.type not in ("cpu", "cuda", "mps", "xpu"):
+        raise InputError(f"{option} must be auto, cpu, cuda, cuda:1, ..., not {name!r}.")
     count = getattr(torch, device.type).device_count()
-    number = f"{count} of them" if count else "no GPU"
-    check((device.index or 0) < count, f"{option} {name}, but torch sees {number} here; use {option} cpu.")
+    if (device.index or 0) >= count:
+        seen = f"{count} of them" if count else "no GPU"
+        raise InputError(f"{option} {name}, but torch sees {seen} here; use {option} cpu.")
     return name

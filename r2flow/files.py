@@ -11,15 +11,15 @@ from typing import IO, Any
 
 import numpy as np
 
-from r2flow.errors import InputError, check, naming
+from r2flow.errors import InputError, naming
 
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file that replaces `path` when the block ends without an error.
 
-    It is flushed to the disk before the rename and the folder after it: a reader, or a power cut, finds the old file or
-    the whole new one. A link stays, and its target is written.
+    It is flushed to the disk before the rename and the folder after it: a reader, or a power cut,
+    finds the old file or the whole new one. A link stays, and its target is written.
     """
     path = Path(path)
     if path.exists() and not path.is_file():  # the rename would replace a device or a pipe
@@ -29,9 +29,11 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     target = Path(os.path.realpath(path))
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
     # Texts may contain file names that are not UTF-8.
-    encoding, errors = (None, None) if "b" in mode else ("utf-8", "backslashreplace")
+    text: dict[str, Any] = (
+        {} if "b" in mode else {"encoding": "utf-8", "errors": "backslashreplace"}
+    )
     try:
-        with open(temporary, mode.replace("w", "x"), encoding=encoding, errors=errors) as file:
+        with open(temporary, mode.replace("w", "x"), **text) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -45,7 +47,8 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         if error.errno is None:  # numpy's error of an incomplete write
             error = OSError(errno.ENOSPC, f"cannot be written whole, is there room? ({error})")
         name = str(error.filename or "")
-        if not name or name.endswith(".part"):  # errors of full disks have no name, of read-only folders the temporary
+        # errors of full disks have no name, of read-only folders the temporary
+        if not name or name.endswith(".part"):
             error.filename = str(path)
         raise error
     finally:
@@ -75,21 +78,29 @@ def read_json(path: Path) -> Any:
 
 @contextmanager
 def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Iterator[None]:
-    """Read a regular file of `least` to `largest` bytes: every error becomes an InputError that names it."""
+    """Read a regular file of `least` to `largest` bytes: every error becomes an InputError that
+    names it.
+    """
     with telling(path):
-        problem = ""
+        # reading a pipe or a device may never end
+        size = path.stat().st_size if path.is_file() else None
         if not path.exists():
-            problem = "does not exist, or is a broken link. Is the path right?"
-        elif path.is_dir():
-            problem = f"is a folder, not a {what}; name a file in it."
-        elif not path.is_file():  # reading a pipe or a device may never end
-            problem = "is not a regular file."
-        elif (size := path.stat().st_size) < least:
-            problem = f"is empty ({size} bytes); fetch or write it again."
-        elif size > largest:
+            raise InputError(f"{path} does not exist, or is a broken link. Is the path right?")
+        if size is None:
+            kind = (
+                f"a folder, not a {what}; name a file in it"
+                if path.is_dir()
+                else "not a regular file"
+            )
+            raise InputError(f"{path} is {kind}.")
+        if size < least:
+            raise InputError(f"{path} is empty ({size} bytes); fetch or write it again.")
+        if size > largest:
             most = f"{largest / 2**30:g} GiB" if largest >= 2**30 else f"{largest / 2**20:g} MiB"
-            problem = f"has {size:,} bytes, too many for a {what} (at most {most}). Is it another file?"
-        check(not problem, f"{path} {problem}")
+            raise InputError(
+                f"{path} has {size:,} bytes, too many for a {what} (at most {most}). "
+                "Is it another file?"
+            )
         yield
 
 
@@ -102,17 +113,22 @@ def telling(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except OSError as error:
-        reason = " ".join(str(error.strerror or error).split())  # pyarrow's messages have several lines
+        reason = " ".join(
+            str(error.strerror or error).split()
+        )  # pyarrow's messages have several lines
         raise InputError(f"{path} cannot be read: {reason}.") from None
-    except BaseException as error:  # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # Rust decoders
+    # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
+    except BaseException as error:
+        # Rust decoders
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160].rstrip('.')}"
-        raise InputError(f"{path} is not a readable {path.suffix} file ({reason}). Is it damaged?") from error
+        raise InputError(
+            f"{path} is not a readable {path.suffix} file ({reason}). Is it damaged?"
+        ) from error
 
 
 def cache_folder(variable: str, name: str = "") -> Path:
     """Folder in an environment variable; default: `name` in r2flow's folder of the user's cache."""
-    if folder := os.environ.get(variable):
-        return Path(folder).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "r2flow", name).expanduser()
+    usual = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "r2flow", name)
+    return Path(os.environ.get(variable) or usual).expanduser()

@@ -10,8 +10,12 @@ import torch
 from torch import Tensor
 
 
-def state_hash(state: Mapping[str, Tensor | np.ndarray], notes: Mapping[str, Any] | None = None) -> str:
-    """SHA-256 (64 hex digits) of names, shapes, types and bytes of tensors or arrays, after the JSON of `notes`."""
+def state_hash(
+    state: Mapping[str, Tensor | np.ndarray], notes: Mapping[str, Any] | None = None
+) -> str:
+    """SHA-256 (64 hex digits) of names, shapes, types and bytes of tensors or arrays, after the
+    JSON of `notes`.
+    """
     digest = hashlib.sha256(b"" if notes is None else json.dumps(notes, sort_keys=True).encode())
     for name, value in sorted(state.items()):
         digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())

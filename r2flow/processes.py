@@ -26,7 +26,7 @@ def summed(x: Tensor) -> Tensor:
 
 
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Average each gradient over all processes, in one message; no operation for a single process."""
+    """Average each gradient over all processes, in one message; nothing for a single process."""
     trained = [p for p in parameters if p.grad is not None]
     if not trained or place()[1] == 1:
         return
@@ -44,7 +44,8 @@ def averaged(x: Tensor) -> Tensor:
 def joined(device: str) -> Iterator[str]:
     """Join torchrun's process group for a block; without torchrun, run as a single process.
 
-    Processes take batches in turn and sum statistics, so that each has all figures. Yields this process's device.
+    Processes take batches in turn and sum statistics, so that each has all figures. Yields this
+    process's device.
     """
     if os.environ.get("WORLD_SIZE", "1") == "1" or "RANK" not in os.environ:
         yield device
@@ -52,8 +53,8 @@ def joined(device: str) -> Iterator[str]:
     if device == "cuda":
         device = f"cuda:{int(os.environ.get('LOCAL_RANK', '0')) % torch.cuda.device_count()}"
         torch.cuda.set_device(device)
-    # Counts are exchanged on the CPU, statistics on their device. The timeout covers the search for copies by the first
-    # process, which can take hours.
+    # Counts are exchanged on the CPU, statistics on their device. The timeout covers the search for
+    # copies by the first process, which can take hours.
     backend = "cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo"
     torch.distributed.init_process_group(backend, timeout=timedelta(days=7))
     try:

@@ -8,46 +8,78 @@ from operator import length_hint
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 class Bar(Progress):
     """A progress bar with rate and time left, on standard error.
 
     Args:
-        shown: Whether to draw it; default: on a terminal; elsewhere, as in a log, lines are printed.
-        lines: Print lines also on a terminal, since bars of several processes would overwrite each other.
-        evaluations: Network evaluations of all units, for `evaluated`; 0: unknown, as for adaptive solvers.
+        shown: Whether to draw it; default: on a terminal; elsewhere, as in a log, lines are
+            printed.
+        lines: Print lines also on a terminal, since bars of several processes would overwrite each
+            other.
+        evaluations: Network evaluations of all units, for `evaluated`; 0: unknown, as for adaptive
+            solvers.
         every: Seconds between lines.
     """
 
     def __init__(
-        self, doing: str, total: int, unit: str = "scans", shown: bool | None = None, lines: bool = False,
-        evaluations: int = 0, every: float = 30,
-    ) -> None:  # fmt: skip
-        drawn = not lines and (sys.stderr is not None and sys.stderr.isatty() if shown is None else shown)
+        self,
+        doing: str,
+        total: int,
+        unit: str = "scans",
+        shown: bool | None = None,
+        lines: bool = False,
+        evaluations: int = 0,
+        every: float = 30,
+    ) -> None:
+        drawn = not lines and (
+            sys.stderr is not None and sys.stderr.isatty() if shown is None else shown
+        )
         super().__init__(
-            TextColumn(doing), BarColumn(), MofNCompleteColumn(), TextColumn(unit), _Rate(), TimeRemainingColumn(),
+            TextColumn(doing),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn(unit),
+            _Rate(),
+            TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),
-            console=Console(stderr=True, get_time=time.monotonic), speed_estimate_period=math.inf, transient=True,
+            console=Console(stderr=True, get_time=time.monotonic),
+            speed_estimate_period=math.inf,
+            transient=True,
             disable=not drawn,
-        )  # fmt: skip
+        )
         self._task = self.add_task(unit, total=total, note="")
-        self._doing, self._unit, self.every = doing, unit, every
-        self._share, self._spent = total / evaluations if evaluations else 0.0, 0
+        self._doing = doing
+        self._unit = unit
+        self.every = every
+        self._share = total / evaluations if evaluations else 0.0
+        self._spent = 0
         self._lines = lines or (shown is None and not drawn)
         self._printed = time.monotonic()
 
     def __call__(self, units: float = 1) -> None:
         self.advance(self._task, units)
-        now, task = time.monotonic(), self.tasks[0]
+        now = time.monotonic()
+        task = self.tasks[0]
         if self._lines and now - self._printed >= self.every and task.speed:
             self._printed = now
-            counted = f"{self._doing} {int(task.completed + 1e-6)}/{task.total:.0f} {self._unit}"  # not those begun
-            line = f"{counted}  {task.speed:.2f}/s  {duration(task.time_remaining or 0)} left  {task.fields['note']}"
+            # not those begun
+            counted = f"{self._doing} {int(task.completed + 1e-6)}/{task.total:.0f} {self._unit}"
+            left = duration(task.time_remaining or 0)
+            line = f"{counted}  {task.speed:.2f}/s  {left} left  {task.fields['note']}"
             print(line.rstrip(), file=sys.stderr, flush=True)
 
     def evaluated(self) -> None:
@@ -69,8 +101,12 @@ class _Rate(ProgressColumn):
         return Text(f"{speed:.2f}/s" if speed else "")
 
 
-def track(items: Iterable[T], doing: str, unit: str = "", total: int | None = None, least: int = 0) -> Iterator[T]:
-    """Iterate over items, with a bar if there are at least `least`; `total` is for iterables without a length."""
+def track(
+    items: Iterable[_T], doing: str, unit: str = "", total: int | None = None, least: int = 0
+) -> Iterator[_T]:
+    """Iterate over items, with a bar if there are at least `least`; `total` is for iterables
+    without a length.
+    """
     count = length_hint(items) if total is None else total
     with Bar(doing, count, unit, shown=None if count >= least else False) as bar:
         for item in items:

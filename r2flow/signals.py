@@ -16,19 +16,21 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
-Handler = Callable[[int, FrameType | None], object] | signal.Handlers
+_Handler = Callable[[int, FrameType | None], object] | signal.Handlers
 
 STOPPING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 LATER = 75  # exit code EX_TEMPFAIL of an unfinished run: the same command resumes
 
-# After torch's shutdown and before multiprocessing's SIGTERM, which workers of a failed run's loader outlive for 30 s:
+# After torch's shutdown and before multiprocessing's SIGTERM, which workers of a failed run's
+# loader outlive for 30 s:
 atexit.register(lambda: [one.kill() for one in multiprocessing.active_children() if one.daemon])  # type: ignore[func-returns-value]
 atexit.register(signal.signal, signal.SIGCHLD, signal.SIG_DFL)  # torch's handler would report them
 
 
 class Stopped(BaseException):
-    """Work was stopped by a signal; `code` is the exit code of the process, as 130 after Ctrl-C: `code_of`.
+    """Work was stopped by a signal; `code` is the exit code of the process, as 130 after Ctrl-C:
+    `code_of`.
 
     Not an `Exception`, so that handlers of errors (in readers, in Hydra) do not catch it.
     """
@@ -44,24 +46,30 @@ def code_of(number: int) -> int:
 
 
 def outlive_parent(seconds: float = 10.0) -> None:
-    """Wait for the end of the launching process, which Lightning kills once a child ends with a nonzero code."""
-    parent, begin = os.getppid(), time.monotonic()
-    while os.getppid() == parent and time.monotonic() - begin < seconds:
+    """Wait for the end of the launching process, which Lightning kills once a child ends with a
+    nonzero code.
+    """
+    parent = os.getppid()
+    end = time.monotonic() + seconds
+    while os.getppid() == parent and time.monotonic() < end:
         time.sleep(0.1)
 
 
-def hear(handler: Handler, signals: Sequence[int] = STOPPING) -> dict[int, Any]:
+def hear(handler: _Handler, signals: Sequence[int] = STOPPING) -> dict[int, Any]:
     """Handle signals, and return their former handlers.
 
-    Stop signals stay ignored if they were, as Ctrl-C in background jobs of a shell and SIGHUP under nohup.
+    Stop signals stay ignored if they were, as Ctrl-C in background jobs of a shell and SIGHUP under
+    nohup.
     """
     heard = [n for n in signals if n not in STOPPING or signal.getsignal(n) is not signal.SIG_IGN]
     return {number: signal.signal(number, handler) for number in heard}
 
 
 @contextmanager
-def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
-    """Handle signals within a block as `hear`; without effect outside the main thread, which alone receives them."""
+def listening(handler: _Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
+    """Handle signals within a block as `hear`; without effect outside the main thread, which alone
+    receives them.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -74,8 +82,9 @@ def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[N
 
 
 def stop_at_once(number: int, frame: FrameType | None = None) -> None:
-    """Handler without anything to save."""
-    if multiprocessing.parent_process() is not None:  # a forked worker; its parent prints the message
+    """_Handler without anything to save."""
+    # a forked worker; its parent prints the message
+    if multiprocessing.parent_process() is not None:
         os._exit(code_of(number))
     while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
         frame = frame.f_back
@@ -85,14 +94,14 @@ def stop_at_once(number: int, frame: FrameType | None = None) -> None:
 
 
 def end_at_once(number: int, frame: FrameType | None = None) -> None:
-    """Handler during imports and at exit, without cleanup."""
+    """_Handler during imports and at exit, without cleanup."""
     os.write(2, b"stopped\n")
     os._exit(code_of(number))
 
 
 @contextmanager
 def heard_from_the_first_import() -> Iterator[None]:
-    """Answer stop signals by one line during a whole program, including slow imports and its exit."""
+    """Answer stop signals by one line during a whole program, its imports and its exit."""
     atexit.register(partial(hear, signal.SIG_IGN))  # registered first, so that it is called last
     with listening(end_at_once):
         try:
@@ -103,7 +112,9 @@ def heard_from_the_first_import() -> Iterator[None]:
 
 
 def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exit(1)) -> None:
-    """End a worker when its parent process ends, since it would wait forever for a reader of its results."""
+    """End a worker when its parent process ends, since it would wait forever for a reader of its
+    results.
+    """
 
     def wait() -> None:
         if parent := multiprocessing.parent_process():
@@ -129,7 +140,9 @@ def out_of_reach() -> Iterator[None]:
 
 
 def outlive_the_signal(worker: int = 0) -> None:
-    """Keep a loader's worker alive for 30 s after a signal, since its run may need it; it also ends with its run."""
+    """Keep a loader's worker alive for 30 s after a signal, since its run may need it; it also ends
+    with its run.
+    """
     end_with_parent()
     sys.excepthook = lambda *_: None  # called if a stopped run drops the connection for a tensor
     signal.signal(signal.SIGALRM, signal.SIG_DFL)

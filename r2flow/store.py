@@ -1,30 +1,24 @@
 """Stores: folders of numbered items, written by any number of processes and resumable.
 
-    store = Store(folder, "scans", recipe)
-    store.begin()                                    # claims the folder, or refuses one with another recipe
-    store.make(store.missing(range(9)), work, 4)     # work(i) calls store.write(i, tensors, notes)
-    tensors, notes = store.read(3)
+    store = Store(folder, "scans", recipe) store.begin()                                    # claims
+    the folder, or refuses one with another recipe store.make(store.missing(range(9)), work, 4)
+    # work(i) calls store.write(i, tensors, notes) tensors, notes = store.read(3)
 
-An item depends only on the recipe and on its number: two processes that make the same item write the same bytes.
-`manifest.json` stores the recipe; an item is a safetensors file with the digest of the recipe and a checksum. Files are
-written under a temporary name and renamed when complete, so that a killed command can resume.
+An item depends only on the recipe and on its number: two processes that make the same item write
+the same bytes. `manifest.json` stores the recipe; an item is a safetensors file with the digest of
+the recipe and a checksum. Files are written under a temporary name and renamed when complete, so
+that a killed command can resume.
 """
 
 import hashlib
 import json
 import logging
 import math
-import multiprocessing
 import os
-import signal
 import time
-import traceback
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from logging.handlers import QueueHandler
-from multiprocessing import connection
 from pathlib import Path
-from types import FrameType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,17 +27,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from r2flow.config import at_most_three, differences
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.files import read_json, write_file
 from r2flow.hashing import state_hash
 from r2flow.lidar.scan_files import FIRM_ENDINGS
-from r2flow.signals import code_of, end_with_parent, out_of_reach
+from r2flow.pool import attempts_of
 
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
-STALE = 3600  # seconds after which a temporary file counts as abandoned
-PATIENCE = 0.2  # seconds between polls of items that other processes make
+_STALE = 3600  # seconds after which a temporary file counts as abandoned
+_PATIENCE = 0.2  # seconds between polls of items that other processes make
 QUIET = 20.0  # seconds of waiting before a log message
 
 
@@ -51,17 +45,20 @@ class Damaged(Exception):
     """A file does not have the content that was written."""
 
 
-class Foreign(InputError):
+class _Foreign(InputError):
     """A manifest.json that r2flow did not write."""
 
 
 class Store:
-    """A folder of items of one kind, `KIND-000003.safetensors`, and of one recipe, plain values that they depend on."""
+    """A folder of items of one kind, `KIND-000003.safetensors`, and of one recipe, plain values
+    that they depend on.
+    """
 
     option = "--out FOLDER"  # in messages: how a user gives another folder
 
     def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any]) -> None:
-        self.folder, self.kind = Path(folder).expanduser(), kind
+        self.folder = Path(folder).expanduser()
+        self.kind = kind
         self.described: dict[str, Any] = json.loads(json.dumps(recipe))
         self.digest = checksum(self.described)
 
@@ -69,19 +66,27 @@ class Store:
         return [self.folder / f"{self.kind}-{item:06d}.safetensors"]
 
     def check(self) -> bool:
-        """Whether the folder has a manifest; refuses a folder with scans, or with anything of another recipe."""
+        """Whether the folder has a manifest; refuses a folder with scans, or with anything of
+        another recipe.
+        """
         if (self.folder / MANIFEST).is_file():
             recipe = read_manifest(self.folder, self.kind)["recipe"]
-            if other := [*differences(recipe, self.described).values()]:
+            other = [*differences(recipe, self.described).values()]
+            if other:
                 if len(os.listdir(self.folder)) == 1:
                     return False  # its command was refused before it made anything
                 raise InputError(
-                    f"{self.folder} holds other {self.kind.replace('simulated', 'simulated scans')}: "
-                    f"{at_most_three(other)}. Give the same settings, or another folder by {self.option}."
+                    f"{self.folder} holds other "
+                    f"{self.kind.replace('simulated', 'simulated scans')}: {at_most_three(other)}. "
+                    f"Give the same settings, or another folder by {self.option}."
                 )
             return True
-        scan = next((path.name for path in self.folder.glob("*") if path.name.lower().endswith(FIRM_ENDINGS)), None)
-        check(not scan, f"{self.folder} holds scans ({scan}) and no {MANIFEST}: give another folder by {self.option}.")
+        for path in self.folder.glob("*"):
+            if path.name.lower().endswith(FIRM_ENDINGS):
+                raise InputError(
+                    f"{self.folder} holds scans ({path.name}) and no {MANIFEST}: "
+                    f"give another folder by {self.option}."
+                )
         return False
 
     def begin(self, **notes: Any) -> None:
@@ -89,15 +94,18 @@ class Store:
         if not self.check():
             self.write_manifest(**notes)
             self.check()  # another process may have taken the folder in between
-        for leftover in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):  # of killed writers
+        # of killed writers
+        for leftover in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):
             with suppress(FileNotFoundError):
-                if time.time() - leftover.stat().st_mtime > STALE:
+                if time.time() - leftover.stat().st_mtime > _STALE:
                     leftover.unlink()
 
     def write_manifest(self, **notes: Any) -> None:
         """Write or overwrite the manifest: the recipe and `notes`."""
         content = {"format": f"r2flow {self.kind}", "recipe": self.described, **notes}
-        write_file(self.folder / MANIFEST, json.dumps({**content, "checksum": checksum(content)}, indent=1))
+        write_file(
+            self.folder / MANIFEST, json.dumps({**content, "checksum": checksum(content)}, indent=1)
+        )
 
     def has(self, item: int) -> bool:
         """Whether an item exists; reads only the header of its file."""
@@ -109,9 +117,16 @@ class Store:
     def missing(self, items: Iterable[int]) -> list[int]:
         return [item for item in items if not self.has(item)]
 
-    def write(self, item: int, tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> None:
+    def write(
+        self, item: int, tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None
+    ) -> None:
         """Write an item; it then counts as made."""
-        note = {"recipe": self.digest, "item": item, "sha256": state_hash(tensors, notes or {}), "notes": notes or {}}
+        note = {
+            "recipe": self.digest,
+            "item": item,
+            "sha256": state_hash(tensors, notes or {}),
+            "notes": notes or {},
+        }
         (path,) = self.files(item)
         if path.is_symlink() and not path.exists():
             path.unlink()
@@ -144,7 +159,8 @@ class Store:
                 note = json.loads((file.metadata() or {})["r2flow"])
                 if note["recipe"] != self.digest:
                     raise InputError(
-                        f"{path} holds {self.kind} of another recipe: give the settings that they were made with, or "
+                        f"{path} holds {self.kind} of another recipe: "
+                        "give the settings that they were made with, or "
                         f"another folder by {self.option}."
                     )
                 if note["item"] != item:
@@ -174,14 +190,17 @@ class Store:
         advance: Callable[[int], None] = lambda item: None,
         wait: bool = True,
     ) -> None:
-        """Make items by `work`, which any process must be able to unpickle, in `workers` processes (1: this one).
+        """Make items by `work`, which any process must be able to unpickle, in `workers` processes
+        (1: this one).
 
-        `advance` is called with each finished item. `wait`: await items that other commands are making; else skip them.
+        `advance` is called with each finished item. `wait`: await items that other commands are
+        making; else skip them.
         """
-        left, since = list(items), time.monotonic()
+        left = list(items)
+        since = time.monotonic()
         while left:
             waiting = []
-            with closing(self._attempts(left, work, workers)) as attempts:
+            with closing(attempts_of(self, left, work, workers)) as attempts:
                 for item, done in attempts:
                     if done:
                         advance(item)
@@ -192,82 +211,30 @@ class Store:
             if len(waiting) < len(left):
                 since = time.monotonic()
             else:
-                time.sleep(PATIENCE)
+                time.sleep(_PATIENCE)
             if waiting and time.monotonic() - since > QUIET:
                 since = math.inf  # log once
-                log.warning("waiting for another process, which makes %s", self.files(waiting[0])[0])
+                log.warning(
+                    "waiting for another process, which makes %s", self.files(waiting[0])[0]
+                )
             left = waiting
-
-    def _attempts(self, items: list[int], work: Callable[[int], None], workers: int) -> Generator[tuple[int, bool]]:
-        if min(workers, len(items)) <= 1:
-            for item in items:
-                yield item, self.attempt(item, work)
-            return
-        context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-        processes, doing, left = {}, {}, iter(items)
-        try:
-            with out_of_reach():
-                for _ in range(min(workers, len(items))):
-                    end, other = context.Pipe()
-                    process = context.Process(target=_serve, args=(other,))
-                    process.start()
-                    processes[end] = process
-                    other.close()  # so that the end of the process is heard
-            # Sent once, and not as an argument: Python waits forever if a process ends before it reads a large one.
-            for end, item in zip(processes, left, strict=False):
-                doing[end] = item
-                with suppress(OSError):  # heard below
-                    end.send((self, work))
-                    end.send(item)
-            while doing:
-                for end in doing.keys() & connection.wait(doing):
-                    if (result := self._result(end)) is None:
-                        continue
-                    item = doing.pop(end)
-                    if (following := next(left, None)) is not None:
-                        doing[end] = following
-                        with suppress(OSError):
-                            end.send(following)
-                    yield item, result
-        finally:
-            for end, process in processes.items():
-                process.terminate()
-                end.close()  # if compiled code of the process has swallowed the exception
-            for process in processes.values():
-                process.join()
-
-    def _result(self, end: connection.Connection) -> bool | None:
-        """The result of a process, whose errors are raised; None for a line of its log, which is passed on."""
-        try:
-            result: Any = end.recv()
-        except (EOFError, OSError):
-            raise InputError(
-                f"a process that wrote {self.folder} was killed or could not start; is there memory for as "
-                "many processes? The same command resumes."
-            ) from None
-        if isinstance(result, Exception):
-            raise result
-        if not isinstance(result, logging.LogRecord):
-            return bool(result)
-        logging.getLogger(result.name).handle(result)
-        return None
 
     def attempt(self, item: int, work: Callable[[int], None]) -> bool:
         """Make an item unless it exists; False if another process is making it.
 
-        The lock ends with its process. It only saves work, since two processes write the same bytes for an item.
+        The lock ends with its process. It only saves work, since two processes write the same bytes
+        for an item.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f".{self.kind}-{item:06d}.lock"
         lock = FileLock(path, timeout=0)
         try:
-            try:
-                lock.acquire()
-            except Timeout:
-                return False
+            lock.acquire()
             self.check()  # another command may have taken the folder, which held the manifest alone
             if not self.has(item):
                 work(item)
+        except Timeout:
+            return False
         finally:
             if lock.is_locked:
                 path.unlink(missing_ok=True)
@@ -276,9 +243,13 @@ class Store:
 
 
 class FileStore(Store):
-    """A store whose items are files of other formats, `000003.ENDING`; an item exists if all of its files exist."""
+    """A store whose items are files of other formats, `000003.ENDING`; an item exists if all of its
+    files exist.
+    """
 
-    def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any], endings: Sequence[str]) -> None:
+    def __init__(
+        self, folder: str | Path, kind: str, recipe: Mapping[str, Any], endings: Sequence[str]
+    ) -> None:
         super().__init__(folder, kind, recipe)
         self.endings = endings
 
@@ -289,59 +260,28 @@ class FileStore(Store):
         return all(file.is_file() for file in self.files(item))
 
 
-def _serve(end: connection.Connection) -> None:
-    """Make items for the parent process until SIGTERM, or the end of the parent, which logs what this one would."""
-    stopped = working = False
-
-    def hear(number: int, frame: FrameType | None) -> None:
-        nonlocal stopped
-        first, stopped = not stopped, True
-        if first and working:  # elsewhere an exception leaves a lock, or ends in `FileLock.__del__`
-            raise SystemExit(code_of(number))
-
-    def interruptible(item: int) -> None:
-        nonlocal working
-        working = True
-        try:
-            if stopped:
-                raise SystemExit(code_of(signal.SIGTERM))
-            work(item)
-        finally:
-            working = False
-
-    end_with_parent(end=lambda: os.kill(os.getpid(), signal.SIGTERM))
-    logging.getLogger().handlers = [QueueHandler(SimpleNamespace(put_nowait=end.send))]
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-    with suppress(EOFError, OSError):  # the parent is gone
-        try:
-            store, work = end.recv()  # imports modules, and SIGTERM ends it at once
-            signal.signal(signal.SIGTERM, hear)
-            while True:
-                end.send(store.attempt(end.recv(), interruptible))
-        except Exception as error:
-            error.add_note(traceback.format_exc())
-            try:
-                end.send(error)
-            except Exception:  # it cannot be pickled
-                end.send(RuntimeError(f"{type(error).__name__}: {error}"))
-
-
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
     """Read and verify the manifest of a folder."""
     path = folder / MANIFEST
     try:
         content: dict[str, Any] = read_json(path)
         if "checksum" not in content:  # a common name: of a data set, say
-            raise Foreign(f"{path} is damaged, or not of r2flow: give another folder.")
+            raise _Foreign(f"{path} is damaged, or not of r2flow: give another folder.")
         format_name, _ = content["format"], content["recipe"]
         damaged = content.pop("checksum") != checksum(content)
-    except (OSError, Foreign):
+    except (OSError, _Foreign):
         raise
     except (ValueError, LookupError, TypeError, AttributeError):
         damaged = True
-    check(not damaged, f"{path} is damaged. If r2flow wrote {folder}, remove it and make it again.")
+    if damaged:
+        raise InputError(
+            f"{path} is damaged. If r2flow wrote {folder}, remove it and make it again."
+        )
     if kind is not None and format_name != f"r2flow {kind}":
-        raise InputError(f"{folder} holds {format_name.removeprefix('r2flow ')}, not {kind}; give another folder.")
+        raise InputError(
+            f"{folder} holds {format_name.removeprefix('r2flow ')}, not {kind}; "
+            "give another folder."
+        )
     return content
 
 
@@ -349,10 +289,12 @@ def manifest_of(folder: str | Path) -> dict[str, Any]:
     """The manifest that r2flow wrote in a folder; empty if there is none."""
     try:
         return read_manifest(Path(folder).expanduser())
-    except (FileNotFoundError, NotADirectoryError, Foreign):
+    except (FileNotFoundError, NotADirectoryError, _Foreign):
         return {}
 
 
 def checksum(content: Any) -> str:
     """SHA-256 of a JSON-serialisable value."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()

@@ -9,13 +9,11 @@ import numpy as np
 
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.noise import generator
-from r2flow.simulator import roadside
-from r2flow.simulator.draws import ScalarDraws
-from r2flow.simulator.kinds import KINDS, draw_ground
-from r2flow.simulator.lasers import RIGS, Rays, lasers_of
+from r2flow.simulator.lasers import Rays, lasers_of
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.returns import report
-from r2flow.simulator.scene import Scene, SceneBuilder
+from r2flow.simulator.roadside import StreetBuilder
+from r2flow.simulator.scene import Scene
 
 REVISION = 4  # of the scans: incremented with every change of the scans of a seed
 
@@ -24,14 +22,17 @@ REVISION = 4  # of the scans: incremented with every change of the scans of a se
 class SimulatedScan:
     """A simulated scan with labels."""
 
-    image: np.ndarray  # range in metres and reflectance in [0, 1], (2, H, W), float32; 0 where missing
+    image: (
+        np.ndarray
+    )  # range in metres and reflectance in [0, 1], (2, H, W), float32; 0 where missing
     labels: np.ndarray  # SemanticKITTI ids, (H, W), uint16; 0 where missing
 
 
 def simulate(sensor: Sensor | str, seed: int, index: int) -> SimulatedScan:
-    """Scan `index` of `seed`, a function of sensor, seed and index only, bit-identical on every machine.
+    """Scan `index` of `seed`: a function of sensor, seed and index, the same bits on every machine.
 
-    The scene is drawn before anything that depends on the sensor, so that all sensors scan the same scenes.
+    The scene is drawn before anything that depends on the sensor, so that all sensors scan the same
+    scenes.
     """
     rng = generator(seed, "simulator", index)
     return observe(draw_scene(rng), named_sensor(sensor), rng)
@@ -39,22 +40,7 @@ def simulate(sensor: Sensor | str, seed: int, index: int) -> SimulatedScan:
 
 def draw_scene(rng: np.random.Generator) -> Scene:
     """Draw a scene of a kind in `kinds.KINDS`, chosen by their shares."""
-    draws = ScalarDraws(rng)
-    name = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
-    b, k = SceneBuilder(draw_ground(draws, name), draws), KINDS[name]
-    streets = b.ground.streets
-    for street in streets:
-        for side in (1, -1):
-            roadside.line_front(b, k, street, side)
-            roadside.park(b, k, street, side)
-            roadside.furnish(b, street, side)
-        roadside.close_street(b, street)
-    roadside.close_view(b)
-    roadside.drive(b, k, streets[0])
-    roadside.walk(b, k, streets[0])
-    if name == "highway":
-        roadside.guard(b, streets[0])
-    return b.build(rig=draws.pick(range(len(RIGS)), (0.7, 0.3)))
+    return StreetBuilder(rng).draw()
 
 
 def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> SimulatedScan:

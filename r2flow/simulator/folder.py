@@ -14,7 +14,9 @@ from r2flow.simulator import REVISION, simulate
 from r2flow.store import FileStore
 
 KIND = "simulated"
-FORMATS = Registry("format", bin=".bin", pcd=".pcd", ply=".ply", npy=".npy")  # npy is the range image itself
+FORMATS = Registry(
+    "format", bin=".bin", pcd=".pcd", ply=".ply", npy=".npy"
+)  # npy is the range image itself
 
 
 class SimulatedFolder(FileStore):
@@ -22,21 +24,30 @@ class SimulatedFolder(FileStore):
 
     Args:
         formats: Endings of the files of a scan, from `FORMATS`.
-        labels: Whether each scan has a SemanticKITTI .label file, a uint32 per point in the order of the points.
+        labels: Whether each scan has a SemanticKITTI .label file, a uint32 per point in the order
+            of the points.
     """
 
     def __init__(
-        self, folder: str | Path, sensor: Sensor, seed: int, formats: Sequence[str] = ("bin",), labels: bool = False
+        self,
+        folder: str | Path,
+        sensor: Sensor,
+        seed: int,
+        formats: Sequence[str] = ("bin",),
+        labels: bool = False,
     ) -> None:
         reading = {"sensor": sensor.described(), "reflectance_scale": 1.0}
         endings = [*formats, *(["label"] if labels else [])]
-        super().__init__(folder, KIND, {"simulator": REVISION, "seed": seed, "reading": reading}, endings)
+        super().__init__(
+            folder, KIND, {"simulator": REVISION, "seed": seed, "reading": reading}, endings
+        )
         self.sensor, self.seed, self.formats, self.labels = sensor, seed, formats, labels
         for name in formats:
             FORMATS[name]
         if labels and tuple(formats) == ("npy",):
             raise InputError(
-                "labels are those of points, and .npy is a range image without points; add another format, such as bin."
+                "labels are those of points, and .npy is a range image without points; "
+                "add another format, such as bin."
             )
 
     def simulate(self, item: int) -> None:
@@ -45,6 +56,8 @@ class SimulatedFolder(FileStore):
         write_scan(scan.image, rays, self.folder, name, self.formats)
         if self.labels:
             # In the order of the points; ids are exact in float32.
-            _, labels = image_to_points(np.stack([scan.image[0], scan.labels.astype(np.float32)]), rays)
+            _, labels = image_to_points(
+                np.stack([scan.image[0], scan.labels.astype(np.float32)]), rays
+            )
             with atomic_write(self.folder / f"{name}.label") as file:
                 file.write(labels.astype("<u4").tobytes())

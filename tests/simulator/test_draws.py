@@ -5,7 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from r2flow.simulator.draws import ScalarDraws, cosine, exponentials, hypotenuse, logistic, normals, sine
+from r2flow.simulator.draws import (
+    ScalarDraws,
+    cosine,
+    exponentials,
+    hypotenuse,
+    logistic,
+    normals,
+    sine,
+)
 
 N = 40_000
 
@@ -21,19 +29,23 @@ def test_sine_and_cosine_are_those_of_the_library():
 
 
 @pytest.mark.parametrize(
-    ("draw", "mean", "deviation", "fourth"), [(normals, 0.0, 1.0, 3.0), (exponentials, 1.0, 1.0, 9.0)]
+    ("draw", "mean", "deviation", "fourth"),
+    [(normals, 0.0, 1.0, 3.0), (exponentials, 1.0, 1.0, 9.0)],
 )
 def test_draws_have_the_moments_of_their_distribution(draw, mean, deviation, fourth):
     x = draw(np.random.default_rng(0), (N,)).astype(np.float64)
     assert x.mean() == pytest.approx(mean, abs=5 * deviation / math.sqrt(N))
     assert x.std() == pytest.approx(deviation, rel=0.02)
-    # tails end at the outermost of 8192 quantiles, which takes a few hundredths off the fourth moment
+    # tails end at the outermost of 8192 quantiles, which takes a few hundredths off the fourth
+    # moment
     assert (((x - x.mean()) / x.std()) ** 4).mean() == pytest.approx(fourth, rel=0.15)
 
 
 def test_the_smooth_step_rises_from_0_to_1_like_a_logistic():
     np.testing.assert_array_equal(logistic(np.array([-3.0, 0.0, 3.0])), [0, 0.5, 1])
-    assert ((logistic(np.array([1e-4])) - logistic(np.array([-1e-4]))) / 2e-4)[0] == pytest.approx(0.25, abs=1e-6)
+    assert ((logistic(np.array([1e-4])) - logistic(np.array([-1e-4]))) / 2e-4)[0] == pytest.approx(
+        0.25, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
-"""`r2flow simulate`: the files hold the simulator's scans, however many processes write them and in whatever order."""
+"""`r2flow simulate`: the files hold the simulator's scans, however many processes write them and in
+whatever order.
+"""
 
 import numpy as np
 import pytest
@@ -34,8 +36,12 @@ def test_files_hold_what_the_simulator_draws(tmp_path):
     points = read_points(folder.folder / "000006.bin")
     labels = np.fromfile(folder.folder / "000006.label", "<u4")
     assert len(labels) == len(points.xyz) == (scan.image[0] > 0).sum()
-    np.testing.assert_allclose(project(points.xyz, points.reflectance, SMALL), scan.image, atol=1e-5)
-    np.testing.assert_array_equal(project(points.xyz, labels.astype(np.float32), SMALL)[1], scan.labels)
+    np.testing.assert_allclose(
+        project(points.xyz, points.reflectance, SMALL), scan.image, atol=1e-5
+    )
+    np.testing.assert_array_equal(
+        project(points.xyz, labels.astype(np.float32), SMALL)[1], scan.labels
+    )
 
 
 def test_a_folder_of_another_seed_or_sensor_is_refused(tmp_path):
@@ -51,7 +57,20 @@ def test_a_folder_of_another_seed_or_sensor_is_refused(tmp_path):
 
 
 def test_the_verb_writes_the_scans_of_any_sensor(r2flow, tmp_path, sensor):
-    asked = "--num", 1, "--sensor", sensor.name, "--seed", 4, "--format", "npy,ply", "--size", "16x64"
+    asked = (
+        "--num",
+        1,
+        "--sensor",
+        sensor.name,
+        "--seed",
+        4,
+        "--format",
+        "npy,ply",
+        "--size",
+        "16x64",
+    )
     assert "1 scan (npy, ply)" in r2flow("simulate", *asked, "--out", tmp_path).said
-    np.testing.assert_array_equal(np.load(tmp_path / "000000.npy"), simulate(sensor.resized(16, 64), 4, 0).image)
+    np.testing.assert_array_equal(
+        np.load(tmp_path / "000000.npy"), simulate(sensor.resized(16, 64), 4, 0).image
+    )
     assert read_manifest(tmp_path)["recipe"]["reading"]["sensor"]["name"] == sensor.name

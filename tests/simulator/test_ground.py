@@ -5,8 +5,9 @@ import pytest
 
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.ground import Ground, Street
+from r2flow.simulator.ground import Ground
 from r2flow.simulator.lasers import Rays, along_rows
+from r2flow.simulator.streets import Street
 
 HDL64E = SENSORS["hdl64e"]
 HEIGHT = HDL64E.height
@@ -35,15 +36,29 @@ def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
 
 @pytest.mark.parametrize("kerb", [0.0, 0.12])  # all is off the street, and higher by the kerb
 def test_on_waves_a_ray_ends_where_it_first_meets_the_surface(kerb):
-    ground = Ground(OPEN, waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)), kerb=kerb)
+    ground = Ground(
+        OPEN, waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)), kerb=kerb
+    )
     distance, cosine = ground.meet(RAYS)
-    np.testing.assert_allclose(cosine, Ground(OPEN, ground.waves, drop=-kerb).meet(RAYS)[1], atol=1e-3)
+    np.testing.assert_allclose(
+        cosine, Ground(OPEN, ground.waves, drop=-kerb).meet(RAYS)[1], atol=1e-3
+    )
     met = np.isfinite(distance)
     s, a = np.where(met, distance, 1.0), np.broadcast_to(RAYS.azimuth, RAYS.shape)
     slope = np.broadcast_to(np.tan(RAYS.lasers.elevation)[:, None], RAYS.shape)
-    for share, least, most in ((1.0, -0.03, 0.03), *((share, -0.02, np.inf) for share in (0.9, 0.6, 0.3))):
-        above = HEIGHT - kerb + share * s * slope - ground.height(share * s * np.cos(a), share * s * np.sin(a))
-        assert ((above[met] > least) & (above[met] < most)).all()  # the profile's chords against the waves
+    for share, least, most in (
+        (1.0, -0.03, 0.03),
+        *((share, -0.02, np.inf) for share in (0.9, 0.6, 0.3)),
+    ):
+        above = (
+            HEIGHT
+            - kerb
+            + share * s * slope
+            - ground.height(share * s * np.cos(a), share * s * np.sin(a))
+        )
+        assert (
+            (above[met] > least) & (above[met] < most)
+        ).all()  # the profile's chords against the waves
 
 
 def test_beside_the_street_the_ground_is_higher_by_the_kerb():
@@ -82,7 +97,9 @@ def test_a_curved_street_keeps_its_radius():
 
 
 def test_a_side_street_ends_where_it_joins():
-    side = Street(heading=np.pi / 2, offset=-20.0, curvature=0.0, half_width=3.0, pavement=0.0, start=0.0)
+    side = Street(
+        heading=np.pi / 2, offset=-20.0, curvature=0.0, half_width=3.0, pavement=0.0, start=0.0
+    )
     ground = Ground(streets=(STRAIGHT, side), corner=1e-3)
     assert ground.off_street(20.0, 15.0) == pytest.approx(-3.0)
     assert ground.off_street(20.0, -15.0) == pytest.approx(11.0, abs=1e-3)
@@ -91,7 +108,11 @@ def test_a_side_street_ends_where_it_joins():
 
 def test_numbers_and_arrays_of_places_have_the_same_height():
     ground = Ground(
-        waves=((0.3, 0.1, 0.05, 1.0),), lean=(0.01, 0.02), streets=(STRAIGHT,), banks=(1.5, -0.5), drop=0.03
+        waves=((0.3, 0.1, 0.05, 1.0),),
+        lean=(0.01, 0.02),
+        streets=(STRAIGHT,),
+        banks=(1.5, -0.5),
+        drop=0.03,
     )
     x, y = np.linspace(-50, 50, 21), np.linspace(-60, 40, 21)
     one_by_one = [ground.height(float(a), float(b)) for a, b in zip(x, y, strict=True)]

@@ -5,12 +5,12 @@ import pytest
 
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.draws import ScalarDraws
-from r2flow.simulator.ground import Ground, Street
+from r2flow.simulator.ground import Ground
 from r2flow.simulator.lasers import Rays, along_rows, lasers_of
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta
+from r2flow.simulator.streets import Street
 
 HDL64E = SENSORS["hdl64e"]
 HEIGHT = HDL64E.height
@@ -18,9 +18,10 @@ HEIGHT = HDL64E.height
 
 def look(*solids, lasers=None):
     """Hits of all rays on a few solids over flat ground far from any street, and r = s / cos e."""
-    b = SceneBuilder(Ground((Street(0.0, 1e6, 0.0, 4.0, 2.0),)), ScalarDraws(np.random.default_rng(0)))
+    b = SceneBuilder(np.random.default_rng(0))
+    b.ground = Ground((Street(0.0, 1e6, 0.0, 4.0, 2.0),))
     for label, solid in solids:
-        b.add(solid, label, "concrete")
+        b.add(solid, 0.0, label, "concrete")
     rays = Rays(lasers or along_rows(HDL64E), HDL64E.columns, HEIGHT)
     hits = cast(b.build(), rays, np.random.default_rng(1))
     return hits, hits.distance / np.cos(rays.lasers.elevation)[:, None], rays
@@ -37,10 +38,14 @@ def test_lasers_above_the_origin_see_flat_ground_at_their_own_height():
     hits, _, _ = look(lasers=lasers)
     down = lasers.elevation < -0.05
     exact = -(HEIGHT + lasers.height) / np.tan(lasers.elevation)
-    np.testing.assert_allclose(hits.distance[down], np.repeat(exact[down, None], HDL64E.columns, 1), rtol=1e-5)
+    np.testing.assert_allclose(
+        hits.distance[down], np.repeat(exact[down, None], HDL64E.columns, 1), rtol=1e-5
+    )
 
 
-@pytest.mark.parametrize(("centre", "radius"), [((9.0, 4.0, 1.2), 1.1), ((0.3, 0.2, -0.05), 1.5)])  # ahead, below
+@pytest.mark.parametrize(
+    ("centre", "radius"), [((9.0, 4.0, 1.2), 1.1), ((0.3, 0.2, -0.05), 1.5)]
+)  # ahead, below
 def test_a_sphere_is_met_at_the_root_of_its_quadratic(centre, radius):
     hits, r, rays = look(("person", Blobs(*centre, radius, radius, 0.0)))
     d = directions(rays)
@@ -87,14 +92,17 @@ def test_a_leaning_windscreen_is_met_in_its_plane():
     w = HDL64E.columns // 2
     rows = np.flatnonzero(hits.label[:, w] == LABELS["car"])
     z = HEIGHT + hits.distance[rows, w] * np.tan(rays.lasers.elevation[rows])
-    # its front looks at the sensor: at x = 8 on the ground, half a metre farther for each metre of height
+    # its front looks at the sensor: at x = 8 on the ground, half a metre farther for each metre of
+    # height
     leaning = z < 2 - 1e-3
     np.testing.assert_allclose(hits.distance[rows, w][leaning], 8 + 0.5 * z[leaning], atol=0.02)
 
 
 def test_the_nearest_of_many_overlapping_solids_is_met():
     places = {"car": 5.0, "truck": 6.0, "fence": 7.0, "building": 9.0, "trunk": 14.0}
-    solids = [(name, Boxes(x, 0.5 * (x - 5), 0.2 * x, 1.5, 1.0, 0.0, 2.0)) for name, x in places.items()]
+    solids = [
+        (name, Boxes(x, 0.5 * (x - 5), 0.2 * x, 1.5, 1.0, 0.0, 2.0)) for name, x in places.items()
+    ]
     together, _, _ = look(*solids)
     alone = [look(one)[0] for one in solids]
     distances = np.stack([hits.distance for hits in alone])

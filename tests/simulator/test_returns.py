@@ -6,24 +6,32 @@ import pytest
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import observe
-from r2flow.simulator.draws import ScalarDraws
-from r2flow.simulator.ground import Ground, Street
+from r2flow.simulator.ground import Ground
 from r2flow.simulator.lasers import HDL64E, RIGS, along_rows, hidden, lasers_of, rows_of
-from r2flow.simulator.materials import INDEX, MATERIALS
+from r2flow.simulator.materials import ALBEDO, INDEX, SWALLOW
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Boxes, Cylinders
+from r2flow.simulator.streets import Street
 
 SENSOR = SENSORS["hdl64e"]
 VLP16 = SENSORS["vlp16"]
 OPEN = Ground((Street(0.0, 1e6, 0.0, 4.0, 2.0),))  # flat, without a street in sight
 
 
+def builder() -> SceneBuilder:
+    b = SceneBuilder(np.random.default_rng(0))
+    b.ground = OPEN
+    return b
+
+
 def wall(material: str, distance: float = 10.0, sensor=VLP16, albedo: float | None = None):
     """The scan of a wall ahead of the sensor, and the pixels that look at it within 30 degrees."""
-    b = SceneBuilder(OPEN, ScalarDraws(np.random.default_rng(0)))
-    usual = MATERIALS[INDEX[material]].albedo if albedo is None else albedo
-    b.add(Boxes(distance + 5, 0, 0, 10, 200, -1, 100), "building", material, usual)
-    return observe(b.build(), sensor, np.random.default_rng(1)), np.abs(sensor.rays().numpy()[1]) < np.pi / 6
+    b = builder()
+    usual = float(ALBEDO[INDEX[material]]) if albedo is None else albedo
+    b.add(Boxes(distance + 5, 0, 0, 10, 200, -1, 100), 0.0, "building", material, usual)
+    return observe(b.build(), sensor, np.random.default_rng(1)), np.abs(
+        sensor.rays().numpy()[1]
+    ) < np.pi / 6
 
 
 def test_rows_and_edges_of_the_image_agree():
@@ -58,7 +66,8 @@ def test_a_wall_is_measured_to_within_the_noise_in_steps():
 
 
 @pytest.mark.parametrize(
-    ("material", "low", "high"), [("retro", 0.85, 1.0), ("plaster", 0.35, 0.5), ("rubber", 0.0, 0.1)]
+    ("material", "low", "high"),
+    [("retro", 0.85, 1.0), ("plaster", 0.35, 0.5), ("rubber", 0.0, 0.1)],
 )
 def test_materials_have_their_albedo(material, low, high):
     scan, ahead = wall(material)
@@ -68,7 +77,7 @@ def test_materials_have_their_albedo(material, low, high):
 
 def test_glass_swallows_its_share_of_pulses():
     scan, ahead = wall("pane", albedo=0.5)
-    share = MATERIALS[INDEX["pane"]].swallow
+    share = SWALLOW[INDEX["pane"]]
     looked = ahead & (VLP16.rays().numpy()[0] > 0.01)
     lost = (scan.image[0][looked] == 0).mean()
     assert lost == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / looked.sum()))
@@ -104,13 +113,19 @@ def test_neighbouring_lasers_see_the_own_car_from_either_side():
     instrument = hidden(HDL64E, 1024, 0)[:, 640:780]
     rows = np.flatnonzero(instrument.sum(1) > 30)
     middle = np.array([np.flatnonzero(instrument[row]).mean() for row in rows])
-    assert (np.sign(np.diff(middle)) == -np.sign(np.diff(middle))[0] * (-1) ** np.arange(1, len(rows))).all()
+    assert (
+        np.sign(np.diff(middle)) == -np.sign(np.diff(middle))[0] * (-1) ** np.arange(1, len(rows))
+    ).all()
 
 
 def test_a_pixel_keeps_the_nearest_of_several_lasers():
-    # at 16 rows about four lasers share a row: a thin near bar must not be overwritten by what is behind
+    # at 16 rows about four lasers share a row: a thin near bar must not be overwritten by what is
+    # behind
     coarse = SENSOR.resized(16, 1024)
-    b = SceneBuilder(OPEN, ScalarDraws(np.random.default_rng(0)))
-    b.add(Boxes(20, 0, 0, 1, 200, -1, 50), "building", "plaster", 0.4)
-    b.add(Cylinders(10, 0, 0.5, 1.6, 1.7), "pole", "plaster", 0.4)  # a bar seen by two lasers at most
-    assert (observe(b.build(), coarse, np.random.default_rng(1)).labels[:, 512] == LABELS["pole"]).any()
+    b = builder()
+    b.add(Boxes(20, 0, 0, 1, 200, -1, 50), 0.0, "building", "plaster", 0.4)
+    bar = Cylinders(10, 0, 0.5, 1.6, 1.7)  # seen by two lasers at most
+    b.add(bar, 0.0, "pole", "plaster", 0.4)
+    assert (
+        observe(b.build(), coarse, np.random.default_rng(1)).labels[:, 512] == LABELS["pole"]
+    ).any()
