@@ -103,7 +103,6 @@ def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(k
 
 
 def test_scans_without_measured_points_are_refused(generated):
-    write_points(generated / "000000.bin", np.ones((1, 3), np.float32), np.ones(1, np.float32))
     with pytest.raises(InputError, match=r"000000.npy of .* lacks the measured coordinates"):
         PAPER.check(open_scans(str(generated), READING))
 

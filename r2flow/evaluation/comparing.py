@@ -1,4 +1,4 @@
-"""Comparisons of sets of scans; those of sampled sets are stored, so that an interrupted evaluation resumes."""
+"""Comparisons of sets of scans; those of sampled sets are stored, to resume an evaluation."""
 
 import json
 import math
@@ -9,14 +9,22 @@ from pathlib import Path
 from typing import Literal
 
 from r2flow.data.sets import ScanSet
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.evaluation import measuring
-from r2flow.evaluation.measuring import Cache, MetricResult, Statistics, Work, gather_real, measure, speed_result
+from r2flow.evaluation.measuring import (
+    Cache,
+    MetricResult,
+    Metrics,
+    Statistics,
+    Work,
+    gather_real,
+    measure,
+    speed_result,
+)
 from r2flow.evaluation.protocols import Rules
 from r2flow.evaluation.sets import baseline_sets, reference_sets
 from r2flow.files import read_json, write_file
-from r2flow.metrics.base import ScanMetric
-from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, Panel, mean_distance
+from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, mean_distance
 from r2flow.plugins import plugin_digests
 from r2flow.processes import place
 from r2flow.store import checksum
@@ -41,68 +49,93 @@ class Comparison:
 
 
 def pairs_of(
-    real: ScanSet, judged: Mapping[str, ScanSet], reference: bool | None = None, baselines: bool | None = None
+    real: ScanSet,
+    judged: Mapping[str, ScanSet],
+    reference: bool | None = None,
+    baselines: bool | None = None,
 ) -> list[Pair]:
-    """The judged sets against the real one, with references and baselines; by default (None), if any set is judged."""
+    """The judged sets against the real one, with references and baselines.
+
+    By default (None) these are there if any set is judged.
+    """
     pairs: list[Pair] = [("judged", name, real, scans) for name, scans in judged.items()]
     if reference or (judged and reference is None and len(real) > 1):
-        pairs += [("reference", name, *sets) for name, sets in reference_sets(real, judged).items()]
+        for name, sets in reference_sets(real, judged).items():
+            pairs.append(("reference", name, *sets))
     if baselines or (judged and baselines is None):
-        num = min(max((len(scans) for scans in judged.values()), default=len(real)), 1000)
-        pairs += [("baseline", name, real, scans) for name, scans in baseline_sets(real, num).items()]
+        num = max(map(len, judged.values()), default=len(real))
+        for name, scans in baseline_sets(real, min(num, 1000)).items():
+            pairs.append(("baseline", name, real, scans))
     return pairs
 
 
 def with_equal_panels(comparisons: Sequence[Comparison]) -> list[Comparison]:
-    """Leave reflectance out of every panel's mean if a set lacks it, so that all are means of the same lines."""
-    panels = [result.figures for c in comparisons for result in c.measured if result.metric == Panel.name]
-    lacking = any(math.isfinite(figures[Panel.name]) and math.isnan(figures[REFLECTANCE]) for figures in panels)
+    """Leave reflectance out of every panel's mean if a set lacks it.
 
-    def equal(result: MetricResult) -> MetricResult:
-        if result.metric != Panel.name or math.isnan(result.figures[REFLECTANCE]):
-            return result
-        mean = mean_distance({name: result.figures[name] for name in PANEL if name != REFLECTANCE})
-        return replace(result, figures={**result.figures, Panel.name: mean}, remarks=[*result.remarks, LACKING])
+    All are then means of the same lines.
+    """
+    panels = [r.figures for c in comparisons for r in c.measured if r.metric == "panel"]
+    if not any(math.isnan(f[REFLECTANCE]) and not math.isnan(f["panel"]) for f in panels):
+        return list(comparisons)
+    return [replace(c, measured=[*map(_without_reflectance, c.measured)]) for c in comparisons]
 
-    return [replace(c, measured=[*map(equal, c.measured)]) for c in comparisons] if lacking else list(comparisons)
+
+def _without_reflectance(result: MetricResult) -> MetricResult:
+    """A panel whose mean leaves reflectance out; other results are unchanged."""
+    if result.metric != "panel" or math.isnan(result.figures[REFLECTANCE]):
+        return result
+    mean = mean_distance({line: result.figures[line] for line in PANEL if line != REFLECTANCE})
+    figures = {**result.figures, "panel": mean}
+    return replace(result, figures=figures, remarks=[*result.remarks, LACKING])
 
 
 @dataclass
 class Comparer:
     """Measures pairs of sets; statistics of a real set are gathered once.
 
-    Results of sampled sets are stored in `folder`, if given, in files named by a hash of all that they depend on.
+    Results of sampled sets are stored in `folder`, if given, in files named by a hash of all that
+    they depend on.
     """
 
-    metrics: Mapping[str, ScanMetric]
+    metrics: Metrics
     work: Work
     rules: Rules
     cache: Cache | None
     folder: Path | None
     device: str
-    _statistics: dict[int, dict[str, Statistics]] = field(default_factory=dict)
+    _statistics: dict[ScanSet, dict[str, Statistics]] = field(default_factory=dict)
 
     def __call__(self, kind: Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
         """Compare two sets, or read the stored results."""
-        path = results = None
-        if self.folder is not None and other.source.drawn:
-            recipe = {
-                "real": real.identity or [real.label, len(real)], "sampled": other.about, "format": measuring.FORMAT,
-                "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
-                "protocol": self.rules.name, "plugins": plugin_digests(), "device": self.device,
-            }  # fmt: skip
-            path = self.folder / f"{checksum(recipe)[:16]}.json"
+        path = self._stored(real, other)
+        if path is not None:
             with suppress(OSError, ValueError, TypeError):  # missing or damaged
                 results = [MetricResult(**entry) for entry in read_json(path)]
-        if results is None:
-            if id(real) not in self._statistics:
-                self._statistics[id(real)] = gather_real(self.metrics, real, self.work, self.cache, self.rules)
-            statistics = self._statistics[id(real)]
-            filled = kind == "reference" or any(one.empty < one.scans for one in statistics.values())
-            check(filled, f"{real.label}: none of its {len(real)} scans has a return.")
-            results = measure(self.metrics, statistics, other, self.work, self.rules)
-            if other.source.drawn:
-                results.append(speed_result(real, other))
-            if path is not None and place()[0] == 0:
-                write_file(path, json.dumps([asdict(result) for result in results]))
+                return Comparison(name, real, other, results, kind)
+        if real not in self._statistics:
+            gathered = gather_real(self.metrics, real, self.work, self.cache, self.rules)
+            self._statistics[real] = gathered
+        statistics = self._statistics[real]
+        if kind != "reference" and all(s.empty == s.scans for s in statistics.values()):
+            raise InputError(f"{real.label}: none of its {len(real)} scans has a return.")
+        results = measure(self.metrics, statistics, other, self.work, self.rules)
+        if other.source.drawn:
+            results.append(speed_result(real, other))
+        if path is not None and place()[0] == 0:
+            write_file(path, json.dumps([asdict(result) for result in results]))
         return Comparison(name, real, other, results, kind)
+
+    def _stored(self, real: ScanSet, other: ScanSet) -> Path | None:
+        """File of the results of a sampled set; None for other sets."""
+        if self.folder is None or not other.source.drawn:
+            return None
+        recipe = {
+            "real": real.identity or [real.label, len(real)],
+            "sampled": other.about,
+            "format": measuring.FORMAT,
+            "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
+            "protocol": self.rules.name,
+            "plugins": plugin_digests(),
+            "device": self.device,
+        }
+        return self.folder / f"{checksum(recipe)[:16]}.json"

@@ -1,12 +1,12 @@
-"""Copy detection: distance of generated scans to the nearest training scan, up to rotation and reflection.
+"""Copy detection: distance of generated scans to the nearest training scan, up to symmetries.
 
-A scan is described by its log-range in model space, averaged over cells, x (h, w). The distance to a training scan y
-is the minimum over shifts u of the w columns, and over y and its mirror image,
+A scan is described by its log-range in model space, averaged over cells, x (h, w). The distance to
+a training scan y is the minimum over shifts u of the w columns, and over y and its mirror image,
 
     d^2(x, y) = min_u (|x|^2 + |y|^2 - 2 c(u)) / (h w),        c(u) = sum_ij x_ij y_i(j+u),
 
-with c by FFT along the rows. The test compares the distances of generated and real scans as in Meehan et al. (2020), "A
-non-parametric test to detect data-copying in generative models".
+with c by FFT along the rows. The test compares the distances of generated and real scans as in
+Meehan et al. (2020), "A non-parametric test to detect data-copying in generative models".
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,11 +14,13 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import torch
+from numpy import ndarray
+from scipy.stats import mannwhitneyu
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from r2flow.data.sets import ScanSet
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.measuring import MetricResult, Work, bar
 from r2flow.evaluation.sets import HALVES
@@ -31,116 +33,156 @@ SAME = 5e-3  # largest distance of equal scans, whose files may be rounded; othe
 PAIRS = {"cpu": 1024, "cuda": 131072}  # pairs per block, by device: sized for the CPU's cache
 
 
-def described(scans: ScanSet, training: ScanSet, work: Work, device: str, doing: str) -> Iterator[Tensor]:
-    """Yield log-range, as of training scans, averaged over cells, (B, h, w); NaN for a scan without returns."""
-    rows, columns = (min(cells, size) for cells, size in zip(CELLS, scans.sensor.shape, strict=True))
+def _described(
+    scans: ScanSet, training: ScanSet, work: Work, device: str, doing: str
+) -> Iterator[Tensor]:
+    """Yield log-range, as of training scans, averaged over cells, (B, h, w).
+
+    NaN for a scan without returns.
+    """
+    cells = np.minimum(CELLS, scans.sensor.shape).tolist()
     encoding = Encoding(training.sensor, reflectance=False)  # a model's limits may be others
     with torch.no_grad(), bar(doing, len(scans)) as advance:
         for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
             batch = Scans(images.to(device), scans.sensor)
-            mean = adaptive_avg_pool2d(encoding.encode(batch.images[:, :1]), (rows, columns))[:, 0]
-            yield torch.where(batch.returned.flatten(1).any(1)[:, None, None], mean, torch.nan)
+            mean = adaptive_avg_pool2d(encoding.encode(batch.images[:, :1]), cells)[:, 0]
+            yield torch.where(batch.nonempty[:, None, None], mean, torch.nan)
             advance(len(images))
 
 
 class Nearest:
-    """Nearest scan of a training set for each scan of a set, among the training scans compared so far.
+    """Nearest scan of a training set for each scan of a set, among those compared so far.
 
-    `numbers`: indices of scans with returns, (N,); `squared`: d^2 to the nearest training scan; `neighbours`: index of
-    this training scan; `turns`: its shift u in cells, or -1 - u if mirrored first.
+    Attributes:
+        numbers: Indices of scans with returns, (N,).
+        squared: d^2 to the nearest training scan, (N,).
+        neighbours: Index of this training scan.
+        turns: Its shift u in cells, or -1 - u if mirrored first.
+
+    Raises:
+        InputError: No scan has a return.
     """
 
     def __init__(self, scans: ScanSet, training: ScanSet, work: Work, device: str) -> None:
-        x = torch.cat(list(described(scans, training, work, device, "describing")))
+        x = torch.cat(list(_described(scans, training, work, device, "describing")))
         usable = x.isfinite().flatten(1).all(1)
-        check(usable.any(), f"none of the {len(scans)} scans of {scans.label} has a return to compare.")
-        self.scans, self.training, self.numbers = scans, training, np.flatnonzero(usable.cpu().numpy())
-        self.x = x = x[usable]
-        self.width = x.shape[2]
-        self.spectra = -2 * torch.fft.rfft(x).conj().permute(2, 0, 1).contiguous()  # (K, N, h)
-        self.squared = x.new_full((len(x),), torch.inf)
-        self.neighbours, self.turns = (torch.zeros_like(self.squared, dtype=torch.long) for _ in range(2))
+        if not usable.any():
+            raise InputError(
+                f"none of the {len(scans)} scans of {scans.label} has a return to compare."
+            )
+        self.scans = scans
+        self.training = training
+        self.numbers = np.flatnonzero(usable.cpu().numpy())
+        self.squared = x.new_full((len(self.numbers),), torch.inf)
+        self.neighbours = torch.zeros_like(self.squared, dtype=torch.long)
+        self.turns = torch.zeros_like(self.neighbours)
+        self._x = x[usable]
+        self._width = x.shape[2]
+        self._spectra = -2 * torch.fft.rfft(self._x).conj().permute(2, 0, 1).contiguous()
 
     def approach(self, y: Tensor, first: int) -> None:
-        """Update with training scans `first`, `first + 1`, ..., (M, h, w); a scan of NaN is never nearest."""
-        both, m = torch.cat([y, y.flip(-1)]), len(y)
+        """Update with training scans `first`, `first + 1`, ..., (M, h, w).
+
+        A scan of NaN is never nearest.
+        """
+        m = len(y)
+        both = torch.cat([y, y.flip(-1)])
         energy = both.square().sum((1, 2)).nan_to_num(torch.inf)
         spectra = torch.fft.rfft(both.nan_to_num(0.0)).permute(2, 1, 0).contiguous()  # (K, h, 2 M)
+        columns = torch.arange(self._width, device=y.device)
         block = max(PAIRS.get(y.device.type, 1024) // m, 1)
         for start in range(0, len(self.numbers), block):
             at = slice(start, start + block)
-            d = torch.fft.irfft(self.spectra[:, at] @ spectra, n=self.width, dim=0)  # -2 c(u), (w, n, 2 M)
-            curve, turn = d.min(0)
+            # -2 c(u), (w, n, 2 M)
+            d = torch.fft.irfft(self._spectra[:, at] @ spectra, n=self._width, dim=0)
+            curve, turns = d.min(0)
             place = (curve + energy).argmin(1)
-            turn = turn.gather(1, place[:, None])[:, 0]
-            columns = (turn[:, None, None] + torch.arange(self.width, device=y.device)) % self.width
-            turned = both[place].gather(2, columns.expand(-1, y.shape[1], -1))
-            squared = (self.x[at] - turned).square().mean((1, 2))  # the curve of a copy has 1e-8, by rounding
+            turn = turns.gather(1, place[:, None])
+            shifted = ((turn + columns) % self._width)[:, None]
+            turned = both[place].gather(2, shifted.expand(-1, y.shape[1], -1))
+            # The curve of a copy has 1e-8, by rounding.
+            squared = (self._x[at] - turned).square().mean((1, 2))
             closer = squared < self.squared[at]
-            for stored, new in (
-                (self.squared, squared), (self.neighbours, first + place % m),
-                (self.turns, torch.where(place < m, turn, -1 - turn)),
-            ):  # fmt: skip
-                stored[at] = torch.where(closer, new, stored[at])
+            turn = torch.where(place < m, turn[:, 0], -1 - turn[:, 0])
+            self.squared[at][closer] = squared[closer]
+            self.neighbours[at][closer] = first + place[closer] % m
+            self.turns[at][closer] = turn[closer]
 
     @property
-    def distances(self) -> np.ndarray:
+    def distances(self) -> ndarray:
         """Distance of each scan to its nearest training scan, (N,)."""
-        return np.asarray(self.squared.double().sqrt().cpu())
+        return self.squared.double().sqrt().cpu().numpy()
 
-    def match(self, place: int) -> np.ndarray:
+    def match(self, place: int) -> ndarray:
         """Image of the nearest training scan of the scan at `place`, aligned with that scan."""
-        image, turn = self.training.source[int(self.neighbours[place])], int(self.turns[place])
+        image = self.training.source[int(self.neighbours[place])]
+        turn = int(self.turns[place])
         if turn < 0:
-            image, turn = image[..., ::-1], -1 - turn
-        return np.roll(image, -round(turn * image.shape[-1] / self.width), axis=-1)
+            image = image[..., ::-1]
+            turn = -1 - turn
+        return np.roll(image, -round(turn * image.shape[-1] / self._width), axis=-1)
 
 
-def find_nearest(sets: Mapping[str, ScanSet], training: ScanSet, work: Work, device: str = "cpu") -> dict[str, Nearest]:
-    """Find the nearest training scan of each scan of several sets; reads training scans once, without storing them."""
+def find_nearest(
+    sets: Mapping[str, ScanSet], training: ScanSet, work: Work, device: str = "cpu"
+) -> dict[str, Nearest]:
+    """Find the nearest training scan of each scan of several sets.
+
+    Reads training scans once, without storing them.
+    """
     nearest = {name: Nearest(scans, training, work, device) for name, scans in sets.items()}
     first = 0
-    for y in described(training, training, work, device, "reading training scans"):
+    for y in _described(training, training, work, device, "reading training scans"):
         for neighbours in nearest.values():
             neighbours.approach(y, first)
         first += len(y)
-    check(all(n.squared.isfinite().all() for n in nearest.values()), f"no scan of {training.label} has a return.")
     return nearest
 
 
 def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
-    """Median distance to the nearest training scan, and P(a scan's distance < a real scan's), 0.5 by chance.
+    """Median distance to the nearest training scan, and P(a scan's distance < a real scan's).
 
-    Real scans that are training scans are left out. A small p of the one-sided Mann-Whitney U does not prove copying:
-    scans that resemble training streets are nearer without being copies, and frames of one drive are not independent.
+    The latter is 0.5 by chance. Real scans that are training scans are left out. A small p of the
+    one-sided Mann-Whitney U does not prove copying: scans that resemble training streets are nearer
+    without being copies, and frames of one drive are not independent.
     """
-    from scipy.stats import mannwhitneyu
-
     others = real.distances[real.distances >= SAME]
+    same = len(real.distances) - len(others)
     d = others if judged is real and len(others) else judged.distances
-    figures, remarks = {"copies": float(np.median(d))}, []
-    if judged is not real and (same := len(real.distances) - len(others)):
-        remarks.append(f"copies: {same} of {len(real.distances)} real scans are training scans, and left out.")
+    figures = {"copies": float(np.median(d))}
+    remarks = []
+    if judged is not real and same:
+        scans = f"{same} of {len(real.distances)} real scans"
+        remarks.append(f"copies: {scans} are training scans, and left out.")
     if judged is not real and len(others):
         test = mannwhitneyu(others, d, alternative="greater")
-        figures["copies_nearer"] = float(test.statistic) / (len(d) * len(others))
+        nearer = float(test.statistic) / (len(d) * len(others))
+        figures["copies_nearer"] = nearer
         remarks.append(
-            f"copies: {(d < others.min()).sum()} of {len(d)} scans lie nearer to a training scan than any of "
-            f"{len(others)} real ones, {len(d) / (len(others) + 1):.2g} expected; nearer in "
-            f"{figures['copies_nearer']:.0%} of all pairs (p = {test.pvalue:.2g})."
+            f"copies: {(d < others.min()).sum()} of {len(d)} scans lie nearer to a training scan "
+            f"than any of {len(others)} real ones, {len(d) / (len(others) + 1):.2g} expected; "
+            f"nearer in {nearer:.0%} of all pairs (p = {test.pvalue:.2g})."
         )
-    settings = {"cells": list(CELLS), "turned": True, "mirrored": True, "training scans": len(real.training)}
+    settings = {
+        "cells": list(CELLS),
+        "turned": True,
+        "mirrored": True,
+        "training scans": len(real.training),
+    }
     sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(d)}
-    protocol = {**asdict(Protocol("copies", "log-range of cells", settings=settings)), "sizes": sizes}
-    return MetricResult("copies", figures, protocol, None, remarks)
+    protocol = asdict(Protocol("copies", "log-range of cells", settings=settings))
+    return MetricResult("copies", figures, {**protocol, "sizes": sizes}, None, remarks)
 
 
-def with_copies(comparisons: Sequence[Comparison], nearest: Mapping[str, Nearest], real: Nearest) -> list[Comparison]:
-    """Add `copies_result` to each judged set in `nearest`, and that of the real scans to the halves."""
-    of = {("judged", name): neighbours for name, neighbours in nearest.items()} | {("reference", HALVES): real}
-    return [
-        replace(row, measured=[*row.measured, copies_result(of[row.kind, row.name], real)])
-        if (row.kind, row.name) in of
-        else row
-        for row in comparisons
-    ]
+def with_copies(
+    comparisons: Sequence[Comparison], nearest: Mapping[str, Nearest], real: Nearest
+) -> list[Comparison]:
+    """Add `copies_result` to each judged set in `nearest`, and that of the real scans to halves."""
+    of = {("judged", name): neighbours for name, neighbours in nearest.items()}
+    of["reference", HALVES] = real
+    extended = []
+    for row in comparisons:
+        judged = of.get((row.kind, row.name))
+        more = [] if judged is None else [copies_result(judged, real)]
+        extended.append(replace(row, measured=[*row.measured, *more]))
+    return extended

@@ -1,9 +1,9 @@
 """Registry of distances between real and generated scans; each name stands for one protocol.
 
-`METRICS[name](sensor=...)` builds a metric. Importing this module does not import metrics, networks or torch.
+`METRICS[name](sensor=...)` builds a metric. Importing this module does not import torch.
 
-Not implemented: LiDARGen's JSD and MMD, which keep returns up to 70 m (scans are masked to 63 m here), and
-UltraLiDAR's, which compare voxel centres of real scans with points of generated scans.
+Not implemented: LiDARGen's JSD and MMD, which keep returns up to 70 m (scans are masked to 63 m
+here), and UltraLiDAR's, which compare voxel centres of real scans with points of generated scans.
 """
 
 from __future__ import annotations
@@ -18,26 +18,33 @@ if TYPE_CHECKING:
     from r2flow.metrics.base import ScanMetric
 
 # Published names of Frechet distances by network; other networks have `frechet_NETWORK`.
-FIELD_NAMES = {"rangenet53": "frd", "rangenet21": "frid", "pointnet": "fpd", "spvcnn": "fpvd", "minkowskinet": "fsvd"}
+FIELD_NAMES = {
+    "rangenet53": "frd",
+    "rangenet21": "frid",
+    "pointnet": "fpd",
+    "spvcnn": "fpvd",
+    "minkowskinet": "fsvd",
+}
 
 METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
-    jsd=lazy(f"{__name__}.jsd_mmd:JSD"),
-    mmd=lazy(f"{__name__}.jsd_mmd:MMD"),
-    jsd_lidm=lazy(f"{__name__}.lidm:JSDLiDM"),
-    mmd_lidm=lazy(f"{__name__}.lidm:MMDLiDM"),
-    panel=lazy(f"{__name__}.panel:Panel"),
-    things=lazy(f"{__name__}.things:Things"),
-    auc=lazy(f"{__name__}.features:TwoSample", "handcrafted"),
-    auc_range=lazy(f"{__name__}.features:TwoSample", "handcrafted_range"),
+    jsd=lazy("r2flow.metrics.jsd_mmd:JSD"),
+    mmd=lazy("r2flow.metrics.jsd_mmd:MMD"),
+    jsd_lidm=lazy("r2flow.metrics.lidm:JSDLiDM"),
+    mmd_lidm=lazy("r2flow.metrics.lidm:MMDLiDM"),
+    panel=lazy("r2flow.metrics.panel:Panel"),
+    things=lazy("r2flow.metrics.things:Things"),
+    auc=lazy("r2flow.metrics.features:TwoSample", "handcrafted"),
+    auc_range=lazy("r2flow.metrics.features:TwoSample", "handcrafted_range"),
 )
 
 
 def add_network(name: str) -> None:
     """Register a network's metrics: Frechet distance, kernel distance, precision and recall."""
-    METRICS.add(FIELD_NAMES.get(name, f"frechet_{name}"), lazy(f"{__name__}.features:FrechetDistance", name))
-    METRICS.add(f"kid_{name}", lazy(f"{__name__}.features:KernelDistance", name))
-    METRICS.add(f"manifold_{name}", lazy(f"{__name__}.features:Manifold", name))
+    frechet = FIELD_NAMES.get(name, f"frechet_{name}")
+    METRICS.add(frechet, lazy("r2flow.metrics.features:FrechetDistance", name))
+    METRICS.add(f"kid_{name}", lazy("r2flow.metrics.features:KernelDistance", name))
+    METRICS.add(f"manifold_{name}", lazy("r2flow.metrics.features:Manifold", name))
 
 
 for _network in EXTRACTORS:

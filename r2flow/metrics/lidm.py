@@ -1,31 +1,33 @@
-"""JSD and MMD of the LiDAR Diffusion Models' evaluation toolbox, which differ from the usual JSD and MMD.
+"""JSD and MMD of the LiDAR Diffusion Models' evaluation toolbox, which differ from the usual ones.
 
-Ran, Guizilini and Wang (2024). Returns of 1 m < r < 56 m within +-50 m; each cell of the ground plane is occupied or
-not, without counts. MMD is the minimum matching distance of Achlioptas et al. (2018), not maximum mean discrepancy. The
-publication compares 2000 samples with KITTI-360's drive 0003.
+Ran, Guizilini and Wang (2024). Returns of 1 m < r < 56 m within +-50 m; each cell of the ground
+plane is occupied or not, without counts. MMD is the minimum matching distance of Achlioptas et al.
+(2018), not maximum mean discrepancy. The publication compares 2000 samples with KITTI-360's drive
+0003.
 """
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
-from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
-from r2flow.metrics.base import ScanMetric, Side, blocks
+from r2flow.metrics.base import StoredMetric, blocks
 from r2flow.metrics.jsd_mmd import JSD
 from r2flow.metrics.scans import Scans
 
-NEAR, FAR, EXTENT = 1.0, 56.0, 50  # metres
-FINE, COARSE = 0.05, 0.5  # cell size in metres: JSD, MMD
+NEAR = 1.0  # metres, as all lengths here
+FAR = 56.0
+EXTENT = 50
+FINE = 0.05  # cell size of JSD
+COARSE = 0.5  # cell size of MMD
 BLOCK = 500  # scans per block: two blocks of distance maps and occupied cells take 640 MB
 
 
-def occupied(points: Tensor, cell: float) -> Tensor:
-    """Sorted indices (K,) of occupied ground-plane cells, in a grid with 2 EXTENT / cell cells per side."""
+def _occupied(points: Tensor, cell: float) -> Tensor:
+    """Sorted indices (K,) of occupied ground-plane cells, of 2 EXTENT / cell cells per side."""
     r = points.norm(dim=1)
     inside = (r > NEAR) & (r < FAR) & (points[:, :2].abs() < EXTENT).all(1)
     side = round(2 * EXTENT / cell)
@@ -34,46 +36,53 @@ def occupied(points: Tensor, cell: float) -> Tensor:
 
 
 class JSDLiDM(JSD):
-    """Jensen-Shannon distance (root, natural logarithm) between counts of scans that occupy each 5 cm cell.
+    """Jensen-Shannon distance (root, natural logarithm) between counts of scans per 5 cm cell.
 
-    A row lists the occupied cells, since a scan has 4 million.
+    A scan counts in each cell that it occupies. A row lists the occupied cells, since a scan has 4
+    million.
     """
 
     name = "jsd_lidm"
     representation = "occupied cells from above"
     mask = (NEAR, FAR)
-    settings: ClassVar[Mapping[str, Any]] = {
-        "cell": FINE, "metres": [-EXTENT, EXTENT], "logarithm": "natural", "root": True
-    }  # fmt: skip
+    settings: ClassVar = {
+        "cell": FINE,
+        "metres": [-EXTENT, EXTENT],
+        "logarithm": "natural",
+        "root": True,
+    }
     width = round(2 * EXTENT / FINE) ** 2
 
     def rows(self, scans: Scans) -> Tensor:
         """Indices of occupied cells, (B, K) float64, filled up with `width`."""
-        cells = [occupied(points, FINE).double() for points in scans.points]
-        rows = pad_sequence([pad(indices, (0, 1), value=self.width) for indices in cells], True, self.width)
-        return torch.where(rows[:, :1] < self.width, rows, torch.nan)
+        rows = []
+        for points in scans.points:
+            cells = _occupied(points, FINE).double()
+            rows.append(cells if len(cells) else cells.new_full((1,), torch.nan))
+        return pad_sequence(rows, True, self.width)
 
-    def accumulate(self, rows: Tensor, side: Side) -> None:
-        total: Tensor = getattr(self, f"{side}_sum")
-        cells = rows[rows < self.width].long().to(total.device)
-        total.index_add_(0, cells, total.new_ones(len(cells)))
+    def accumulate(self, rows: Tensor, numbers: Tensor, side: int) -> None:
+        cells = rows[rows < self.width].long().to(self.sums.device)
+        self.sums[side] += cells.bincount(minlength=self.width)
 
 
-class MMDLiDM(ScanMetric):
-    """Minimum matching distance: mean over real scans of the Chamfer distance to the nearest generated scan.
+class MMDLiDM(StoredMetric):
+    """Minimum matching distance: mean over real scans of the Chamfer distance to the nearest scan.
 
-    A scan is the set A of occupied 0.5 m cells, scaled to a square of side 1. With |a - B| the distance of a cell to
-    the nearest cell of B, the distance is (mean_a |a - B|^2 + mean_b |b - A|^2) / 2. The squared distance map of every
-    scan is computed once and stored; the Chamfer distances of all pairs are then two matrix products, exactly.
+    The nearest is of the generated scans. A scan is the set A of occupied 0.5 m cells, scaled to a
+    square of side 1. With |a - B| the distance of a cell to the nearest cell of B, the distance is
+    (mean_a |a - B|^2 + mean_b |b - A|^2) / 2. The squared distance map of every scan is computed
+    once and stored; the Chamfer distances of all pairs are then two matrix products, exactly.
     """
 
     name = "mmd_lidm"
     representation = "occupied cells from above"
     mask = (NEAR, FAR)
-    settings: ClassVar[Mapping[str, Any]] = {
-        "cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"
-    }  # fmt: skip
-    keeping = True
+    settings: ClassVar = {
+        "cell": COARSE,
+        "metres": [-EXTENT, EXTENT],
+        "distance": "Chamfer, squared, halved",
+    }
     biased = True
     fewest = 1
 
@@ -82,16 +91,19 @@ class MMDLiDM(ScanMetric):
         maps = torch.full((len(scans), side * side), torch.nan)
         for squared, points in zip(maps, scans.points, strict=True):
             free = np.ones((side, side), dtype=bool)
-            free.flat[occupied(points, COARSE).cpu().numpy()] = False
+            free.flat[_occupied(points, COARSE).cpu().numpy()] = False
             if not free.all():  # integers up to rounding of the root
                 squared[:] = torch.from_numpy(np.rint(distance_transform_edt(free) ** 2)).flatten()
         return maps
 
-    def distance(self, real: Tensor, generated: Tensor) -> Tensor:
+    def values(self, real: Tensor, generated: Tensor) -> list[float]:
         nearest = torch.full((len(real),), torch.inf, dtype=torch.float64)
         for i, x in blocks(real, BLOCK):
+            a = (x == 0).double()  # occupied cells
             for _, y in blocks(generated, BLOCK):
-                a, b = (x == 0).double(), (y == 0).double()  # occupied cells
-                chamfer = ((a @ y.T) / a.sum(1)[:, None] + (x @ b.T) / b.sum(1)) / 2  # of all pairs, in squared cells
+                b = (y == 0).double()
+                to_generated = (a @ y.T) / a.sum(1)[:, None]  # of all pairs, in squared cells
+                to_real = (x @ b.T) / b.sum(1)
+                chamfer = (to_generated + to_real) / 2
                 nearest[i] = torch.minimum(nearest[i], chamfer.amin(1))
-        return nearest.mean() * (COARSE / (2 * EXTENT)) ** 2
+        return [float(nearest.mean()) * (COARSE / (2 * EXTENT)) ** 2]

@@ -15,7 +15,8 @@ from r2flow.files import read_json
 from r2flow.generators import Flow
 from r2flow.inversion import interpolate_scans
 from r2flow.lidar.projection import image_to_points
-from r2flow.metrics.birds_eye import EXTENT, birds_eye_histogram, js_distance
+from r2flow.metrics.jsd_mmd import js_distance
+from r2flow.metrics.scans import EXTENT, birds_eye_histogram
 from r2flow.model.checkpoint import Checkpoint, weights_hash
 from r2flow.progress import track
 from r2flow.reports.backbones import cost

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.metrics import METRICS
-from r2flow.metrics.base import SIDES, ScanMetric
+from r2flow.metrics.base import ScanMetric
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
@@ -69,8 +69,8 @@ def measured(metric: ScanMetric, real: Scans, generated: Scans) -> ScanMetric:
 
 
 def given(metric: ScanMetric, real: ArrayLike, generated: ArrayLike) -> dict[str, float]:
-    for rows, side in ((real, SIDES[0]), (generated, SIDES[1])):
-        metric.add_rows(torch.as_tensor(rows).flatten(1), side, range(len(rows)))
+    for rows, is_real in ((real, True), (generated, False)):
+        metric.add_rows(torch.as_tensor(rows).flatten(1), is_real, range(len(rows)))
     return metric.compute()
 
 

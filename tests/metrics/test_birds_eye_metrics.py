@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from r2flow.metrics import jsd_mmd, lidm
-from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
-from r2flow.metrics.jsd_mmd import JSD, MMD
+from r2flow.metrics.jsd_mmd import JSD, MMD, js_distance
 from r2flow.metrics.lidm import JSDLiDM, MMDLiDM
+from r2flow.metrics.scans import birds_eye_histogram
 from tests.metrics.conftest import given, measured, scans_of
 
 

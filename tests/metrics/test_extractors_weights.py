@@ -7,7 +7,6 @@ import tarfile
 
 import pytest
 import torch
-import yaml
 
 from r2flow.errors import InputError
 from r2flow.metrics.extractors import EXTRACTORS
@@ -20,7 +19,6 @@ PARTS = {
     "segmentation_decoder": {"dec5.upconv.bias": torch.zeros(3)},
     "segmentation_head": {"1.bias": torch.ones(1)},
 }
-CONFIG = {"dataset": {"sensor": {"img_means": [12.12]}}}
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +43,7 @@ def saved(content) -> bytes:
 
 def pack(folder, kind):
     """The release's files as a folder or a .tar.gz, one folder deep as they are published."""
-    files = {**{name: saved(content) for name, content in PARTS.items()}, "arch_cfg.yaml": yaml.dump(CONFIG).encode()}
+    files = {name: saved(content) for name, content in PARTS.items()} | {"arch_cfg.yaml": b"date: 2020-01-01"}
     if kind == "folder":
         for name, data in files.items():
             (folder / name).write_bytes(data)
@@ -92,16 +90,11 @@ def test_weights_that_are_added_are_those_that_are_loaded(pointnet, folder):
     assert weights_hash(untrained(PointNet, 4)) != weights
 
 
-def test_kept_weights_that_were_changed_are_not_used(pointnet, folder):
+def test_damaged_weights_are_not_used(pointnet, folder):
     network, path = pointnet
     add("pointnet", path)
     kept_path = folder / "pointnet.safetensors"
-    data = bytearray(kept_path.read_bytes())
-    data[-100] ^= 1
-    kept_path.write_bytes(data)
-    with pytest.raises(InputError, match="is not what was added"):
-        EXTRACTORS["pointnet"].trained()
-    kept_path.write_bytes(data[:-100])
+    kept_path.write_bytes(kept_path.read_bytes()[:-100])
     with pytest.raises(InputError, match="damaged"):
         EXTRACTORS["pointnet"].trained()
 
@@ -113,12 +106,12 @@ def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, fo
     tensors = network.state_dict()
     refused = [
         (saved({**tensors, "fc3.weight": torch.zeros(40, 256), "fc3.bias": torch.zeros(40)}), "size mismatch for fc3"),
-        (saved({**tensors, "fc3.bias": torch.full((16,), torch.nan)}), "'fc3.bias' has values that are not finite"),
     ]
     odd = ({0: torch.ones(1)}, {"a": torch.eye(2).to_sparse()}, {"a": torch.ones(1) * 1j}, {"a": 1}, [1])
     odd += ({"a": torch.ones(1, device="meta")},)
     none = (b"", b"\x80\x02}q\x00.", b"nonsense" * 100, *map(saved, odd))
-    for content, said in (*refused, *((one, "not a checkpoint|no table of tensors|is empty") for one in none)):
+    refused += [(one, "not a checkpoint|not the weights|not a readable|is empty") for one in none]
+    for content, said in refused:
         path.write_bytes(content)
         with pytest.raises(InputError, match=said):
             add("pointnet", path)
@@ -131,10 +124,9 @@ def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, fo
 
 @pytest.mark.parametrize("kind", ["folder", "tar.gz"])
 def test_the_release_of_several_files_is_read_as_one(tmp_path, kind):
-    tensors, config = read_published(pack(tmp_path, kind))
+    tensors = read_published(pack(tmp_path, kind))
     expected = {name: value for part in PARTS.values() for name, value in part.items()}
     assert {name: value.tolist() for name, value in tensors.items()} == {n: v.tolist() for n, v in expected.items()}
-    assert config == CONFIG
 
 
 def test_archives_of_nothing_of_several_and_of_halves_are_said(tmp_path):
@@ -151,17 +143,6 @@ def test_archives_of_nothing_of_several_and_of_halves_are_said(tmp_path):
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(InputError, match="damaged"):
         read_published(path)
-
-
-def test_settings_of_an_archive_are_a_table_of_whatever(tmp_path, pointnet):
-    network, _ = pointnet
-    (tmp_path / "net").mkdir()
-    torch.save(network.state_dict(), tmp_path / "net" / "model.ckpt")
-    (tmp_path / "net" / "arch_cfg.yaml").write_text("date: 2020-01-01\n")
-    assert add("pointnet", tmp_path / "net") == weights_hash(network)
-    (tmp_path / "net" / "arch_cfg.yaml").write_text("[1, 2]\n")
-    with pytest.raises(InputError, match="not a table"):
-        add("pointnet", tmp_path / "net")
 
 
 def test_pipes_and_devices_are_refused_at_once(tmp_path):

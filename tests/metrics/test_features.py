@@ -9,6 +9,7 @@ import torch
 
 from r2flow.metrics import METRICS, features
 from r2flow.metrics.features import KernelDistance, Manifold, area, interval
+from r2flow.metrics.jsd_mmd import squared_distances
 from tests.metrics.conftest import Summary, given
 
 
@@ -48,7 +49,7 @@ def test_repeated_scans_lie_on_each_other_however_far_from_zero():
     # Every ball has the radius 0, and holds the six that are one: density 6 / 5.
     assert figures(rows, rows) == pytest.approx([1, 1, 6 / 5, 1])
     x = torch.from_numpy(rows)
-    assert not features.squared_distances(x, x).diagonal().any()  # where two ways to add up are rounded differently
+    assert not squared_distances(x, x).diagonal().any()  # where two ways to add up are rounded differently
 
 
 def test_the_kernel_distance_of_two_gaussians_is_that_of_their_moments():

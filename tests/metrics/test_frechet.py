@@ -65,7 +65,7 @@ def test_fewer_scans_than_dimensions_is_exact_and_said(summary):
     common = np.linalg.norm(a @ b.T, "nuc") / math.sqrt(3 * 4)
     expected = ((x.mean(0) - y.mean(0)) ** 2).sum() + (a**2).sum() / 3 + (b**2).sum() / 4 - 2 * common
     assert metric.compute() == {"frechet_summary": pytest.approx(expected, rel=1e-9)}
-    assert any("fewer scans than features" in said and "too large" in said for said in metric.remarks())
+    assert any("fewer scans than features" in said and "too large" in said for said in metric.remarks)
 
 
 def test_random_weights_never_have_the_field_s_name(summary):

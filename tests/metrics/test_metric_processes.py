@@ -9,6 +9,7 @@ import torch.multiprocessing as mp
 
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
+from r2flow.metrics.base import StoredMetric
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.features import FrechetDistance, Manifold
 from tests.metrics.conftest import scans_of
@@ -32,9 +33,9 @@ def measure(rank, ranks):
             for real, scans in ((True, images(seed, 14)), (False, images(seed + 1, 11))):
                 for batch in scans.split(3)[rank::ranks]:
                     metric.update(batch, real=real)
-            kept = len(metric.kept("real")) if metric.keeping else 0
-            found.append([metric.compute(), metric.remarks()])
-            assert not metric.keeping or len(metric.kept("real")) == kept  # its own again
+            kept = len(metric.real_rows) if isinstance(metric, StoredMetric) else 0
+            found.append([metric.compute(), metric.remarks])
+            assert not kept or len(metric.real_rows) == kept  # its own again
     return found
 
 

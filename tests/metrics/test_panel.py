@@ -13,7 +13,7 @@ from r2flow.evaluation.sets import BASELINES, Baseline
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics import panel as lines
-from r2flow.metrics.birds_eye import js_distance
+from r2flow.metrics.jsd_mmd import js_distance
 from r2flow.metrics.panel import PANEL, RUNS, Scan, distances, panel, rate_distance, steps_by_sector
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import measured
@@ -155,7 +155,7 @@ def test_range_alone_leaves_reflectance_out():
     metric = measured(METRICS["panel"](), *(Scans(torch.from_numpy(x), SENSOR) for x in (images, images[:, :1])))
     assert np.isnan(metric.compute()["reflectance pairs"])
     assert metric.compute()["panel"] == pytest.approx(0, abs=1e-9)
-    assert any("no reflectance" in remark for remark in metric.remarks())
+    assert any("no reflectance" in remark for remark in metric.remarks)
 
 
 def test_the_baselines_are_what_they_say():

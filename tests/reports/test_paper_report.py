@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.metrics.birds_eye import js_distance
+from r2flow.metrics.jsd_mmd import js_distance
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.reports.paper import PaperRun, marginals_apart, role_of, same_architecture, scans_figure, table_i
 from r2flow.reports.printed import COLUMNS, TABLE_II

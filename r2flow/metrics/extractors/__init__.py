@@ -22,11 +22,11 @@ class Extractors(Registry["type[Extractor]"]):
 
 EXTRACTORS = Extractors(
     "extractor",
-    handcrafted=lazy(f"{__name__}.handcrafted:Handcrafted"),
-    handcrafted_range=lazy(f"{__name__}.handcrafted:HandcraftedRange"),
-    rangenet53=lazy(f"{__name__}.rangenet:RangeNet53"),
-    rangenet21=lazy(f"{__name__}.rangenet:RangeNet21"),
-    pointnet=lazy(f"{__name__}.pointnet:PointNet"),
-    minkowskinet=lazy(f"{__name__}.voxels:MinkowskiNet"),
-    spvcnn=lazy(f"{__name__}.voxels:SPVCNN"),
+    handcrafted=lazy("r2flow.metrics.extractors.handcrafted:Handcrafted"),
+    handcrafted_range=lazy("r2flow.metrics.extractors.handcrafted:HandcraftedRange"),
+    rangenet53=lazy("r2flow.metrics.extractors.rangenet:RangeNet53"),
+    rangenet21=lazy("r2flow.metrics.extractors.rangenet:RangeNet21"),
+    pointnet=lazy("r2flow.metrics.extractors.pointnet:PointNet"),
+    minkowskinet=lazy("r2flow.metrics.extractors.voxels:MinkowskiNet"),
+    spvcnn=lazy("r2flow.metrics.extractors.voxels:SPVCNN"),
 )

@@ -1,25 +1,26 @@
 """Hand-made features of scans, without training or weights, for any sensor and image size.
 
-The statistics describe differences of neighbouring returns along rows and columns, missing rays, and distributions of
-range and reflectance. Each is a mean over half of the rows, invariant to rotation of the scan. Six are also computed
-per azimuth sector, which distinguishes rotated and mirrored scans.
+The statistics describe differences of neighbouring returns along rows and columns, missing rays,
+and distributions of range and reflectance. Each is a mean over half of the rows, invariant to
+rotation of the scan. Six are also computed per azimuth sector, which distinguishes rotated and
+mirrored scans.
 
 Statistics, bands, sectors and scale were chosen on half of a set of corruptions of scans.
 """
 
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from r2flow.metrics.extractors.base import Extractor, nan_where_empty
+from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
 
-BANDS, SECTORS = 2, 8  # bands of rows, sectors of azimuth
-PIXELS = 2**16  # pixels per batch, sized for a core's cache
+BANDS = 2  # of rows
+SECTORS = 8  # of azimuth
 FINE = 0.005  # metres, or relative to full reflectance: lower limit of steps
 SAME = 0.0025  # metres: neighbours are equal up to rounding in files
 EDGE = 0.5  # metres between neighbours on different objects
@@ -28,9 +29,12 @@ REFLECTANCES = (0, 0.1, 0.25, 0.5, torch.inf)
 FEW = 0.01  # share of rays in a cell; statistics of fewer rays shrink to the centre
 FAR_OUT = 5.0  # distance from the centre in scales beyond which features grow logarithmically
 
+# Ends of the names of features: see `Handcrafted`.
+SPREAD = ", spread"
+BEAMS = ", beams"
+SECTORED = ", sectors"
 
 # Features are (x - centre) / spread, by mean and standard deviation over simulated hdl64e scans.
-SPREAD, BEAMS, SECTORED = ", spread", ", beams", ", sectors"
 SCALES = {
     "returns": (0.76, 0.029),
     "row changes": (0.026, 0.009),
@@ -90,52 +94,56 @@ SCALES = {
 }
 
 
-def statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tensor | None]]:
-    """Yield names in `SCALES`, values per pixel, and the mask of pixels (None: all), (B, H, W) each.
+def _statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """Yield names in `SCALES`, values per pixel, and the mask of pixels, (B, H, W) each.
 
     r are ranges in metres, (B, H, W), 0 without a return; q reflectances.
     """
     m = (r > 0).to(r)
-    right, left, lower = _right(m), _right(m, -1), _lower(m)
-    yield "returns", m, None
-    yield "row changes", (m - right).abs(), None
-    yield "column changes", (m - lower).abs(), None
-    yield "single losses", (1 - m) * right * left, None
-    yield "single returns", m * (1 - right) * (1 - left), None
+    every = torch.ones_like(r)
+    right = _right(m)
+    left = _right(m, -1)
+    lower = _lower(m)
+    yield "returns", m, every
+    yield "row changes", (m - right).abs(), every
+    yield "column changes", (m - lower).abs(), every
+    yield "single losses", (1 - m) * right * left, every
+    yield "single returns", m * (1 - right) * (1 - left), every
     log_range = torch.log2(r + 1)
     yield "log-range", log_range, m
     for low, high in pairwise(RANGES):
-        yield f"beyond {low} m", ((r > low) & (r <= high)).to(r), None
-
-    step, both = _right(r) - r, m * right
+        yield f"beyond {low} m", ((r > low) & (r <= high)).to(r), every
+    step = _right(r) - r
+    both = m * right
     edge = (step.abs() > EDGE).to(r) * both
     yield "row step", _size(step), both
-    yield "row edges", edge, None
+    yield "row edges", edge, every
     yield "row slant", torch.tanh(step / EDGE), both
     yield "row equal", (step.abs() < SAME).to(r), both
     for far in (8, 64):
         yield f"row step of {far}", _size(_right(r, far) - r), m * _right(m, far)
-    before, three = _right(step, -1), both * left
+    before = _right(step, -1)
+    three = both * left
     yield "row bend", _size(step - before), three
     yield "row bend sign", torch.tanh((step - before) / 0.1), three
     yield "row smooth", _agreement(step, before), three
-
-    down, two = _lower(r) - r, m * lower
+    down = _lower(r) - r
+    two = m * lower
     yield "column step", _size(down), two
-    yield "column edges", (down.abs() > EDGE).to(r) * two, None
+    yield "column edges", (down.abs() > EDGE).to(r) * two, every
     yield "column slant", torch.tanh(down / EDGE), two
-    bend, whole = down - (r - _upper(r)), two * _upper(m)
+    bend = down - _upper(down)
+    whole = two * _upper(m)
     yield "column bend", _size(bend), whole
     yield "column bend sign", torch.tanh(bend / EDGE), whole
     four = both * _lower(both)
     yield "rows agree", _agreement(step, _lower(step)), four
     yield "diagonals", _size(_lower(_right(r)) - r) - _size(_right(r) - _lower(r)), four
-
     if q is None:
         return
     yield "reflectance", q, m
     for low, high in pairwise(REFLECTANCES):
-        yield f"reflectance from {low}", ((q >= low) & (q < high)).to(r) * m, None
+        yield f"reflectance from {low}", ((q >= low) & (q < high)).to(r) * m, every
     step = _right(q) - q
     before = _right(step, -1)
     yield "reflectance row step", _size(step), both
@@ -166,30 +174,33 @@ def _size(x: Tensor) -> Tensor:
 
 
 def _agreement(a: Tensor, b: Tensor) -> Tensor:
-    """2 a b / (a^2 + b^2): 1 for equal steps, -1 for opposite steps, 0 if one is 0 or both are small."""
+    """2 a b / (a^2 + b^2): 1 for equal steps, -1 for opposite ones, 0 if one is 0 or both small."""
     return 2 * a * b / (a * a + b * b + FINE**2)
 
 
 class Handcrafted(Extractor):
-    """Features of range and reflectance: means and spreads of `statistics` in 2 bands of rows, some in 8 sectors.
+    """Features of range and reflectance: means and spreads of `_statistics` in 2 bands of rows.
 
-    Names with `SPREAD` are standard deviations within a band; names with `BEAMS` are means over the band of differences
-    between the means of neighbouring rows, |x(h - 1) - 2 x(h) + x(h + 1)|.
+    Some are means in 8 sectors. Names with `SPREAD` are standard deviations within a band; names
+    with `BEAMS` are means over the band of differences between the means of neighbouring rows,
+    |x(h - 1) - 2 x(h) + x(h + 1)|.
     """
 
     name = "handcrafted"
     layer = f"means over {BANDS} bands of rows and {SECTORS} sectors of azimuth"
     weights = "none"
-    needs_reflectance: ClassVar[bool] = True
+    needs_reflectance = True
     table: Tensor  # centre and spread of every feature, (D, 2)
 
     def __init__(self) -> None:
         super().__init__()
-        self.scales = {name: s for name, s in SCALES.items() if self.needs_reflectance or "reflectance" not in name}
-        cells = [SECTORS if name.endswith(SECTORED) else BANDS for name in self.scales]
-        self.dim = sum(cells)
-        table = torch.tensor([scale for scale, n in zip(self.scales.values(), cells, strict=True) for _ in range(n)])
-        self.register_buffer("table", table, persistent=False)
+        both = self.needs_reflectance
+        self.scales = {name: s for name, s in SCALES.items() if both or "reflectance" not in name}
+        table = []
+        for name, scale in self.scales.items():
+            table += [scale] * (SECTORS if name.endswith(SECTORED) else BANDS)
+        self.dim = len(table)
+        self.register_buffer("table", torch.tensor(table), persistent=False)
 
     @classmethod
     def trained(cls) -> Self:
@@ -197,27 +208,29 @@ class Handcrafted(Extractor):
 
     @torch.no_grad()
     def features(self, scans: Scans) -> Tensor:
-        h, w = scans.sensor.shape
-        parts = scans.images.split(max(PIXELS // (h * w), 1))
-        return nan_where_empty(torch.cat([self._features(part) for part in parts]), scans)
+        # One by one, for a core's cache.
+        parts = [self._features(image) for image in scans.images.split(1)]
+        return scans.nan_where_empty(torch.cat(parts))
 
     def _features(self, images: Tensor) -> Tensor:
         h, w = images.shape[2:]
-        every = torch.ones_like(images[:, 0])
-        features: dict[str, tuple[Tensor, Tensor]] = {}
-        for name, x, where in statistics(images[:, 0], images[:, 1] if self.needs_reflectance else None):
-            where = every if where is None else where
-            masked, in_rows, in_columns = x * where, where.sum(-1), where.sum(-2)
-            in_row = masked.sum(-1)
-            features[name] = mean, share = _cells(in_row, in_rows, BANDS, w)
+        found: dict[str, tuple[Tensor, Tensor]] = {}
+        q = images[:, 1] if self.needs_reflectance else None
+        for name, x, where in _statistics(images[:, 0], q):
+            masked = x * where
+            sums = masked.sum(-1)
+            counts = where.sum(-1)
+            mean, share = _cells(sums, counts, BANDS, w)
+            found[name] = mean, share
             if name + SPREAD in self.scales:
-                square, _ = _cells(torch.linalg.vecdot(masked, x), in_rows, BANDS, w)
-                features[name + SPREAD] = (square - mean**2).clamp(min=0).sqrt(), share
+                square, _ = _cells(torch.linalg.vecdot(masked, x), counts, BANDS, w)
+                found[name + SPREAD] = (square - mean**2).clamp(min=0).sqrt(), share
             if name + BEAMS in self.scales:
-                features[name + BEAMS] = _unevenness(in_row, in_rows)
+                found[name + BEAMS] = _unevenness(sums, counts)
             if name + SECTORED in self.scales:
-                features[name + SECTORED] = _cells(masked.sum(-2), in_columns, SECTORS, h)
-        values, shares = (torch.cat([features[name][k] for name in self.scales], 1) for k in (0, 1))
+                found[name + SECTORED] = _cells(masked.sum(-2), where.sum(-2), SECTORS, h)
+        values = torch.cat([found[name][0] for name in self.scales], 1)
+        shares = torch.cat([found[name][1] for name in self.scales], 1)
         centre, spread = self.table.T
         x = (values - centre) / spread * (shares / (shares + FEW))
         return FAR_OUT * torch.asinh(x / FAR_OUT)
@@ -231,14 +244,18 @@ class HandcraftedRange(Handcrafted):
 
 
 def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> tuple[Tensor, Tensor]:
-    """Means over equal parts of rows or columns, (B, cells), from sums and counts, (B, n), and the shares counted."""
+    """Means over equal parts of rows or columns, (B, cells), and the shares counted.
+
+    From sums and counts, (B, n).
+    """
     n = F.adaptive_avg_pool1d(count, cells)
     return F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays
 
 
 def _unevenness(total: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-    """|x(h - 1) - 2 x(h) + x(h + 1)| of row means x, as in `_cells`, over rows where all three exist."""
-    mean, valid = total / count.clamp(min=1), (count > 0).to(total)
-    defined = F.pad(valid[:, 2:] * valid[:, 1:-1] * valid[:, :-2], (1, 1))
+    """|x(h - 1) - 2 x(h) + x(h + 1)| of row means x, as in `_cells`, where all three exist."""
+    mean = total / count.clamp(min=1)
+    valid = (count > 0).to(total)
+    defined = (F.avg_pool1d(valid, 3, 1, 1) == 1).to(total)
     difference = F.pad((mean[:, 2:] - 2 * mean[:, 1:-1] + mean[:, :-2]).abs(), (1, 1))
     return _cells(difference * defined, defined, BANDS, 1)

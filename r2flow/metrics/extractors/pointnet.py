@@ -1,15 +1,15 @@
-"""PointNet (Qi et al., CVPR 2017), the feature network of FPD, trained on 16 classes of ShapeNet."""
+"""PointNet (Qi et al., CVPR 2017), the network of FPD, trained on 16 classes of ShapeNet."""
 
 import torch
 from torch import Tensor, nn
 
-from r2flow.metrics.extractors.base import Extractor, nan_where_empty
+from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
 
 CHUNK = 16384  # points per pass: 1024 channels of them take 64 MiB
 
 
-class Points(nn.Module):
+class _PointMaximum(nn.Module):
     """Three layers per point, then the maximum over points: (B, 3, N) -> (B, 1024)."""
 
     def __init__(self) -> None:
@@ -21,17 +21,16 @@ class Points(nn.Module):
         self.bn2 = nn.BatchNorm1d(128)
         self.bn3 = nn.BatchNorm1d(1024)
 
-    def largest(self, points: Tensor) -> Tensor:
-        chunks = points.split(max(CHUNK // len(points), 1), dim=2)
-        return torch.stack([self.each(chunk).amax(2) for chunk in chunks]).amax(0)
+    def forward(self, points: Tensor) -> Tensor:
+        maxima = []
+        for chunk in points.split(max(CHUNK // len(points), 1), dim=2):
+            x = torch.relu(self.bn1(self.conv1(chunk)))
+            x = torch.relu(self.bn2(self.conv2(x)))
+            maxima.append(self.bn3(self.conv3(x)).amax(2))
+        return torch.stack(maxima).amax(0)
 
-    def each(self, points: Tensor) -> Tensor:
-        x = torch.relu(self.bn1(self.conv1(points)))
-        x = torch.relu(self.bn2(self.conv2(x)))
-        return self.bn3(self.conv3(x))
 
-
-class Transform(Points):
+class _Transform(_PointMaximum):
     """The matrix that transforms the input points: (B, 3, N) -> (B, 3, 3)."""
 
     def __init__(self) -> None:
@@ -43,24 +42,27 @@ class Transform(Points):
         self.bn5 = nn.BatchNorm1d(256)
 
     def forward(self, points: Tensor) -> Tensor:
-        x = torch.relu(self.bn4(self.fc1(torch.relu(self.largest(points)))))
+        x = torch.relu(self.bn4(self.fc1(torch.relu(super().forward(points)))))
         x = torch.relu(self.bn5(self.fc2(x)))
-        return self.fc3(x).view(-1, 3, 3) + torch.eye(3, device=x.device, dtype=x.dtype)
+        return self.fc3(x).view(-1, 3, 3) + torch.eye(3).to(x)
 
 
-class Cloud(Points):
+class _Cloud(_PointMaximum):
     """Global feature of a cloud, (B, 3, N) -> (B, 1024)."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.stn = Transform()
+        self.stn = _Transform()
 
     def forward(self, points: Tensor) -> Tensor:
-        return self.largest(self.stn(points).transpose(1, 2) @ points)
+        return super().forward(self.stn(points).mT @ points)
 
 
 class PointNet(Extractor):
-    """FPD's network; features are the global feature and the outputs of three layers of a classifier of k classes."""
+    """FPD's network; features are the global feature and the outputs of a classifier's layers.
+
+    The classifier has three layers and k classes.
+    """
 
     name = "pointnet"
     layer = "global feature and the classifier's three layers, 1024 + 512 + 256 + 16"
@@ -68,7 +70,7 @@ class PointNet(Extractor):
     def __init__(self, k: int = 16) -> None:
         super().__init__()
         self.dim = 1024 + 512 + 256 + k
-        self.feat = Cloud()
+        self.feat = _Cloud()
         self.fc1 = nn.Linear(1024, 512)
         self.fc2 = nn.Linear(512, 256)
         self.fc3 = nn.Linear(256, k)
@@ -84,8 +86,9 @@ class PointNet(Extractor):
 
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
-        """As published, each pixel is a point, and rays without a return are points at the origin.
+        """As published, each pixel is a point, and rays without a return are at the origin.
 
-        Features are maxima over points, so the number of points at the origin does not matter.
+        Features are maxima over points, so the number of points at the origin does not matter. The
+        unit is 80 m for every sensor.
         """
-        return nan_where_empty(self(scans.xyz.flatten(2).to(self.device) / 80.0), scans)  # for every sensor
+        return scans.nan_where_empty(self(scans.xyz.flatten(2).to(self.device) / 80.0))

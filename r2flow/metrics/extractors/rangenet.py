@@ -1,28 +1,28 @@
-"""RangeNet++ (Milioto et al., IROS 2019) as a feature network: FRD's RangeNet-53 and FRID's RangeNet-21.
+"""RangeNet++ (Milioto et al., IROS 2019): FRD's RangeNet-53 and FRID's RangeNet-21.
 
-Darknet on range images: a U-Net with additive skips that halves the width five times and keeps the height. Parameters
-are named as in the evaluation of the generative papers, `stem.0.weight` ... `head.1.bias`; names of the original
-release (`conv1.weight`, `enc1.residual_0.bn2.bias` ...) are translated.
+Darknet on range images: a U-Net with additive skips that halves the width five times and keeps the
+height. Parameters are named as in the evaluation of the generative papers, `stem.0.weight` ...
+`head.1.bias`; names of the original release (`conv1.weight`, `enc1.residual_0.bn2.bias` ...) are
+translated.
 """
 
-import math
 import random
 import re
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.metrics.extractors.base import Extractor, nan_where_empty
+from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
 
-BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}  # number of layers -> residual blocks per level
-BANDS = 16
+WIDTHS = (32, 64, 128, 256, 512, 1024)
 
-# Statistics of SemanticKITTI, the training set of the published networks: range, x, y, z in metres, reflectance.
+# Statistics of SemanticKITTI, the training set of the published networks: range, x, y, z in metres,
+# reflectance.
 MEAN = (12.12, 10.88, 0.23, -1.04, 0.21)
 STD = (12.32, 11.47, 6.91, 0.86, 0.16)
 
@@ -31,7 +31,7 @@ def _convolution(convolution: nn.Module, channels: int) -> nn.Sequential:
     return nn.Sequential(convolution, nn.BatchNorm2d(channels), nn.LeakyReLU(0.1))
 
 
-class Residual(nn.Module):
+class _Residual(nn.Module):
     """x + f(x) with a bottleneck f."""
 
     def __init__(self, channels: int, inner: int) -> None:
@@ -45,7 +45,7 @@ class Residual(nn.Module):
         return x + self.residual(x)
 
 
-class Level(nn.Module):
+class _Level(nn.Module):
     """A convolution that halves or doubles the number of columns, then residual blocks."""
 
     def __init__(self, channels: int, out: int, blocks: int) -> None:
@@ -56,43 +56,41 @@ class Level(nn.Module):
         else:
             change = nn.ConvTranspose2d(channels, out, (1, 4), stride=(1, 2), padding=(0, 1))
         self.conv = _convolution(change, out)
-        self.residual_blocks = nn.ModuleList(Residual(out, channels) for _ in range(blocks))
+        self.residual_blocks = nn.Sequential(*(_Residual(out, channels) for _ in range(blocks)))
 
     def forward(self, x: Tensor) -> Tensor:
-        x = self.conv(x)
-        for block in self.residual_blocks:
-            x = block(x)
-        return x
+        return self.residual_blocks(self.conv(x))
 
 
 class RangeNet(Extractor):
     """RangeNet of 21 or 53 layers on range, x, y, z and optionally reflectance.
 
-    Features precede the segmentation head of `num_classes` (None: no head). Of the channels' statistics `mean` and
-    `std`, further values are ignored.
+    Features precede the segmentation head of `num_classes` (0: no head).
     """
 
-    layers: ClassVar[int]
+    blocks: tuple[int, ...]  #: residual blocks per level
+    bands = 1  #: the height must be a multiple of it
     mean: Tensor
     std: Tensor
 
-    def __init__(
-        self, num_classes: int | None = 20, mean: tuple[float, ...] = MEAN, std: tuple[float, ...] = STD
-    ) -> None:
+    def __init__(self, num_classes: int = 20) -> None:
         super().__init__()
-        channels, blocks = 4 + self.needs_reflectance, BLOCKS[self.layers]
-        widths = [32 << level for level in range(6)]
-        self.stem = _convolution(nn.Conv2d(channels, widths[0], 3, padding=1, bias=False), widths[0])
+        channels = 4 + self.needs_reflectance
+        stem = nn.Conv2d(channels, WIDTHS[0], 3, padding=1, bias=False)
+        self.stem = _convolution(stem, WIDTHS[0])
         for level in range(1, 6):
-            self.add_module(f"enc{level}", Level(widths[level - 1], widths[level], blocks[level - 1]))
+            down = _Level(WIDTHS[level - 1], WIDTHS[level], self.blocks[level - 1])
+            self.add_module(f"enc{level}", down)
         for level in range(5, 0, -1):
-            self.add_module(f"dec{level}", Level(widths[level], widths[level - 1], 1))
-        self.head = (
-            nn.Sequential(nn.Identity(), nn.Conv2d(widths[0], num_classes, 3, padding=1)) if num_classes else None
-        )
+            self.add_module(f"dec{level}", _Level(WIDTHS[level], WIDTHS[level - 1], 1))
+        self.head = None
+        if num_classes:
+            classifier = nn.Conv2d(WIDTHS[0], num_classes, 3, padding=1)
+            self.head = nn.Sequential(nn.Identity(), classifier)
         # Not persistent, since the published files hold only parameters.
-        self.register_buffer("mean", torch.tensor(mean[:channels]).view(-1, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(std[:channels]).view(-1, 1, 1), persistent=False)
+        statistics = torch.tensor([MEAN, STD])[:, :channels, None, None]
+        self.register_buffer("mean", statistics[0], persistent=False)
+        self.register_buffer("std", statistics[1], persistent=False)
 
     def normalise(self, image: Tensor) -> Tensor:
         """(image - mean) / std at pixels with a return, else 0; (B, 4 or 5, H, W), range first."""
@@ -111,32 +109,33 @@ class RangeNet(Extractor):
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
         h, w = scans.sensor.shape
-        if w % 32 or (self.layers == 21 and h % BANDS):
-            raise InputError(f"RangeNet needs images of multiples of {BANDS} x 32, found {h} x {w}; choose a --size.")
+        if w % 32 or h % self.bands:
+            raise InputError(
+                f"{self.name} needs images of multiples of {self.bands} x 32, found {h} x {w}; "
+                "choose a --size."
+            )
         reflectance = scans.images[:, 1 : 1 + self.needs_reflectance]
         image = torch.cat([scans.images[:, :1], scans.xyz, reflectance], 1).to(self.device)
-        return nan_where_empty(self.pool(self(self.normalise(image))), scans)
+        return scans.nan_where_empty(self.pool(self(self.normalise(image))))
 
     @abstractmethod
     def pool(self, maps: Tensor) -> Tensor:
         """Map decoder maps (B, C, H, W) to features (B, D)."""
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
         tensors = {translate(name): tensor for name, tensor in tensors.items()}
-        head = tensors.get("head.1.bias")
-        mean, std = _normalisation(config, 4 + cls.needs_reflectance) if config else (MEAN, STD)
-        return cls(num_classes=None if head is None else len(head), mean=mean, std=std).filled(tensors)
+        return cls(len(tensors.get("head.1.bias", ()))).filled(tensors)
 
 
 class RangeNet53(RangeNet):
-    """FRD's network on range and reflectance; features are a fixed random choice of 4096 values of the decoder map."""
+    """FRD's network on range and reflectance; features are a fixed random choice of 4096 values."""
 
     name = "rangenet53"
     layer = "decoder map, 4096 of its values by a fixed draw"
     dim = 4096
     needs_reflectance = True
-    layers = 53
+    blocks = (1, 2, 8, 8, 4)
 
     def pool(self, maps: Tensor) -> Tensor:
         flat = maps.flatten(1)
@@ -146,30 +145,24 @@ class RangeNet53(RangeNet):
 
 
 class RangeNet21(RangeNet):
-    """FRID's network on range; features are means of the decoder map over 16 bands of rows (published as "depth")."""
+    """FRID's network on range; features are means of the decoder map over 16 bands of rows.
+
+    They were published as "depth".
+    """
 
     name = "rangenet21"
     layer = "decoder map, mean over 16 bands of rows"
     dim = 512
-    layers = 21
+    blocks = (1, 1, 2, 2, 1)
+    bands = 16
 
     def pool(self, maps: Tensor) -> Tensor:
-        return maps.unflatten(2, (BANDS, -1)).mean((3, 4)).flatten(1)
+        return maps.unflatten(2, (self.bands, -1)).mean((3, 4)).flatten(1)
 
 
-def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    try:
-        sensor = config["dataset"]["sensor"]
-        mean, std = (tuple(float(value) for value in sensor[key])[:channels] for key in ("img_means", "img_stds"))
-    except (KeyError, TypeError, ValueError):
-        mean = std = ()
-    if len(mean) < channels or len(std) < channels or not all(map(math.isfinite, mean + std)) or min(std) <= 0:
-        raise InputError(f"arch_cfg.yaml must have {channels} finite img_means and img_stds under dataset: sensor.")
-    return mean, std
-
-
-# Substitutions from names of the original release, applied in order. The head's file uses the bare name "1.weight".
-NAMES = [(re.compile(pattern), replacement) for pattern, replacement in (
+# Substitutions from names of the original release, applied in order. The head's file uses the bare
+# name "1.weight".
+NAMES = (
     (r"^(backbone|decoder)\.", ""),
     (r"^1\.", "head.1."),
     (r"^conv1\.", "stem.0."),
@@ -178,13 +171,15 @@ NAMES = [(re.compile(pattern), replacement) for pattern, replacement in (
     (r"^((?:enc|dec)\d)\.bn\.", r"\1.conv.1."),
     (r"^(dec\d)\.residual\.", r"\1.residual_0."),
     (r"\.residual_(\d+)\.", r".residual_blocks.\1."),
-    (r"(\.residual_blocks\.\d+)\.(conv|bn)(\d)\.",
-     lambda m: f"{m[1]}.residual.{int(m[3]) - 1}.{'0' if m[2] == 'conv' else '1'}."),
-)]  # fmt: skip
+    (r"(\.residual_blocks\.\d+)\.conv1\.", r"\1.residual.0.0."),
+    (r"(\.residual_blocks\.\d+)\.bn1\.", r"\1.residual.0.1."),
+    (r"(\.residual_blocks\.\d+)\.conv2\.", r"\1.residual.1.0."),
+    (r"(\.residual_blocks\.\d+)\.bn2\.", r"\1.residual.1.1."),
+)
 
 
 def translate(name: str) -> str:
     """Translate a parameter name of the original release; keep names of r2flow."""
     for pattern, replacement in NAMES:
-        name = pattern.sub(replacement, name)
+        name = re.sub(pattern, replacement, name)
     return name
