@@ -14,7 +14,7 @@ from torch import nn
 import r2flow
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import sampled_set
-from r2flow.generators import Generated, Generator, Sampler, build_generator
+from r2flow.generators import Generator, Sampler, build_generator
 from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.region import region
@@ -299,13 +299,6 @@ def test_the_network_is_computed_in_the_precision_that_is_asked_for():
     with torch.autocast("cpu", torch.bfloat16):  # of the caller
         assert torch.equal(next(sample(one, 2, steps=3)).images, exact)
     assert sampled_set(one, "", 2).about != sampled_set(network(), "", 2).about
-
-
-@pytest.mark.parametrize("shape", [(1, 2, 8, 16), (2, 1, 8, 16), (2, 2, 4, 16), None])
-def test_a_sampler_that_gives_other_than_a_scan_for_each_noise_is_refused(shape):
-    generator, made = flow().generator, shape and Generated.after(torch.zeros(shape), 1)
-    with pytest.raises(InputError, match="must give a Generated of 2 scans"):
-        generator(torch.zeros(2, *generator.noise_shape), sampler=mock.MagicMock(draws=False, return_value=made))
 
 
 def test_a_samplers_name_may_have_fields_as_on_the_command_line():

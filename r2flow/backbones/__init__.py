@@ -10,7 +10,7 @@ from r2flow.backbones.base import Backbone
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.registry import Registry, presets
 
@@ -41,21 +41,24 @@ BACKBONES = _Backbones("backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=E
 
 
 def build_backbone(
-    options: Mapping[str, Any],
+    options: Mapping[str, Any] | None,
     rays: Tensor,
     in_channels: int,
     out_channels: int | None = None,
     second_time: bool = False,
 ) -> Backbone:
-    """Build the backbone `options["name"]`, as in conf/backbone, along rays (elevation, azimuth) in radians, (2, H, W).
+    """Build the backbone `options["name"]`, as in conf/backbone.
 
-    `in_channels` includes the channels of a condition; `out_channels` None means as many.
+    Args:
+        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
+        in_channels: Channels of the image and of a condition.
+        out_channels: None means as many.
     """
-    check(options is not None, "stage.parent names a run without a backbone: leave it out, or name a flow.")
-    wanted = {"in_channels": in_channels, "out_channels": out_channels, "second_time": second_time or None}
-    given = {name: value for name, value in wanted.items() if value is not None}  # a plug-in may not know the others
-    built = BACKBONES.build(options, rays, **given)
-    check(any(True for _ in built.parameters()), f"a {type(built).__name__} has no weights to learn.")
+    if options is None:
+        raise InputError("stage.parent names a run without a backbone: leave it out, or name a flow.")
+    channels = {"in_channels": in_channels, "out_channels": out_channels or in_channels}
+    times = {"second_time": True} if second_time else {}  # a plug-in may have one time only
+    built = BACKBONES.build(options, rays, **channels, **times)
     return built
 
 

@@ -2,35 +2,39 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.registry import Positive
 
 
 class Backbone(ExactBuffers):
     """A field v(t, x) on images, or the mean velocity u(x, t, s) of a flow from time t to time s.
 
-    X_{t->s}(x) = x + (s - t) u(x, t, s), and u(x, t, t) = v(t, x) (Geng et al. 2025, "Mean flows for one-step
-    generative modeling", with the sign of s - t).
+    X_{t->s}(x) = x + (s - t) u(x, t, s), and u(x, t, t) = v(t, x) (Geng et al. 2025, "Mean flows
+    for one-step generative modeling", with the sign of s - t).
 
-    A subclass implements `velocity` and passes the options below on as `**common`; layers with times as input are
-    `ExactLinear`, since times stay float32. A class declares its capabilities:
+    A subclass implements `velocity` and passes the options below on as `**common`; layers with
+    times as input are `ExactLinear`, since times stay float32. A class declares its capabilities:
 
     - unit: The rows and columns of the image, and of each part of it, are multiples of the unit.
-    - follow_rays: Computes unsaved buffers from `coords`; called by the constructor and whenever `coords` is loaded.
-    - takes_second_time: The class supports `second_time=True`: it then has an `interval_embedding` of s - t, created
-      after all other layers, whose last layer is zero, and `velocity` takes s (see `condition`).
-    - croppable: It can be evaluated on a part of its image. A layer's `open_ring` ends its wrapping of columns.
+    - follow_rays: Computes unsaved buffers from `coords`; called by the constructor and whenever
+      `coords` is loaded.
+    - takes_second_time: The class supports `second_time=True`: it then has an `interval_embedding`
+      of s - t, created after all other layers, whose last layer is zero, and `velocity` takes s
+      (see `condition`).
+    - croppable: It can be evaluated on a part of its image. A layer's `open_ring` ends its wrapping
+      of columns.
     - any_size: It takes images of any number of rows and columns.
-    - learns_directions: It learns a vector per direction, so that scans must not be rotated in training.
+    - learns_directions: It learns a vector per direction: scans must not be rotated in training.
 
-    Its modules may have a method `macs` (`r2flow.reports.backbones.count_macs`). `model.compile(dynamic=True)` compiles
-    it to a graph without breaks for batches of two or more images, and another for single images.
+    Its modules may have a method `macs` (`r2flow.reports.backbones.count_macs`).
+    `model.compile(dynamic=True)` compiles it to a graph without breaks for batches of two or more
+    images, and another for single images.
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
@@ -40,10 +44,10 @@ class Backbone(ExactBuffers):
         data_std: Standard deviation of the data, for `precondition`; None: the network is v itself.
     """
 
-    takes_second_time: ClassVar[bool] = False
-    croppable: ClassVar[bool] = False
-    any_size: ClassVar[bool] = False
-    learns_directions: ClassVar[bool] = False
+    takes_second_time = False
+    croppable = False
+    any_size = False
+    learns_directions = False
     coords: Tensor
     interval_embedding: nn.Module
 
@@ -58,51 +62,62 @@ class Backbone(ExactBuffers):
         data_std: Positive | None = None,
     ) -> None:
         super().__init__()
-        self.unit, self.second_time, self.data_std = unit, second_time, data_std
-        self.in_channels, self.out_channels = in_channels, in_channels if out_channels is None else out_channels
-        self._check(rays)
-        # on the parameters' device: torch 2.6's `get_default_device` does not see `with torch.device(...)`
-        device = torch.empty(0).device if rays.device.type == "cpu" else rays.device
-        self.register_buffer("coords", rays[None].to(device, torch.float32, copy=True))
+        self.unit = unit
+        self.second_time = second_time
+        self.data_std = data_std
+        self.in_channels = in_channels
+        self.out_channels = out_channels or in_channels
+        name = type(self).__name__
+        if second_time and not self.takes_second_time:
+            raise InputError(
+                f"{name} takes no second time: choose a backbone that does, such as hdit, or "
+                "distill the flow (stage=distill)."
+            )
+        for dimension, size, step in zip(("height", "width"), rays.shape[1:], unit, strict=True):
+            if size % step:
+                raise InputError(
+                    f"{dimension} {size} cannot be used by {name} with these options: it must be a "
+                    f"multiple of {step}, such as {size // step * step + step}."
+                )
+        # torch 2.6's `get_default_device` does not see `with torch.device(...)`
+        self.coords = nn.Buffer(rays[None].to(torch.empty(0).device, torch.float32, copy=True))
         self.register_load_state_dict_post_hook(_follow_loaded_rays)
 
     def forward(self, t: Tensor | float, x: Tensor, s: Tensor | float | None = None) -> Tensor:
-        """v(t, x), or u(x, t, s) for networks with a second time, (B, C', H, W) in the dtype of x.
+        """v(t, x), or u(x, t, s) with a second time, (B, C', H, W) in the dtype of x.
 
-        x, (B, C, H, W), is the image and its condition; times are scalars or (B,), and s None means s = t.
+        x, (B, C, H, W), is the image and its condition; times are scalars or (B,), and s None means
+        s = t.
         """
-        expected = self.in_channels, *(x.shape[2:] if self.any_size else self.coords.shape[2:])
-        if x.shape[1:] != expected:
-            raise InputError(f"this backbone was built for images of {expected}, found {tuple(x.shape[1:])}.")
-        if not x.is_floating_point():  # v would be rounded
-            raise InputError(f"images in model space are floating-point numbers, found {x.dtype}.")
-        assert s is None or self.second_time, "this backbone was built for one time and takes no s"
-        t, s = _times("t", t, x), _times("s", t if s is None else s, x)
+        t = _times(t, x)
+        s = t if s is None else _times(s, x)
         if self.data_std is None:
             return self._velocity(t, x, s).to(x.dtype)
-        image, rest = at_least_float32(x[:, : self.out_channels]), x[:, self.out_channels :]
+        image = at_least_float32(x[:, : self.out_channels])
         into, skip, out = precondition(t, self.data_std)
-        inner = torch.cat([into * image, rest], dim=1) if rest.shape[1] else into * image
+        inner = torch.cat([into * image, x[:, self.out_channels :]], dim=1)
         return (skip * image + out * self._velocity(t, inner, s)).to(x.dtype)
 
     def _velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-        y = x.to(next(self.parameters()).dtype, copy=True)  # copies: a plug-in may edit them in place
-        v = self.velocity(t.clone(), y, s.clone()) if self.second_time else self.velocity(t.clone(), y)
-        expected = x.shape[0], self.out_channels, *x.shape[2:]
-        found = tuple(v.shape) if isinstance(v, Tensor) else type(v).__name__
-        if found != expected:  # one channel or one image would broadcast in the loss
-            raise InputError(f"a {type(self).__name__} must give images of {expected}, found {found}.")
+        y = x.to(next(self.parameters()).dtype)
+        v = self.velocity(t, y, s) if self.second_time else self.velocity(t, y)
+        expected = (len(x), self.out_channels, *x.shape[2:])
+        if v.shape != expected:  # one channel or one image would broadcast in the loss
+            raise InputError(
+                f"a {type(self).__name__} must give images of {expected}, found {tuple(v.shape)}."
+            )
         return v
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better.
 
-        Only networks with a second time get s, of the same shape and dtype.
+        Only networks with a second time get s, of the same dtype, (B,) or (1,).
         """
         raise NotImplementedError
 
     def condition(self, time_embedding: nn.Module, t: Tensor, s: Tensor | None) -> Tensor:
-        """The condition time_embedding(t) + e(s - t) - e(0), (B or 1, K), with the `interval_embedding` e.
+        """The condition time_embedding(t) + e(s - t) - e(0), (B or 1, K), by `interval_embedding`
+        e.
 
         The difference is zero at initialisation, and always for s = t: u(x, t, t) = v(t, x).
         """
@@ -112,48 +127,28 @@ class Backbone(ExactBuffers):
         e = self.interval_embedding(torch.cat([s - t, (s - t)[:1] * 0]))
         return c + (e[:-1] - e[-1:])
 
-    def second_time_names(self) -> frozenset[str]:
-        """Entries of the state_dict that networks with one time do not have."""
-        return frozenset(name for name in self.state_dict() if name.startswith("interval_embedding."))
-
     def follow_rays(self) -> None:
         """Recompute buffers that derive from `coords`."""
 
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
-        """The backbone for a part of its image, (B, C, len(rows), len(columns)), with shared parameters.
+        """The backbone for a part of its image, (B, C, len(rows), len(columns)); it shares weights.
 
-        Rows and columns are neighbours, ascending; columns may wrap around the ring. The part ignores the rest of the
-        image and does not wrap a cropped turn, so that its field differs, mostly near the edges of the crop.
+        Rows and columns are neighbours, ascending, in whole units; columns may wrap around the
+        ring. The part ignores the rest of the image and does not wrap a cropped turn, so that its
+        field differs, mostly near the edges of the crop.
         """
-        check(self.croppable, f"a {type(self).__name__} cannot be evaluated on a part of its image: ask for all of it.")
-        for what, numbers, unit in zip(("rows", "columns"), (rows, columns), self.unit, strict=True):
-            assert len(numbers) % unit == int(numbers[0]) % unit == 0, f"{what} must be whole units of {unit}"
+        if not self.croppable:
+            raise InputError(
+                f"a {type(self).__name__} cannot be evaluated on a part of its image: ask for all."
+            )
         part = copy.deepcopy(self, {id(parameter): parameter for parameter in self.parameters()})
-        rows, columns = rows.to(self.coords.device), columns.to(self.coords.device)
-        part.coords = self.coords.index_select(-2, rows).index_select(-1, columns)
+        part.coords = self.coords[:, :, rows][..., columns]
         if len(columns) < self.coords.shape[-1]:
             for module in part.modules():
-                getattr(module, "open_ring", lambda: None)()
+                if hasattr(module, "open_ring"):
+                    module.open_ring()  # type: ignore[operator]
         part.follow_rays()
         return part
-
-    def _check(self, rays: Tensor) -> None:
-        assert (rays.ndim, len(rays)) == (3, 2), f"rays are elevation and azimuth, (2, H, W); not {tuple(rays.shape)}"
-        assert min(self.in_channels, self.out_channels) > 0
-        name = type(self).__name__
-        if self.second_time and not self.takes_second_time:
-            raise InputError(
-                f"{name} takes no second time: choose a backbone that does, such as hdit; without one, a "
-                "flow is straightened and distilled (stage=reflow, stage=distill), but has no flow map."
-            )
-        for dimension, size, unit in zip(("height", "width"), rays.shape[1:], self.unit, strict=True):
-            if size % unit or size == 0:
-                below = size // unit * unit
-                nearest = ", ".join(str(n) for n in (below, below + unit) if n > 0)
-                raise InputError(
-                    f"{dimension} {size} cannot be used by {name} with these options: it must be a multiple of {unit}; "
-                    f"nearest: {nearest}."
-                )
 
 
 def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -161,10 +156,11 @@ def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:
 
         v(t, x) = skip(t) x + out(t) F(t, into(t) x)
 
-    For x_1 ~ N(0, s^2) and x_t = t x_1 + (1 - t) x_0, of variance V = t^2 s^2 + (1 - t)^2, the best linear estimate is
-    E[v | x_t] = skip x_t with skip = (t s^2 - (1 - t)) / V, and its residual variance out^2 = Var[v | x_t] = s^2 / V.
-    With into = V^(-1/2), input and output of F have unit variance at every t (Karras et al. 2022, "Elucidating the
-    design space of diffusion-based generative models", table 1, for the straight path). At t = 0 F need not copy noise.
+    For x_1 ~ N(0, s^2) and x_t = t x_1 + (1 - t) x_0, of variance V = t^2 s^2 + (1 - t)^2, the best
+    linear estimate is E[v | x_t] = skip x_t with skip = (t s^2 - (1 - t)) / V, and its residual
+    variance out^2 = Var[v | x_t] = s^2 / V. With into = V^(-1/2), input and output of F have unit
+    variance at every t (Karras et al. 2022, "Elucidating the design space of diffusion-based
+    generative models", table 1, for the straight path). At t = 0 F need not copy noise.
 
     t is (B,) or (1,), and s is data_std; into, skip and out are (B or 1, 1, 1, 1) each.
     """
@@ -178,16 +174,19 @@ def _follow_loaded_rays(backbone: Backbone, _keys: Any) -> None:
     backbone.follow_rays()
 
 
-def _times(name: str, times: Tensor | float, x: Tensor) -> Tensor:
-    times = torch.as_tensor(times, device=x.device)
-    if times.ndim > 1 or times.numel() not in (x.shape[0], 1):  # len(x), or 1 first, would fix an export's batch size
-        raise InputError(f"{name} must be a scalar or of shape ({len(x)},), found {tuple(times.shape)}.")
-    return at_least_float32(times).reshape(-1)
+def _times(times: Tensor | float, x: Tensor) -> Tensor:
+    return at_least_float32(torch.as_tensor(times, device=x.device)).reshape(-1)
 
 
 def integers(name: str, values: int | Sequence[int], count: int) -> tuple[int, ...]:
-    """`count` integers, from a list of this length or from a single integer."""
-    result = (int(values),) * count if isinstance(values, int) else tuple(int(value) for value in values)
-    if len(result) != count or not result or min(result) < 1:
-        raise InputError(f"{name} must be {count or 1} integers of at least 1, found {list(result)}.")
+    """`count` integers, from a list of this length or from a single integer.
+
+    Raises:
+        InputError: If there are none or others than `count`, or one is below 1.
+    """
+    result = (values,) * count if isinstance(values, int) else tuple(map(int, values))
+    if len(result) != count or min(result, default=0) < 1:
+        raise InputError(
+            f"{name} must be {count or 1} integers of at least 1, found {list(result)}."
+        )
     return result

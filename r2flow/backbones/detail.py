@@ -10,9 +10,10 @@ from r2flow.backbones.layers import ExactLinear, RMSNorm, uncast, unshuffle, zer
 class Detail(nn.Module):
     """Residual 3 x 3 convolutions at full resolution, conditioned on the tokens.
 
-    Near t = 1 the velocity is mostly the remaining noise of each pixel. Tokens of p x q pixels are slow to learn it; a
-    convolution learns it in a few hundred steps, as the difference from the neighbours. The output is initially zero.
-    `ends` are the channels of the image and of the output.
+    Near t = 1 the velocity is mostly the remaining noise of each pixel. Tokens of p x q pixels are
+    slow to learn it; a convolution learns it in a few hundred steps, as the difference from the
+    neighbours. The output is initially zero. `ends` are the channels of the image and of the
+    output.
     """
 
     def __init__(
@@ -31,7 +32,10 @@ class Detail(nn.Module):
         self.spread = nn.Linear(token_channels, patch[0] * patch[1] * channels, bias=False)
         self.image = RingConv2d(ends[0], channels, ring)
         self.gain = zero_initialised(ExactLinear(condition_channels, channels, bias=False))
-        self.blocks = nn.ModuleList([DetailBlock(channels, condition_channels, ring) for _ in range(blocks)])
+
+        self.blocks = nn.ModuleList(
+            _DetailBlock(channels, condition_channels, ring) for _ in range(blocks)
+        )
         self.answer = zero_initialised(RingConv2d(channels, ends[1], ring))
 
     def forward(self, x: Tensor, tokens: Tensor, condition: Tensor) -> Tensor:
@@ -44,13 +48,15 @@ class Detail(nn.Module):
         return uncast(self.answer, F.silu(h))
 
 
-class DetailBlock(nn.Module):
+class _DetailBlock(nn.Module):
     """x + conv(silu(conv(silu(x)) (1 + a) + b)), with a and b from the condition."""
 
     def __init__(self, channels: int, condition_channels: int, ring: bool) -> None:
         super().__init__()
         self.first = RingConv2d(channels, channels, ring)
-        self.modulation = zero_initialised(ExactLinear(condition_channels, 2 * channels, bias=False))
+        self.modulation = zero_initialised(
+            ExactLinear(condition_channels, 2 * channels, bias=False)
+        )
         self.second = zero_initialised(RingConv2d(channels, channels, ring))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Efficient U-Net: residual blocks at each resolution, downsampling first and upsampling last (Saharia 2022)."""
+"""Efficient U-Net: residual blocks at each resolution, downsampled first (Saharia et al. 2022)."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -6,10 +6,18 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from r2flow.backbones.convolutions import BlockOptions, Resample, ResidualBlock, RingConv2d, SelfAttention, UNet
+from r2flow.backbones.convolutions import (
+    BlockOptions,
+    Resample,
+    ResidualBlock,
+    RingConv2d,
+    SelfAttention,
+    UNet,
+    projection,
+)
 from r2flow.backbones.layers import zero_initialised
 
-FILTER = (1, 3, 3, 1)
+_FILTER = (1, 3, 3, 1)
 
 
 class EfficientUNet(UNet):
@@ -18,13 +26,20 @@ class EfficientUNet(UNet):
     For the options see `UNet`.
     """
 
-    def build_levels(self, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions) -> None:
-        for level, ((above, width), count) in enumerate(zip(pairwise(widths), counts, strict=True), start=1):
-            deepest = level == self.levels
-            attention = heads if deepest else None
-            self.add_module(f"d_block{level}", Level(above, width, count, options, attention, down=level > 1))
-            channels = width if deepest else 2 * width  # with the skip
-            self.add_module(f"u_block{level}", Level(channels, above, count, options, attention, up=level > 1))
+    def build_levels(
+        self, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
+    ) -> None:
+        for level, (above, width) in enumerate(pairwise(widths), start=1):
+            count = counts[level - 1]
+            channels = 2 * width  # with the skip
+            attention = 0
+            if level == self.levels:
+                channels = width
+                attention = heads
+            down = _Level(above, width, count, options, attention, down=level > 1)
+            up = _Level(channels, above, count, options, attention, up=level > 1)
+            self.add_module(f"d_block{level}", down)
+            self.add_module(f"u_block{level}", up)
         self.out_conv = zero_initialised(RingConv2d(widths[0], self.out_channels, options.ring))
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
@@ -34,14 +49,16 @@ class EfficientUNet(UNet):
         for level in range(1, self.levels + 1):
             h = self.get_submodule(f"d_block{level}")(h, condition)
             skips.append(h)
-        h = self.get_submodule(f"u_block{self.levels}")(skips.pop(), condition)
-        for level in range(self.levels - 1, 0, -1):
-            h = self.get_submodule(f"u_block{level}")(torch.cat([h, skips.pop()], dim=1), condition)
+        h = skips.pop()
+        for level in range(self.levels, 0, -1):
+            h = self.get_submodule(f"u_block{level}")(h, condition)
+            if skips:
+                h = torch.cat([h, skips.pop()], dim=1)
         return self.out_conv(h)
 
 
-class Level(nn.Module):
-    """A level of encoder or decoder: optional downsampling, residual blocks, optional attention and upsampling."""
+class _Level(nn.Module):
+    """A level of encoder or decoder: downsampling, residual blocks, attention and upsampling."""
 
     def __init__(
         self,
@@ -49,23 +66,27 @@ class Level(nn.Module):
         out_channels: int,
         count: int,
         options: BlockOptions,
-        heads: int | None = None,
+        heads: int,
         down: bool = False,
         up: bool = False,
     ) -> None:
         super().__init__()
         self.downsample = nn.Sequential()
         if down:
-            convolve = RingConv2d(channels, out_channels, options.ring)
-            self.downsample = nn.Sequential(convolve, Resample(FILTER, up=False, ring=options.ring))
+            self.downsample.append(RingConv2d(channels, out_channels, options.ring))
+            self.downsample.append(Resample(_FILTER, up=False, ring=options.ring))
             channels = out_channels
-        inputs = [channels, *[out_channels] * (count - 1)]
-        self.residual_blocks = nn.ModuleList([SkippedBlock(width, out_channels, options) for width in inputs])
-        self.self_attn_block = nn.Identity() if heads is None else SelfAttention(out_channels, heads, options)
+        self.residual_blocks = nn.ModuleList()
+        for _ in range(count):
+            self.residual_blocks.append(_Block(channels, out_channels, options))
+            channels = out_channels
+        self.self_attn_block = (
+            SelfAttention(out_channels, heads, options) if heads else nn.Identity()
+        )
         self.upsample = nn.Sequential()
         if up:
-            convolve = RingConv2d(out_channels, out_channels, options.ring)
-            self.upsample = nn.Sequential(Resample(FILTER, up=True, ring=options.ring), convolve)
+            self.upsample.append(Resample(_FILTER, up=True, ring=options.ring))
+            self.upsample.append(RingConv2d(out_channels, out_channels, options.ring))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         x = self.downsample(x)
@@ -74,12 +95,12 @@ class Level(nn.Module):
         return self.upsample(self.self_attn_block(x))
 
 
-class SkippedBlock(ResidualBlock):
+class _Block(ResidualBlock):
     """A residual block with a 1 x 1 convolution as skip if its width changes."""
 
     def __init__(self, channels: int, out_channels: int, options: BlockOptions) -> None:
         super().__init__(channels, out_channels, options)
-        self.skip = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
+        self.skip = projection(channels, out_channels)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         return (self.skip(x) + self.residual(self.norm1(x), condition)) * self.scale

@@ -1,12 +1,12 @@
 """Encodings of ray directions: harmonics of the ray angles, for attention and as inputs.
 
-Rays are elevation e and azimuth a in radians, shape (1, 2, H, W). All computations are in float32 or better.
+Rays are elevation e and azimuth a in radians, (1, 2, H, W). All is computed in float32 or better.
 """
 
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers
 from r2flow.registry import Registry
@@ -15,18 +15,20 @@ from r2flow.registry import Registry
 class Rotary(ExactBuffers):
     """Rotary embedding by ray angles, theta = (e f_h, a f_w), with integer harmonics f.
 
-    For integers, azimuth +pi and -pi are the same rotation (paper, section III-C). N heads of D channels, a multiple of
-    4, take in turn from the frequencies round(exp(linspace(0, ln M, N D / 4))) of an axis, with M its highest harmonic.
+    For integers, azimuth +pi and -pi are the same rotation (paper, section III-C). N heads of D
+    channels, a multiple of 4, take in turn from the frequencies round(exp(linspace(0, ln M, N D /
+    4))) of an axis, with M its highest harmonic.
     """
-
-    freqs_h: Tensor
-    freqs_w: Tensor
 
     def __init__(self, heads: int, head_channels: int, highest: tuple[int, int]) -> None:
         super().__init__()
-        for name, top in zip(("freqs_h", "freqs_w"), highest, strict=True):
+
+        def frequencies(top: int) -> nn.Buffer:
             ladder = torch.linspace(0, math.log(top), heads * head_channels // 4).exp().round()
-            self.register_buffer(name, ladder.view(-1, heads).T.contiguous())
+            return nn.Buffer(ladder.view(-1, heads).T.contiguous())
+
+        self.freqs_h = frequencies(highest[0])
+        self.freqs_w = frequencies(highest[1])
 
     def table(self, rays: Tensor) -> Tensor:
         """cos theta and sin theta, (2, H, W, 1, N, D / 2), for rays (1, 2, H, W)."""
@@ -39,8 +41,8 @@ def rotate(x: Tensor, table: Tensor) -> Tensor:
     """Rotate each pair (x_i, x_{i + D/2}) by theta_i; x (..., N, D), table of `Rotary`."""
     cos, sin = table
     first, second = x.chunk(2, dim=-1)
-    turned = torch.addcmul(first * cos, second, sin, value=-1), torch.addcmul(second * cos, first, sin)
-    return torch.cat(turned, dim=-1)
+    rotated_first = torch.addcmul(first * cos, second, sin, value=-1)
+    return torch.cat([rotated_first, torch.addcmul(second * cos, first, sin)], dim=-1)
 
 
 class RayEncoding(ExactBuffers):
@@ -55,16 +57,12 @@ class RayEncoding(ExactBuffers):
 class FourierFeatures(RayEncoding):
     """sin and cos of 2^k e and 2^k a, for k = 0 .. ceil(log2 n) - 1 on an axis of n pixels."""
 
-    freqs: Tensor
-    phase: Tensor
-
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__(shape)
-        octaves = [math.ceil(math.log2(size)) for size in shape]
-        ladders = [2.0 ** torch.arange(count) for count in octaves]
-        freqs = torch.block_diag(*(ladder[:, None] for ladder in ladders))
-        self.register_buffer("freqs", freqs[:, :, None, None])
-        self.register_buffer("phase", torch.zeros(len(freqs)))  # the published weights have one
+        ladders = (2.0 ** torch.arange(math.ceil(math.log2(size)))[:, None] for size in shape)
+        freqs = torch.block_diag(*ladders)
+        self.freqs = nn.Buffer(freqs[:, :, None, None])
+        self.phase = nn.Buffer(torch.zeros(len(freqs)))  # the published weights have one
         self.channels = 2 * len(freqs)
 
     def forward(self, rays: Tensor) -> Tensor:
@@ -82,40 +80,46 @@ class Polar(RayEncoding):
 
 
 class SphericalHarmonics(RayEncoding):
-    """The 25 real spherical harmonics of degree 0 to 4, ordered by degree l, then order m = -l .. l.
+    """The 25 real spherical harmonics of degree 0 to 4, ordered by degree l, then order m = -l ..
+    l.
 
-    Y_lm = N_lm P_l^|m|(sin e) times sqrt(2) cos(m b), 1 or sqrt(2) sin(|m| b) for m > 0, = 0, < 0, without
-    the Condon-Shortley phase. b = -a: the published models use the opposite sign of azimuth here.
+    Y_lm = N_lm P_l^|m|(sin e) times sqrt(2) cos(m b), 1 or sqrt(2) sin(|m| b) for m > 0, = 0, < 0,
+    without the Condon-Shortley phase. b = -a: the published models use the opposite sign of
+    azimuth.
     """
 
-    degrees = 5
-    channels = degrees**2
+    channels = 25
 
     def forward(self, rays: Tensor) -> Tensor:
-        e, b = rays[:, 0].double(), -rays[:, 1].double()
+        e, a = rays.double().unbind(1)
         harmonics = []
-        legendre = self._legendre(e)
-        for l in range(self.degrees):  # noqa: E741
+        for l in range(5):  # noqa: E741
             for m in range(-l, l + 1):
                 order = abs(m)
-                norm = math.sqrt((2 * l + 1) / (4 * math.pi) / math.perm(l + order, 2 * order))
-                turn = 1.0 if m == 0 else math.sqrt(2) * ((m * b).cos() if m > 0 else (order * b).sin())
-                harmonics.append(norm * legendre[l, order] * turn)
+                scale = (2 * l + 1) / (4 * math.pi) / math.perm(l + order, 2 * order)
+                harmonic = math.sqrt(scale) * _legendre(l, order, e)
+                if m:
+                    phase = -order * a
+                    harmonic = harmonic * math.sqrt(2) * (phase.cos() if m > 0 else phase.sin())
+                harmonics.append(harmonic)
         return torch.stack(harmonics, dim=1).to(rays.dtype)
 
-    def _legendre(self, e: Tensor) -> dict[tuple[int, int], Tensor]:
-        """P_l^m(sin e) for 0 <= m <= l, by recursion in l."""
-        z, table = e.sin(), {}
-        for m in range(self.degrees):
-            previous, current = torch.zeros_like(z), math.prod(range(1, 2 * m, 2)) * e.cos() ** m
-            for l in range(m, self.degrees):  # noqa: E741
-                table[l, m] = current
-                previous, current = current, ((2 * l + 1) * z * current - (l + m) * previous) / (l - m + 1)
-        return table
+
+def _legendre(l: int, m: int, e: Tensor) -> Tensor:  # noqa: E741
+    """P_l^m(sin e) for 0 <= m <= l, by recursion in l."""
+    if l < m:
+        return torch.zeros_like(e)
+    if l == m:
+        return math.prod(range(1, 2 * m, 2)) * e.cos() ** m
+    one_less = (2 * l - 1) * e.sin() * _legendre(l - 1, m, e)
+    return (one_less - (l + m - 1) * _legendre(l - 2, m, e)) / (l - m)
 
 
 ENCODINGS: Registry[type[RayEncoding]] = Registry(
-    "position", fourier_features=FourierFeatures, polar=Polar, spherical_harmonics=SphericalHarmonics
+    "position",
+    fourier_features=FourierFeatures,
+    polar=Polar,
+    spherical_harmonics=SphericalHarmonics,
 )
 
 

@@ -1,4 +1,4 @@
-"""A small convolutional network at full resolution, for tasks that need only a ray's neighbourhood."""
+"""A small convolutional network at full resolution, for tasks that need a ray's neighbours only."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from r2flow.backbones.layers import uncast, wrapped, zero_initialised
 
 
 class Local(Backbone):
-    """Residual 3 x 3 convolutions, dilated along the rows, on images of any number of rows and columns.
+    """Residual 3 x 3 convolutions, dilated along the rows, on images of any size.
 
     Padding is circular in azimuth for `ring`, also of crops in training, else zero.
 
@@ -23,7 +23,8 @@ class Local(Backbone):
         ring: Whether the columns are a full turn.
     """
 
-    croppable = any_size = True
+    croppable = True
+    any_size = True
 
     def __init__(
         self,
@@ -35,15 +36,16 @@ class Local(Backbone):
     ) -> None:
         super().__init__(rays, (1, 1), **common)
         widths = integers("backbone.dilations", dilations, len(dilations))
-        self.ring, self.margin = ring, 2 + 2 * sum(widths)  # radius of the receptive field
+        # Radius of the receptive field.
+        self.margin = 2 + 2 * sum(widths) if ring else 0
         self.time = time_embedding(channels, channels)
         self.image = nn.Conv2d(self.in_channels, channels, 3, padding=1)
-        self.blocks = nn.ModuleList([_Block(channels, width) for width in widths])
+        self.blocks = nn.ModuleList(_Block(channels, width) for width in widths)
         self.answer = zero_initialised(nn.Conv2d(channels, self.out_channels, 3, padding=1))
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         columns = x.shape[3]
-        margin = self.margin if self.ring else 0
+        margin = self.margin
         x = x.contiguous(memory_format=torch.channels_last)  # up to twice as fast on a CPU
         h = uncast(self.image, wrapped(x, margin, margin) if margin else x)
         h = h + self.time(t)[:, :, None, None].to(h.dtype)
@@ -52,16 +54,15 @@ class Local(Backbone):
         return uncast(self.answer, F.silu(h))[..., margin : margin + columns].contiguous()
 
     def open_ring(self) -> None:
-        self.ring = False
+        self.margin = 0
 
 
 class _Block(nn.Module):
     def __init__(self, channels: int, width: int) -> None:
         super().__init__()
-        self.first, self.second = (
-            nn.Conv2d(channels, channels, 3, padding=(1, width), dilation=(1, width)) for _ in range(2)
-        )
-        zero_initialised(self.second)
+        options: Any = {"padding": (1, width), "dilation": (1, width)}
+        self.first = nn.Conv2d(channels, channels, 3, **options)
+        self.second = zero_initialised(nn.Conv2d(channels, channels, 3, **options))
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.second(F.silu(self.first(F.silu(x))))

@@ -5,7 +5,6 @@ from typing import Any
 
 import torch
 
-from r2flow.errors import check
 from r2flow.generators.base import Condition, Generated, Generator, Sampler, condition_of
 from r2flow.generators.flow import USUAL, Flow, FlowMap, RectifiedFlow, as_flow
 from r2flow.generators.transfer import TransferFlow
@@ -13,9 +12,20 @@ from r2flow.lidar.encoding import build_space
 from r2flow.registry import Registry, lazy
 
 __all__ = [
-    "GENERATORS", "USUAL", "Condition", "Flow", "FlowMap", "Generated", "Generator", "RectifiedFlow",
-    "Sampler", "TransferFlow", "as_flow", "build_generator", "condition_of",
-]  # fmt: skip
+    "GENERATORS",
+    "USUAL",
+    "Condition",
+    "Flow",
+    "FlowMap",
+    "Generated",
+    "Generator",
+    "RectifiedFlow",
+    "Sampler",
+    "TransferFlow",
+    "as_flow",
+    "build_generator",
+    "condition_of",
+]
 
 GENERATORS: Registry[type[Generator]] = Registry(
     "generator",
@@ -33,8 +43,11 @@ GENERATORS: Registry[type[Generator]] = Registry(
 
 
 def build_generator(config: Mapping[str, Any]) -> Generator:
-    """Build the generator of a config: keys `sensor`, `encoding`, `backbone`, `generator` (default: rectified flow)."""
-    with torch.device("cpu"):  # geometry needs real values, even if the weights are on the meta device
+    """Build the generator of a config with the keys `sensor`, `encoding`, `backbone`, `generator`.
+
+    Without the last it is a rectified flow.
+    """
+    with torch.device("cpu"):  # geometry needs real values, even for weights on the meta device
         space = build_space(config)
-    check("backbone" in config, "the config has no 'backbone'.")
-    return GENERATORS.build(config.get("generator") or {"name": "rectified_flow"}, space, config["backbone"])
+    options = config.get("generator") or {"name": "rectified_flow"}
+    return GENERATORS.build(options, space, config["backbone"])

@@ -1,4 +1,4 @@
-"""Flows, generators by the ODE dx/dt = v(t, x) from noise at t = 0 to data at t = 1, and flow maps."""
+"""Flows, generators by the ODE dx/dt = v(t, x) from noise at t = 0 to data at t = 1, and maps."""
 
 from collections.abc import Mapping
 from copy import copy
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones import build_backbone
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.solvers import Solution, Velocity, solve
 from r2flow.generators.base import Condition, Generator
@@ -17,7 +17,8 @@ from r2flow.lidar.region import Region
 from r2flow.noise import Draws
 from r2flow.samplers import MMPS, FixedSteps, Jump, ODESampler, Sampler
 
-USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # default of a new flow
+# Default of a new flow.
+USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)
 
 
 class Flow(Generator):
@@ -25,14 +26,22 @@ class Flow(Generator):
 
     # Samplers that complete scans, with their default settings; the first one is the default.
     completers: ClassVar[tuple[Sampler, ...]] = (MMPS(),)
-    singular: ClassVar[bool] = False  # whether v grows without limit towards t = 1
+    singular = False  # whether v grows without limit towards t = 1
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        """v(t, x), (B, C, H, W), at times t of shape () or (B,); a flow map without it is drawn by jumps alone."""
+        """v(t, x), (B, C, H, W), at times t of shape () or (B,).
+
+        A flow map without it is drawn by jumps alone.
+        """
         raise NotImplementedError
 
-    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
-        """u(t, x, s), (B, C, H, W), the mean velocity from t to s, () or (B,); v(t, x) unless it is a flow map."""
+    def mean_velocity(
+        self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None
+    ) -> Tensor:
+        """u(t, x, s), (B, C, H, W), the mean velocity from t to s, () or (B,).
+
+        It is v(t, x), unless the flow is a flow map.
+        """
         return self.velocity(t, x, condition)
 
     def field(self, condition: Condition | None = None) -> Velocity:
@@ -50,12 +59,22 @@ class Flow(Generator):
         condition: Condition | None = None,
         **options: Any,
     ) -> Solution:
-        """Solve the ODE from x at t_0, (B, ...), to t_1, without `finish`; options: `r2flow.flow.solvers.solve`."""
+        """Solve the ODE from x at t_0, (B, ...), to t_1, without `finish`.
+
+        Options: `r2flow.flow.solvers.solve`.
+        """
         how = sampler or self.sampler
         how.check(self)
         if not isinstance(how, ODESampler):
-            raise InputError(f"sampler {how.name} does not follow the flow's paths: give a solver, such as adams3.")
-        return solve(self.field(condition), x.to(self.device), t_0, t_1, **(how.options() | options))
+            raise InputError(
+                f"sampler {how.name} does not follow the flow's paths: give a solver, as adams3."
+            )
+        field = self.field(condition)
+        return solve(field, x.to(self.device), t_0, t_1, **(how.options() | options))
+
+
+_BACKBONE = "backbone."
+_SECOND_TIME = "backbone.interval_embedding."
 
 
 class NetworkFlow(Flow):
@@ -68,46 +87,37 @@ class NetworkFlow(Flow):
     answer: str = "v(t, x)"  # the quantity that the network predicts
     region: Region | None = None  # region of the image that is generated; None: all of it
     condition_channels: int = 0  # additional input channels of the backbone, for a condition
-    second_time: ClassVar[bool] = False  # whether the backbone takes a second time, for flow maps
+    second_time = False  # whether the backbone takes a second time, for flow maps
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space)
         channels = space.shape[0]
-        self.backbone = build_backbone(
-            backbone, space.rays, channels + self.condition_channels, channels, self.second_time
-        )
+        inputs = channels + self.condition_channels
+        self.backbone = build_backbone(backbone, space.rays, inputs, channels, self.second_time)
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
         """Noise of step j, cropped to the region."""
-        noise = draws.step(self.noise_shape, j)
+        noise = super().further_noise(draws, j)
         return noise if self.region is None else self.region.crop(noise)
 
     def start_from(self, parent: Generator) -> None:
         """Copy a flow's weights; layers for a second time are kept and start as a no-op.
 
-        Only the velocity u(x, t, t) of a flow map is copied. Ray coordinates are not copied if the rays differ.
+        Only the velocity u(x, t, t) of a flow map is copied. Ray coordinates are not copied if the
+        rays differ.
         """
-        theirs = getattr(parent, "answer", self.answer)
-        check(theirs == self.answer, f"the parent's network tells {theirs}, and this one learns {self.answer}.")
+        learned = getattr(parent, "answer", self.answer)
+        if learned != self.answer:
+            raise InputError(
+                f"the parent's network tells {learned}, and this one learns {self.answer}."
+            )
         state = self.state_dict()
-        added = parent.backbone.second_time_names() if isinstance(parent, NetworkFlow) else frozenset[str]()
-        inherited = {
-            name: value
-            for name, value in parent.state_dict().items()
-            if name in state or (name.startswith("backbone.") and name.removeprefix("backbone.") not in added)
-        }
-        new = {name: value for name, value in state.items() if not name.startswith("backbone.")}
-        new |= {name: state[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
+        theirs = parent.state_dict()
+        weights = {name: theirs[name] for name in theirs if name in state or not _optional(name)}
+        kept = {name: state[name] for name in state if name not in weights and _optional(name)}
         if not torch.equal(self.space.rays, parent.space.rays):
-            inherited |= {name: value for name, value in state.items() if name.endswith(".coords")}
-            sized = [name for name, value in inherited.items() if name in state and value.shape != state[name].shape]
-            if sized:
-                size, parent_size = ("x".join(map(str, flow.space.shape)) for flow in (self, parent))
-                raise InputError(
-                    f"the parent has weights for images of {parent_size} ('{sized[0]}'), found {size}: leave "
-                    f"sensor out, or give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}."
-                )
-        self._take(parent, {**new, **inherited})
+            kept["backbone.coords"] = self.backbone.coords
+        self._take(parent, weights | kept)
 
     @property
     def unit(self) -> tuple[int, int]:
@@ -127,23 +137,31 @@ class NetworkFlow(Flow):
         return part
 
 
+def _optional(name: str) -> bool:
+    """Whether a parent's weights may lack an entry: all but those of a network of one time."""
+    return name.startswith(_SECOND_TIME) or not name.startswith(_BACKBONE)
+
+
 class RectifiedFlow(NetworkFlow):
     """v(t, x) by a backbone. 1-RF, k-RF and k-TD differ only in training and sampler."""
 
     usual: ClassVar[Sampler] = USUAL
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        assert condition is None
         return self.backbone(t, x)
 
 
 class Conditioned:
-    """v(t, x) or u(t, x, s) of a flow under a condition; `select` takes the condition of some scenes."""
+    """v(t, x) or u(t, x, s) of a flow under a condition.
+
+    `select` takes the condition of some scenes; `precision` is the coarsest type of the weights.
+    """
 
     def __init__(self, flow: Flow, condition: Condition) -> None:
-        self.flow, self.condition = flow, condition
-        kinds = [p.dtype for p in flow.parameters() if p.is_floating_point()] or [torch.float64]  # without weights
-        self.precision = max(kinds, key=lambda kind: torch.finfo(kind).eps)
+        self.flow = flow
+        self.condition = condition
+        kinds = [p.dtype for p in flow.parameters() if p.is_floating_point()]
+        self.precision = max(kinds, key=lambda kind: torch.finfo(kind).eps, default=torch.float64)
 
     def __call__(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         if s is None:
@@ -151,7 +169,8 @@ class Conditioned:
         return self.flow.mean_velocity(t, x, s, self.condition)
 
     def select(self, scenes: Tensor) -> "Conditioned":
-        return Conditioned(self.flow, {name: value[scenes.to(value.device)] for name, value in self.condition.items()})
+        chosen = {name: value[scenes.to(value.device)] for name, value in self.condition.items()}
+        return Conditioned(self.flow, chosen)
 
 
 class FlowMap(RectifiedFlow):
@@ -160,12 +179,14 @@ class FlowMap(RectifiedFlow):
     Samplers: those of `r2flow.samplers.maps`, and a flow's samplers with v(t, x) = u(x, t, t).
     """
 
-    second_time: ClassVar[bool] = True
+    second_time = True
     usual = Jump()
-    goes_on_as = "rectified_flow"  # a velocity loss would leave the jumps to those of the old flow
+    # A velocity loss would leave the jumps to those of the old flow.
+    goes_on_as = "rectified_flow"
 
-    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
-        assert condition is None
+    def mean_velocity(
+        self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None
+    ) -> Tensor:
         return self.backbone(t, x, s)
 
     def map(self, condition: Condition | None = None) -> MeanVelocity:
@@ -179,8 +200,17 @@ def ode_sampler(flow: Flow) -> Sampler:
 
 
 def as_flow(generator: Generator, what: str, distilled: bool = False) -> Flow:
-    """The generator, if it is a flow; one distilled for the times of its steps only if `distilled`."""
+    """The generator, if it is a flow from noise.
+
+    Raises:
+        InputError: If it is none, or if it is distilled for the times of its steps, unless
+            `distilled`.
+    """
     if not isinstance(generator, Flow) or not generator.draws:
-        raise InputError(f"{what} needs the velocity of a flow from noise; a {type(generator).__name__} has none.")
-    check(distilled or not generator.fixed, f"{what} needs all times; this flow is distilled for {generator.sampler}.")
+        raise InputError(
+            f"{what} needs the velocity of a flow from noise; a {type(generator).__name__} has "
+            "none."
+        )
+    if generator.fixed and not distilled:
+        raise InputError(f"{what} needs all times; this flow is distilled for {generator.sampler}.")
     return generator

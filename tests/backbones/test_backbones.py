@@ -9,9 +9,9 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, Plain, image, tiny, untrained
+from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
 
-from r2flow.backbones import BACKBONES, Backbone, build_backbone, configurations
+from r2flow.backbones import build_backbone, configurations
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
 from r2flow.reports.backbones import count_macs
@@ -70,13 +70,6 @@ def test_scalar_and_batched_times_agree(name):
             torch.testing.assert_close(model(t, x), batched, rtol=0, atol=1e-5)
         for part in (slice(1, None), slice(0)):
             torch.testing.assert_close(batched[part], model(0.3, x[part]), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("t", [torch.rand(2), torch.rand(3, 1)])
-def test_times_of_another_shape_are_refused(name, t):
-    with pytest.raises(InputError, match=r"t must be a scalar or of shape \(3,\), found \((2,|3, 1)\)"):
-        tiny(name)(t, image(3))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -139,42 +132,20 @@ def test_forward_leaves_no_trace_in_the_module(name):
         assert all(vars(module)[key] is value for key, value in before[path].items()), path
 
 
-def test_a_plug_in_may_edit_its_time_and_image_in_place(monkeypatch):
-    model, t, x = tiny("plain"), torch.tensor([0.1, 0.7]), image()
-    monkeypatch.setattr(model, "velocity", lambda t, x: x.mul_(t.mul_(2).reshape(-1, 1, 1, 1)))
-    assert torch.equal(model(t, x), 2 * t.reshape(-1, 1, 1, 1) * x)
-
-
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("dimension", [0, 1])
-def test_a_shape_that_is_not_whole_units_names_the_nearest_that_are(name, dimension):
+def test_a_shape_that_is_not_whole_units_names_one_that_is(name, dimension):
     unit, options = untrained(name).unit, tiny_options(name)
     if unit[dimension] == 1:
         pytest.skip("takes any size")
     shape = [3 * unit[0], 3 * unit[1]]
     shape[dimension] -= 1
     what, multiple = ("height", "width")[dimension], unit[dimension]
-    message = rf"{what} {3 * multiple - 1} cannot be used by .* a multiple of {multiple}; nearest: (\d+), (\d+)\."
-    with pytest.raises(InputError, match=message) as error:
+    message = rf"{what} {3 * multiple - 1} cannot be used by .* a multiple of {multiple}, such as {3 * multiple}\."
+    with pytest.raises(InputError, match=message):
         build_backbone(options, torch.zeros(2, *shape), 2)
-    assert f"nearest: {2 * multiple}, {3 * multiple}." in str(error.value)
     shape[dimension] = 2 * multiple
     build_backbone(options, torch.zeros(2, *shape), 2)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_an_image_of_another_shape_is_refused(name):
-    model = tiny(name)
-    with pytest.raises(InputError, match=r"built for images of \(2, 16, 64\), found \(3, 16, 64\)"):
-        model(0.5, torch.randn(1, 3, ROWS, COLUMNS))
-    with pytest.raises(InputError, match="floating-point numbers, found torch.int64"):
-        model(0.5, torch.ones(1, 2, ROWS, COLUMNS, dtype=torch.int64))
-    wide = torch.randn(1, 2, ROWS, 2 * COLUMNS)
-    if model.any_size:
-        assert model(0.5, wide).shape == wide.shape
-    else:
-        with pytest.raises(InputError, match=r"built for images of \(2, 16, 64\), found \(2, 16, 128\)"):
-            model(0.5, wide)
 
 
 POSITIONS = ["fourier_features", "polar", "spherical_harmonics", "none", None]
@@ -227,17 +198,6 @@ def test_configurations_are_what_hydra_composes(config):
 
 def test_a_backbone_without_a_file_is_configured_by_its_defaults():
     assert configurations()["plain"] == {"name": "plain"}
-
-
-def test_a_backbone_without_weights_is_refused(monkeypatch):
-    monkeypatch.setitem(BACKBONES._entries, "bare", Backbone)
-    with pytest.raises(InputError, match="a Backbone has no weights to learn"):
-        build_backbone({"name": "bare"}, torch.zeros(2, ROWS, COLUMNS), 2)
-
-
-def test_a_backbone_may_know_the_channels_of_its_images_alone(monkeypatch):
-    monkeypatch.setitem(BACKBONES._entries, "narrow", lambda rays, in_channels: Plain(rays, in_channels=in_channels))
-    assert build_backbone({"name": "narrow"}, torch.zeros(2, ROWS, COLUMNS), 3).out_channels == 3
 
 
 @pytest.mark.parametrize("config", [path.stem for path in (CONF / "backbone").glob("*.yaml")])

@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from tiny_backbones import image, tiny, untrained
+from tiny_backbones import image, tiny
 
-from r2flow.backbones.hdit import Attention, BlockOptions, Neighbourhood
-from r2flow.errors import InputError
+from r2flow.backbones.transformer import Attention, BlockOptions, Neighbourhood
 from tests.reference import backbone_of, load_case
 
 
@@ -30,7 +29,8 @@ def test_times_and_rays_are_rounded_as_the_references(shared, monkeypatch):  # l
     monkeypatch.setattr("r2flow.backbones.layers.rms_norm", lambda x, scale: F.rms_norm(x, scale.shape, scale, 1e-6))
     torch.testing.assert_close(model.timestep_pe(case["t"]), case["acts"]["timestep_pe"], rtol=0, atol=5e-7)
     for level in range(3):
-        assert torch.equal(model.get_buffer(f"table_{level}"), model._blocks(level)[0].residual_attn.rope.table(rays))
+        block = (model.down_levels[f"level_{level}"] if level < 2 else model.mid_levels)[0]
+        assert torch.equal(model.get_buffer(f"table_{level}"), block.residual_attn.rope.table(rays))
         rays = F.avg_pool2d(rays, 2)
 
 
@@ -59,11 +59,3 @@ def test_autocast_does_not_round_the_image_at_the_ends():
             found = model(t, x)
     assert expected.std() > 0.1
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-
-
-def test_levels_that_rotate_differently_are_refused():
-    model = untrained("hdit")
-    state = model.state_dict()
-    state["up_levels.level_0.0.residual_attn.rope.freqs_w"] += 1
-    with pytest.raises(InputError, match="level 0 differ in their rotary freqs_w"):
-        model.load_state_dict(state)

@@ -12,7 +12,8 @@ from r2flow import noise
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.errors import InputError
 from r2flow.generators import TransferFlow, build_generator, condition_of
-from r2flow.generators.transfer import TOGETHER, Answers, Surroundings, smoothed
+from r2flow.generators.answers import TOGETHER, Answers, smoothed
+from r2flow.generators.surroundings import Surroundings
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.completion import completing

@@ -148,12 +148,12 @@ GARBLED = [
     ("dusty2", garble("model.generator", arch="stylegan"), "KeyError: 'stylegan'"),
     ("dusty2", garble("model.generator.synthesis_kwargs", output_scale=1.0), "output_scale"),
     ("dusty2", garble("dataset", max_depth=1.0), "needs 0 < min_range < max_range"),
-    ("dusty2", garble(OUTPUT, act="os.system"), "ValueError: the activation 'os.system'"),
+    ("dusty2", garble(OUTPUT, act="os.system"), "KeyError: 'os.system'"),
     ("r2dm", garble("data", min_depth=90.0), "found 90.0 and 80.0"),
     ("r2dm", garble("diffusion", timestep_type="discrete"), "only diffusions of range in continuous time"),
     ("r2dm", garble("model", architecture="refinenet"), "no published architecture named 'refinenet'"),
     ("r2dm", garble("diffusion", noise_schedule="sigmoid"), "no log-SNR schedule named 'sigmoid'"),
-    ("lidargen", None, "KeyError: 'sigmas'"),
+    ("lidargen", None, "KeyError: 'network.sigmas'"),
 ]
 
 

@@ -21,10 +21,7 @@ from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import (
-    DISCRETE,
     PREDICTIONS,
-    SCHEDULES,
-    Cosine,
     alpha_sigma,
     forward_step,
     noised,
@@ -32,6 +29,7 @@ from r2flow.systems.diffusion.process import (
     step,
     walk,
 )
+from r2flow.systems.diffusion.schedules import DISCRETE, SCHEDULES, Cosine
 from tests.reference import assert_near, assert_norms, assert_published, backbone_of, load_case
 
 CONFIG: dict[str, Any] = {

@@ -1,8 +1,8 @@
-"""Diffusion models: a network that predicts noise or data, sampled by diffusion steps or as a flow."""
+"""Diffusion models: a network that predicts noise or data, sampled by diffusion or as a flow."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,17 +12,36 @@ from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.registry import Positive, Share
 from r2flow.samplers import MMPS, Repaint
-from r2flow.samplers.base import Call, Condition, Fresh, Generated, Given, Noise, OnGrid, Steps, last_of
-from r2flow.systems.diffusion.process import PREDICTIONS, SCHEDULES, alpha_sigma, for_images, repaint, walk
+from r2flow.samplers.base import (
+    Call,
+    Condition,
+    Fresh,
+    Generated,
+    Given,
+    Noise,
+    OnGrid,
+    Steps,
+    last_of,
+)
+from r2flow.systems.diffusion.process import (
+    PREDICTIONS,
+    alpha_sigma,
+    for_images,
+    repaint,
+    walk,
+)
+from r2flow.systems.diffusion.schedules import SCHEDULES
 
 
 class Diffusion(NetworkFlow):
-    """y(z_t, lambda_t) by a backbone with the log-SNR lambda as time, as in R2DM (Nakashima and Kurazume 2024).
+    """y(z_t, lambda_t) by a backbone with the log-SNR lambda as time, as in R2DM.
 
-    Samplers: `DDPM`, `DDIM` and those of flows; `Repaint` completes scans by ancestral steps.
+    Nakashima and Kurazume 2024. Samplers: `DDPM`, `DDIM` and those of flows; `Repaint` completes
+    scans by ancestral steps.
 
-    The flow is the diffusion's probability-flow ODE on straight lines: a line's state x_s = s x_1 + (1 - s) x_0 is
-    z_t / (alpha_t + sigma_t) at the t with alpha_t / (alpha_t + sigma_t) = sigmoid(lambda_t / 2) = s, so that
+    The flow is the diffusion's probability-flow ODE on straight lines: a line's state
+    x_s = s x_1 + (1 - s) x_0 is z_t / (alpha_t + sigma_t) at the t with
+    alpha_t / (alpha_t + sigma_t) = sigmoid(lambda_t / 2) = s, so that
 
         v(s, x_s) = x(z_t, lambda_t) - eps(z_t, lambda_t).
 
@@ -31,11 +50,13 @@ class Diffusion(NetworkFlow):
     Args:
         backbone: Name and options, as in conf/backbone.
         prediction: Meaning of y, a name in `r2flow.systems.diffusion.process.PREDICTIONS`.
-        schedule: Name and options of a log-SNR schedule in `r2flow.systems.diffusion.process.SCHEDULES`.
+        schedule: Name and options of a log-SNR schedule in
+            `r2flow.systems.diffusion.schedules.SCHEDULES`.
         clip: Clamp expected data to [-clip, clip] in sampling; null: no clamping.
     """
 
-    completers = MMPS(), Repaint(steps=32, grid="uniform", repeats=16)  # Repaint as in the published script
+    # Repaint as in the published script.
+    completers = (MMPS(), Repaint(steps=32, grid="uniform", repeats=16))
 
     def __init__(
         self,
@@ -46,10 +67,13 @@ class Diffusion(NetworkFlow):
         clip: Positive | None = 1.0,
     ) -> None:
         super().__init__(space, backbone)
-        self.prediction, self.clip, self.answer = PREDICTIONS[prediction], clip, f"{prediction}(z, log-SNR)"
+        self.prediction = PREDICTIONS[prediction]
+        self.clip = clip
+        self.answer = f"{prediction}(z, log-SNR)"
         self.schedule = SCHEDULES.build(schedule or {"name": "cosine"})
         self.run_by(DDPM(256))  # as in the published scripts
-        ends = torch.tensor([1.0, 0.0], dtype=torch.float64, device="cpu")  # real values, also under the meta device
+        # Real values, also under the meta device.
+        ends = torch.tensor([1.0, 0.0], dtype=torch.float64, device="cpu")
         self._ends = torch.sigmoid(self.schedule(ends) / 2).tolist()
 
     def predict(self, z: Tensor, log_snr: Tensor) -> Tensor:
@@ -59,34 +83,51 @@ class Diffusion(NetworkFlow):
     def denoise(self, z: Tensor, log_snr: Tensor) -> Tensor:
         """Expected data given z, clamped."""
         x, _ = self.prediction.split(z, self.predict(z, log_snr), log_snr)
-        return x if self.clip is None else x.clamp(-self.clip, self.clip) + 0 * x  # keeps NaN
+        return self.clipped(x) + 0 * x  # keeps NaN
+
+    def clipped(self, x: Tensor) -> Tensor:
+        return x if self.clip is None else x.clamp(-self.clip, self.clip)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        assert condition is None
         log_snr = 2 * torch.logit(torch.as_tensor(t, device=x.device).clamp(*self._ends))
         alpha, sigma = alpha_sigma(for_images(log_snr, x))
         z = (alpha + sigma) * x
         clean = self.denoise(z, log_snr)
         return clean - (z - alpha * clean) / sigma
 
-    def repaint(self, how: Repaint, z: Tensor, image: Tensor, known: Tensor, noise: Noise, progress: Call) -> Tensor:
+    def log_snrs(self, how: OnGrid, z: Tensor) -> Tensor:
+        """The schedule at a sampler's times, rising.
+
+        It is rounded as in training: at the ends of time, x shows the digits of lambda.
+        """
+        return self.schedule((1 - how.times()).to(z))
+
+    def repaint(
+        self,
+        how: Repaint,
+        z: Tensor,
+        image: Tensor,
+        known: Tensor,
+        noise: Noise,
+        progress: Call,
+    ) -> Tensor:
         """Sample x_1 from noise z given the known part of an image, by the published RePaint."""
 
         def denoise(z: Tensor, log_snr: Tensor) -> Tensor:
             progress()
             return self.denoise(z, log_snr)
 
-        log_snrs = self.schedule((1 - how.times()).to(z))  # rounded as in training: at t = 1, x shows lambda's digits
+        log_snrs = self.log_snrs(how, z)
         *_, z = repaint(denoise, z, image, known, log_snrs, noise, how.repeats, how.jump)
-        return z if self.clip is None else z.clamp(-self.clip, self.clip)
+        return self.clipped(z)
 
 
 @dataclass(frozen=True)
 class DDIM(OnGrid):
     """DDIM steps along the schedule (Song et al. 2021)."""
 
-    paired: ClassVar[bool] = False
-    needs: ClassVar[str] = "denoise"
+    paired = False
+    needs = "denoise"
 
     steps: Steps = 256
     eta: Share = 0.0  # share of fresh noise; 0: deterministic, 1: ancestral steps
@@ -95,11 +136,12 @@ class DDIM(OnGrid):
     def draws(self) -> bool:  # type: ignore[override]
         return self.eta > 0
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        log_snrs = generator.schedule((1 - self.times()).to(noise))  # rounded as in training, see `repaint`
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
+        log_snrs = generator.log_snrs(self, noise)
         z = last_of(walk(generator.denoise, noise, log_snrs, self.eta, draws), progress)
-        clip = generator.clip
-        return Generated.after(z if clip is None else z.clamp(-clip, clip), self.steps, finite(z))
+        return Generated.after(generator.clipped(z), self.steps, finite(z))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""The published R2DM checkpoints: a dict of cfg, weights, ema_weights, optimizer, lr_scheduler and global_step."""
+"""The published R2DM checkpoints.
+
+A dict of cfg, weights, ema_weights, optimizer, lr_scheduler and global_step.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,33 +11,39 @@ from r2flow.errors import InputError
 from r2flow.model.published import BACKBONE, Format, Published, has_keys, rings_of
 from r2flow.model.published import published_config as flow_config
 
-RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
-PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}
-NETWORK = "model."  # prefix of the network's weights in the file; other entries are empty
+_RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
+_PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}
+_NETWORK = "model."  # prefix of the network's weights in the file; other entries are empty
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """Load a published diffusion, sampled by 256 ancestral steps as in its scripts."""
     config = published_config(content["cfg"])
-    state = content["ema_weights" if averaged else "weights"]
-    weights = {
-        BACKBONE + name.removeprefix(NETWORK): value for name, value in state.items() if name.startswith(NETWORK)
-    }
+    weights = {}
+    for name, value in content["ema_weights" if averaged else "weights"].items():
+        if name.startswith(_NETWORK):
+            weights[BACKBONE + name.removeprefix(_NETWORK)] = value
+    step = int(content.get("global_step", 0))
     sampler = {"name": "ddpm", "steps": 256}
-    return Published(config, weights, int(content.get("global_step", 0)), sampler, rings_of(config, weights))
+    return Published(config, weights, step, sampler, rings_of(config, weights))
 
 
 def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
     """Convert a published checkpoint's `cfg` (data, model, diffusion, training) to our config."""
-    data, diffusion = cfg["data"], cfg["diffusion"]
-    if diffusion["timestep_type"] != "continuous" or not data["train_depth"]:
-        raise InputError("only diffusions of range in continuous time are read, which its config does not describe.")
-    limits = {"min_depth": 1.45, "max_depth": 80.0}  # class attributes in the published code, not saved
-    config = flow_config({**cfg, "data": {**limits, **data, "data_format": RANGES[data["depth_format"]]}})
+    diffusion = cfg["diffusion"]
+    if diffusion["timestep_type"] != "continuous" or not cfg["data"]["train_depth"]:
+        raise InputError(
+            "only diffusions of range in continuous time are read, which its config does not "
+            "describe."
+        )
+    # The limits are class attributes in the published code, not saved.
+    data = {"min_depth": 1.45, "max_depth": 80.0, **cfg["data"]}
+    data["data_format"] = _RANGES[data["depth_format"]]
+    config = flow_config({**cfg, "data": data})
     config["encoding"]["limits"] = "open"
     config["generator"] = {
         "name": "diffusion",
-        "prediction": PREDICTIONS[diffusion["prediction_type"]],
+        "prediction": _PREDICTIONS[diffusion["prediction_type"]],
         "schedule": {"name": diffusion["noise_schedule"]},
     }
     return {**config, "published": dict(cfg)}

@@ -1,6 +1,5 @@
 """Training of diffusion models."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch.nn.functional as F
@@ -11,12 +10,7 @@ from r2flow.stages.base import Batch, SingleLoss
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import noised
 
-ERRORS: Registry[Callable[[Tensor, Tensor], Tensor]] = Registry(
-    "error of an element",
-    l2=lambda y, target: F.mse_loss(y, target, reduction="none"),
-    l1=lambda y, target: F.l1_loss(y, target, reduction="none"),
-    huber=lambda y, target: F.smooth_l1_loss(y, target, reduction="none"),
-)
+ERRORS = Registry("error of an element", l2=F.mse_loss, l1=F.l1_loss, huber=F.smooth_l1_loss)
 
 
 class LearnDiffusion(SingleLoss):
@@ -24,9 +18,10 @@ class LearnDiffusion(SingleLoss):
 
     Args:
         loss: Name in `ERRORS`.
-        min_snr: gamma of the weight min(SNR, gamma) on the error of expected data; None: the SNR, which weights the
-            noise's error equally.
-        paired: Whether a sample's error has its own weight; False: the batch's mean, as in R2DM's published code.
+        min_snr: gamma of the weight min(SNR, gamma) on the error of expected data; None: the SNR,
+            which weights the noise's error equally.
+        paired: Whether a sample's error has its own weight; False: the batch's mean, as in R2DM's
+            published code.
     """
 
     learns = Diffusion
@@ -48,9 +43,12 @@ class LearnDiffusion(SingleLoss):
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """Weighted mean error at t = u (t = 0: data, t = 1: noise)."""
-        diffusion, x, eps = self.generator, batch["x_1"], batch["x_0"]
-        log_snr = diffusion.schedule(u)
-        y = diffusion.predict(noised(x, log_snr, eps), log_snr)
-        errors = self.error(y.float(), diffusion.prediction.target(x, eps, log_snr)).flatten(1).mean(1)
-        weights = diffusion.prediction.weight(log_snr, self.min_snr)
+        x = batch["x_1"]
+        eps = batch["x_0"]
+        prediction = self.generator.prediction
+        log_snr = self.generator.schedule(u)
+        y = self.generator.predict(noised(x, log_snr, eps), log_snr)
+        target = prediction.target(x, eps, log_snr)
+        errors = self.error(y.float(), target, reduction="none").flatten(1).mean(1)
+        weights = prediction.weight(log_snr, self.min_snr)
         return (errors * weights).mean() if self.paired else errors.mean() * weights.mean()

@@ -1,5 +1,7 @@
-"""Convolutional GANs (Radford et al. 2016): the vanilla GAN and DUSty v1 (Nakashima and Kurazume 2021), as the
-baselines in the code of DUSty v2."""
+"""Convolutional GANs (Radford et al. 2016): the vanilla GAN and DUSty v1.
+
+Nakashima and Kurazume 2021, as the baselines in the code of DUSty v2.
+"""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -24,9 +26,11 @@ from r2flow.systems.gan.layers import (
 )
 
 
-def _doubling(in_channels: int, out_channels: int, ring: bool, bias: bool) -> list[nn.Module]:
-    layer = nn.ConvTranspose2d(in_channels, out_channels, 4, stride=2, padding=3, bias=bias)
-    return [Pad(ring, "reflect"), Equalised(layer)]
+def _doubling(channels: int, out_channels: int, bias: bool = False) -> nn.Sequential:
+    return nn.Sequential(
+        Pad("reflect"),
+        Equalised(nn.ConvTranspose2d(channels, out_channels, 4, stride=2, padding=3, bias=bias)),
+    )
 
 
 class VanillaGan(Gan):
@@ -39,7 +43,6 @@ class VanillaGan(Gan):
         base_channels: Width of the outermost map; it doubles inwards.
         doublings: From the first map to the image; 4 as published.
         tanh: Whether the image ends in tanh; the published weights of v2 alone do.
-        ring: Whether the columns are a full turn.
     """
 
     drops = False
@@ -53,29 +56,29 @@ class VanillaGan(Gan):
         max_channels: Count = 512,
         doublings: Count = 4,
         tanh: bool = False,
-        ring: bool = True,
     ) -> None:
-        channels, rows, columns = space.shape
-        first = halved("this GAN", (rows, columns), doublings, least=2)
+        channels, *shape = space.shape
+        first = halved("this GAN", shape, doublings, least=2)
         widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings))]
         projection = nn.Sequential(
             nn.Unflatten(1, (latent, 1, 1)),
             Equalised(nn.ConvTranspose2d(latent, widths[0], first, bias=False)),
             BiasedLeakyReLU(widths[0]),
         )
-        blocks = [
-            nn.Sequential(*_doubling(wide, narrow, ring, False), BiasedLeakyReLU(narrow))
-            for wide, narrow in pairwise(widths)
-        ]
-        made = {IMAGE: channels, LOGIT: 1} if self.drops else {IMAGE: channels}
-        heads = Heads({name: nn.Sequential(*_doubling(widths[-1], n, ring, True)) for name, n in made.items()})
-        synthesis = nn.Sequential(projection, *blocks, heads)
+        synthesis = nn.Sequential(projection)
+        for wide, narrow in pairwise(widths):
+            synthesis.append(_doubling(wide, narrow).append(BiasedLeakyReLU(narrow)))
+        heads = {IMAGE: _doubling(widths[-1], channels, bias=True)}
+        if self.drops:
+            heads[LOGIT] = _doubling(widths[-1], 1, bias=True)
+        synthesis.append(Heads(heads))
         mask = RayDrop() if self.drops else None
-        super().__init__(space, LatentGenerator(latent, latent, nn.Identity(), synthesis, mask, tanh))
+        network = LatentGenerator(latent, latent, nn.Identity(), synthesis, mask, tanh)
+        super().__init__(space, network)
 
 
 class DustyV1(VanillaGan):
-    """`VanillaGan` with a second output, the logits of a mask of returns (Nakashima and Kurazume 2021).
+    """`VanillaGan` with a second output, the logits of a mask of returns.
 
     Args:
         temperature: Temperature of the relaxed mask.
@@ -95,7 +98,7 @@ class DustyV1(VanillaGan):
 
 
 class Discriminator(nn.Sequential):
-    """Scores (B, 1, 1, 1) of images (B, C, H, W): blur, strided 4 x 4 convolutions and a linear layer.
+    """Scores (B, 1, 1, 1) of images (B, C, H, W): blur, strided convolutions and a linear layer.
 
     Args:
         shape: Rows and columns of the image.
@@ -112,16 +115,16 @@ class Discriminator(nn.Sequential):
         halvings: Count = 4,
     ) -> None:
         last = halved("this discriminator", shape, halvings, least=2)
-        widths = [2 * channels, *(min(base_channels << i, max_channels) for i in range(halvings))]
-        super().__init__(
-            BlurBoth(),
-            *(
+        super().__init__(BlurBoth())
+        narrow = 2 * channels
+        for i in range(halvings):
+            wide = min(base_channels << i, max_channels)
+            self.append(
                 nn.Sequential(
-                    Pad(True, "reflect"),
+                    Pad("reflect"),
                     Equalised(nn.Conv2d(narrow, wide, 4, stride=2, bias=False)),
                     BiasedLeakyReLU(wide),
                 )
-                for narrow, wide in pairwise(widths)
-            ),
-            Equalised(nn.Conv2d(widths[-1], 1, last), exact=True),
-        )
+            )
+            narrow = wide
+        self.append(Equalised(nn.Conv2d(narrow, 1, last), exact=True))

@@ -1,12 +1,11 @@
 """Base class of GANs: x = G(z) in one evaluation, with or without a mask of dropped rays."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
@@ -22,9 +21,10 @@ class Gan(Generator):
     The sampler is `Direct`, and `network` is G.
     """
 
-    drops: ClassVar[bool] = True  #: whether a ray-drop mask is sampled: logistic noise of `draws.step(shape, 1)`
-    #: Elevation and azimuth of every pixel, (1, 2, H, W), for networks that use them; training rotates scans by random
-    #: angles.
+    #: Whether a ray-drop mask is sampled: logistic noise of `draws.step(shape, 1)`.
+    drops = True
+    #: Elevation and azimuth of every pixel, (1, 2, H, W), for networks that use them; training
+    #: rotates scans by random angles.
     angle: Tensor | None
 
     def __init__(self, space: ModelSpace, network: LatentGenerator) -> None:
@@ -33,11 +33,9 @@ class Gan(Generator):
         self.network = network
         self.register_buffer("angle", None)
 
-    def made(
-        self, z: Tensor, uniform: Tensor | None = None, shift: Tensor | None = None, truncation: float = 1.0
-    ) -> dict[str, Tensor]:
+    def made(self, z: Tensor, uniform: Tensor | None = None, **options: Any) -> dict[str, Tensor]:
         """Outputs of the network, see `LatentGenerator`."""
-        return self.network(z, self.angle, truncation=truncation, uniform=uniform, shift=shift)
+        return self.network(z, self.angle, uniform=uniform, **options)
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
         return draws.step((1, *self.space.shape[1:]), j)
@@ -47,19 +45,20 @@ class Gan(Generator):
 class Direct(Sampler):
     """One evaluation."""
 
-    needs: ClassVar[str] = "made"
+    needs = "made"
 
-    # psi of w <- w_avg + psi (w - w_avg): smaller values reduce diversity (0.7 in DUSty's published demo).
+    # psi of w <- w_avg + psi (w - w_avg): smaller values reduce diversity (0.7 in DUSty's demo).
     truncation: Annotated[float, Bound("in (0, 1]", lambda psi: 0 < psi <= 1)] = 1.0
 
     def evaluations(self, generator: Any) -> int:
         return 1
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
         uniform = None
         if generator.drops:
-            if draws is None:
-                raise InputError(f"a {type(generator).__name__} draws a mask: give draws.")
+            assert draws is not None
             uniform = torch.special.ndtr(draws(1).double()).to(noise)
         x = generator.made(noise, uniform, truncation=self.truncation)["image"]
         progress()

@@ -1,8 +1,8 @@
 """Layers of GANs: equalised learning rate, padding, filters, ray-drop masks and latent codes."""
 
 import math
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -12,25 +12,30 @@ from r2flow.backbones.layers import ExactBuffers, at_least_float32, uncast, wrap
 from r2flow.processes import averaged
 
 DROPPED = -1.0  # value of a dropped ray in model space
-EPS = torch.finfo(torch.float32).eps
-IMAGE, LOGIT, MASK, ORIGINAL, CODE = "image", "raydrop_logit", "raydrop_mask", "image_orig", "w"
+# Outputs of a network.
+IMAGE = "image"
+LOGIT = "raydrop_logit"
 
 
 class Equalised(nn.Module):
-    """gain rate f(x / sqrt n) with weights of N(0, 1 / rate^2), zero biases and n = weight[0].numel().
+    """gain rate f(x / sqrt n) with weights of N(0, 1 / rate^2), zero biases, n = weight[0].numel().
 
-    Adam then learns all layers at equal speed, times `rate` (Karras et al. 2018, section 4.1). n is the fan-in, except
-    for transposed convolutions, as in the published weights. `exact` computes in float32 also under autocast.
+    Adam then learns all layers at equal speed, times `rate` (Karras et al. 2018, section 4.1). n is
+    the fan-in, except for transposed convolutions, as in the published weights. `exact` computes in
+    float32 also under autocast.
     """
 
-    def __init__(self, module: nn.Module, gain: float = 1.0, rate: float = 1.0, exact: bool = False) -> None:
+    def __init__(
+        self, module: Any, gain: float = 1.0, rate: float = 1.0, exact: bool = False
+    ) -> None:
         super().__init__()
-        self.module, self.gain, self.exact = module, gain * rate, exact
-        weight, bias = cast(Tensor, module.weight), cast(Tensor | None, module.bias)
-        self.scale = 1 / math.sqrt(weight[0].numel())
-        nn.init.normal_(weight, 0, 1 / rate)
-        if bias is not None:
-            nn.init.zeros_(bias)
+        self.module = module
+        self.gain = gain * rate
+        self.exact = exact
+        self.scale = 1 / math.sqrt(module.weight[0].numel())
+        nn.init.normal_(module.weight, 0, 1 / rate)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
 
     def forward(self, x: Tensor) -> Tensor:
         if self.exact:
@@ -51,48 +56,50 @@ class BiasedLeakyReLU(nn.Module):
 
 
 class Pad(nn.Module):
-    """Padding by one pixel: circular in azimuth for `ring`, else by the mode `edge`."""
+    """Padding by one pixel: circular in azimuth, by the mode `edge` in elevation."""
 
-    def __init__(self, ring: bool, edge: str) -> None:
+    def __init__(self, edge: str) -> None:
         super().__init__()
-        self.ring, self.edge = ring, edge
+        self.edge = edge
 
     def forward(self, x: Tensor) -> Tensor:
-        x = wrapped(x, 1, 1) if self.ring else F.pad(x, (1, 1, 0, 0), mode=self.edge)
-        return F.pad(x, (0, 0, 1, 1), mode=self.edge)
+        return F.pad(wrapped(x, 1, 1), (0, 0, 1, 1), mode=self.edge)
 
 
 class Filter(ExactBuffers):
-    """A separable filter with circular padding in azimuth ("w") and replicated edge rows ("h"); it keeps the size.
+    """A separable filter with circular padding in azimuth ("w") and replicated edge rows ("h").
 
-    Taps are normalised to sum 1; an even number reaches one pixel further left and up.
+    It keeps the size. Taps are normalised to sum 1; an even number reaches one pixel further left
+    and up.
     """
-
-    kernel: Tensor
 
     def __init__(self, window: Sequence[float], axes: str = "hw") -> None:
         super().__init__()
         taps = torch.tensor(window, dtype=torch.float32)
-        self.register_buffer("kernel", taps / taps.sum())
+        self.kernel = nn.Buffer(taps / taps.sum())
         self.axes = axes
 
     def forward(self, x: Tensor) -> Tensor:
-        size, channels = len(self.kernel), x.shape[1]
-        before, after = size // 2, (size - 1) // 2
+        size = len(self.kernel)
+        before = size // 2
+        after = size - 1 - before
+        channels = x.shape[1]
         kernel = self.kernel.to(x.dtype).expand(channels, 1, 1, -1)
         if "w" in self.axes:
             x = F.conv2d(wrapped(x, before, after), kernel, groups=channels)
         if "h" in self.axes:
-            x = F.conv2d(F.pad(x, (0, 0, before, after), mode="replicate"), kernel.mT, groups=channels)
+            x = F.pad(x, (0, 0, before, after), mode="replicate")
+            x = F.conv2d(x, kernel.mT, groups=channels)
         return x
 
 
 class BlurBoth(nn.Module):
-    """Concatenation of the image blurred in elevation and in azimuth (Kaneko and Harada 2020, NR-GAN)."""
+    """The image blurred in elevation and in azimuth (Kaneko and Harada 2020, NR-GAN)."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.blur_v, self.blur_h = Filter((1, 2, 1), "h"), Filter((1, 2, 1), "w")
+        self.blur_v = Filter((1, 2, 1), "h")
+        self.blur_h = Filter((1, 2, 1), "w")
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.cat([self.blur_v(x), self.blur_h(x)], dim=1)
@@ -101,7 +108,7 @@ class BlurBoth(nn.Module):
 class Heads(nn.Module):
     """A layer per output, by name."""
 
-    def __init__(self, heads: dict[str, nn.Module]) -> None:
+    def __init__(self, heads: Mapping[str, nn.Module]) -> None:
         super().__init__()
         self.heads = nn.ModuleDict(heads)
 
@@ -110,16 +117,15 @@ class Heads(nn.Module):
 
 
 def logistic(uniform: Tensor) -> Tensor:
-    """Standard logistic noise log u - log(1 - u) for u in [0, 1), clamped to [eps, 1 - eps] of float32."""
-    u = uniform.clamp(EPS, 1 - EPS)
-    return u.log() - torch.log1p(-u)
+    """Standard logistic noise log u - log(1 - u) for u in [0, 1), clamped to [eps, 1 - eps]."""
+    return torch.logit(uniform, torch.finfo(torch.float32).eps)
 
 
 def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0) -> Tensor:
     """m ~ Bernoulli(sigmoid(logit)), 0 or 1, with the gradient of its relaxation s.
 
-    s = sigmoid((logit + noise) / temperature) and m = [s > 1/2] for `logistic` noise (Maddison et al. 2017, appendix B;
-    Nakashima and Kurazume 2021, eq. 4).
+    s = sigmoid((logit + noise) / temperature) and m = [s > 1/2] for `logistic` noise (Maddison et
+    al. 2017, appendix B; Nakashima and Kurazume 2021, eq. 4).
     """
     soft = torch.sigmoid((logit + noise) / temperature)
     return soft + ((soft > 0.5).to(soft) - soft).detach()
@@ -128,15 +134,17 @@ def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0
 class RayDrop(nn.Module):
     """Set rays dropped by a random mask to -1 (Nakashima and Kurazume 2021, section III-B)."""
 
-    raydrop_const: Tensor
-
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("raydrop_const", torch.tensor(DROPPED))
+        self.raydrop_const = nn.Buffer(torch.tensor(DROPPED))
 
-    def forward(self, made: dict[str, Tensor], uniform: Tensor, temperature: float) -> dict[str, Tensor]:
+    def forward(
+        self, made: dict[str, Tensor], uniform: Tensor, temperature: float
+    ) -> dict[str, Tensor]:
+        image = made[IMAGE]
         mask = straight_through_mask(made[LOGIT], logistic(uniform), temperature)
-        return {**made, ORIGINAL: made[IMAGE], MASK: mask, IMAGE: made[IMAGE].lerp(self.raydrop_const, 1 - mask)}
+        dropped = image.lerp(self.raydrop_const, 1 - mask)
+        return {**made, "image_orig": image, "raydrop_mask": mask, IMAGE: dropped}
 
 
 class LatentGenerator(nn.Module):
@@ -146,13 +154,12 @@ class LatentGenerator(nn.Module):
 
     Args:
         mapping: Maps z (B, latent) to w (B, code).
-        synthesis: Maps w, optionally with angles and their rotation, to `image` and optionally `raydrop_logit`, (B, .,
-            H, W) float32.
+        synthesis: Maps w, optionally with angles and their rotation, to `image` and optionally
+            `raydrop_logit`, (B, ., H, W) float32.
         measurement: Samples the mask; None: no mask.
         num_styles: Number of layers that take w.
     """
 
-    w_avg: Tensor
     decay = 0.995  # of the average w_avg
     temperature = 1.0  # of the relaxed mask
 
@@ -167,9 +174,13 @@ class LatentGenerator(nn.Module):
         num_styles: int = 1,
     ) -> None:
         super().__init__()
-        self.latent, self.tanh, self.num_styles = latent, tanh, num_styles
-        self.register_buffer("w_avg", torch.zeros(1, code))
-        self.mapping_network, self.synthesis_network, self.measurement_model = mapping, synthesis, measurement
+        self.latent = latent
+        self.tanh = tanh
+        self.num_styles = num_styles
+        self.w_avg = nn.Buffer(torch.zeros(1, code))
+        self.mapping_network = mapping
+        self.synthesis_network = synthesis
+        self.measurement_model = measurement
 
     def forward(
         self,
@@ -180,26 +191,30 @@ class LatentGenerator(nn.Module):
         uniform: Tensor | None = None,
         shift: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Generate `image` (B, C, H, W) and `w` (B, layers, code) from normal z; in training mode, also update w_avg.
+        """Generate `image` (B, C, H, W) and `w` (B, layers, code) from normal z.
 
-        With a mask, there are also `image_orig`, `raydrop_logit` and `raydrop_mask`.
+        With a mask, there are also `image_orig`, `raydrop_logit` and `raydrop_mask`. In training
+        mode, w_avg is updated.
 
         Args:
-            angle: Elevation and azimuth of every pixel, (1 or B, 2, H, W), for a synthesis that uses them.
-            truncation: psi of w <- w_avg + psi (w - w_avg), outside training (Karras et al. 2019, section B).
+            angle: Elevation and azimuth of every pixel, (1 or B, 2, H, W), for a synthesis that
+                uses them.
+            truncation: psi of w <- w_avg + psi (w - w_avg), outside training (Karras et al. 2019,
+                section B).
             uniform: u in [0, 1) for the noise of the mask, (B, 1, H, W).
             shift: Azimuth rotation of each scan in full turns, (B,), for a synthesis with angles.
         """
         w: Tensor = self.mapping_network(z)
         if self.training:
-            self.w_avg.lerp_(averaged(w.detach().mean(0, keepdim=True)).to(self.w_avg), 1 - self.decay)
+            mean = averaged(w.detach().mean(0, keepdim=True))
+            self.w_avg.lerp_(mean.to(self.w_avg), 1 - self.decay)
         elif truncation != 1:
             w = self.w_avg.lerp(w, truncation)
-        made: dict[str, Tensor]
-        made = self.synthesis_network(w) if angle is None else self.synthesis_network(w, angle, shift)
+        rays = () if angle is None else (angle, shift)
+        made: dict[str, Tensor] = self.synthesis_network(w, *rays)
         if self.tanh:
             made[IMAGE] = made[IMAGE].tanh()
-        made[CODE] = w[:, None].expand(-1, self.num_styles, -1)
+        made["w"] = w[:, None].expand(-1, self.num_styles, -1)
         if self.measurement_model is not None:
             assert uniform is not None
             made = self.measurement_model(made, uniform, self.temperature)

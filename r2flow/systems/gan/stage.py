@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 
 from r2flow.registry import Count, Natural, NonNegative, Portion, Registry, construct
 from r2flow.stages.base import Batch, Stage
-from r2flow.systems.gan import dcgan, style_gan
+from r2flow.systems.gan import dcgan, style_discriminator
 from r2flow.systems.gan.augment import AdaptiveAugment, BatchDraws
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import DROPPED, Filter
@@ -28,7 +28,8 @@ def discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
 
 
 def r1(scores: Tensor, x: Tensor) -> Tensor:
-    """mean over images x of |dD/dx|^2, from scores D(x) (Mescheder et al. 2018, eq. 9, without its gamma / 2).
+    """mean over images x of |dD/dx|^2, from scores D(x) (Mescheder et al. 2018, eq. 9, without its
+    gamma / 2).
 
     x, (B, C, H, W), must require a gradient, and the scores have their graph.
     """
@@ -36,11 +37,13 @@ def r1(scores: Tensor, x: Tensor) -> Tensor:
     return gradient.square().flatten(1).sum(1).mean()
 
 
-def lazy_adam(learning_rate: float, betas: tuple[float, float], every: int) -> tuple[float, tuple[float, float]]:
+def lazy_adam(
+    learning_rate: float, betas: tuple[float, float], every: int
+) -> tuple[float, tuple[float, float]]:
     """Adam's learning rate and betas with an additional penalty step every `every` steps.
 
-    With c = every / (every + 1): c times the rate, and betas to the power of c (Karras et al. 2020, StyleGAN2,
-    appendix B). 0 for no such steps.
+    With c = every / (every + 1): c times the rate, and betas to the power of c (Karras et al. 2020,
+    StyleGAN2, appendix B). 0 for no such steps.
     """
     c = every / (every + 1) if every else 1.0
     return c * learning_rate, (betas[0] ** c, betas[1] ** c)
@@ -65,37 +68,44 @@ class Warmup:
         """
         left = self.left(images)
         x = blurred(x, self.blur * left)
-        if uniform is None or self.dropout * left == 0:
+        if uniform is None:
             return x
         return torch.where(uniform < 1 - self.dropout * left, x, DROPPED)
 
 
 def blurred(x: Tensor, sigma: float) -> Tensor:
-    """x filtered by 2^(-(k / sigma)^2), |k| <= floor(3 sigma), over its sum (Karras et al. 2021, StyleGAN3).
+    """x filtered by 2^(-(k / sigma)^2), |k| <= floor(3 sigma), over its sum.
 
-    Circular in azimuth, the edge rows repeated.
+    Circular in azimuth, the edge rows repeated (Karras et al. 2021, StyleGAN3).
     """
     reach = math.floor(3 * sigma)
     if reach == 0:
         return x
-    return Filter(torch.exp2(-((torch.arange(-reach, reach + 1) / sigma) ** 2)).tolist()).to(x.device)(x)
+    window = torch.exp2(-((torch.arange(-reach, reach + 1) / sigma) ** 2))
+    return Filter(window.tolist()).to(x.device)(x)
 
 
-DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
-    "discriminator", dcgan=dcgan.Discriminator, style_gan=style_gan.Discriminator
+DISCRIMINATORS = Registry(
+    "discriminator", dcgan=dcgan.Discriminator, style_gan=style_discriminator.Discriminator
 )
 
 
-GENERATOR, FAKE, REAL, PENALTY = range(1, 5)  # parts of a step, with separate random draws per image
+# Parts of a step, with separate random draws per image.
+GENERATOR = 1
+FAKE = 2
+REAL = 3
+PENALTY = 4
 
 
 class LearnGan(Stage):
-    """Alternating steps of G and D (on new G(z) and scans), and a step of R1 every `r1_every` steps.
+    """Alternating steps of G and D (on new G(z) and scans), and a step of R1 every `r1_every`
+    steps.
 
-    All that D sees is warmed up (`Warmup`) and augmented (`AdaptiveAugment`). Both learn by
-    Adam at a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is
-    r1 r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's. The log has the probability of
-    augmentation after each step (`train/augmented`) and R1 when it was last measured (`train/last_r1`).
+    All that D sees is warmed up (`Warmup`) and augmented (`AdaptiveAugment`). Both learn by Adam at
+    a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is r1
+    r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's. The log has the
+    probability of augmentation after each step (`train/augmented`) and R1 when it was last measured
+    (`train/last_r1`).
 
     Args:
         discriminator: Name and options, as `{name: style_gan, base_channels: 32}`.
@@ -125,43 +135,50 @@ class LearnGan(Stage):
         self.automatic_optimization = False
         self.r1 = r1
         self.r1_every = r1_every
-        channels, h, w = self.space.shape
-        self.discriminator: nn.Module = DISCRIMINATORS.build(discriminator or {"name": "dcgan"}, (h, w), channels)
+        channels, *shape = self.space.shape
+        chosen = discriminator or {"name": "dcgan"}
+        self.discriminator: nn.Module = DISCRIMINATORS.build(chosen, shape, channels)
         self.warmup = construct("stage.warmup", Warmup, warmup)
-        self.augment = None if augment is None else construct("stage.augment", AdaptiveAugment, augment)
+        self.augment = None
+        if augment is not None:
+            self.augment = construct("stage.augment", AdaptiveAugment, augment)
 
     def configure_optimizers(self) -> Any:
         learning_rate = self.hparams.learning_rate
         betas = tuple(self.hparams.betas)
-        rate, lazy_betas = lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
+        lazy = lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
         return [
             torch.optim.Adam(self.generator.parameters(), learning_rate, betas),
-            torch.optim.Adam(self.discriminator.parameters(), rate, lazy_betas),
+            torch.optim.Adam(self.discriminator.parameters(), *lazy),
         ]
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
         step = self.global_step + 1  # counted from 1, as published
         for_generator, for_discriminator = self.own_optimizers()
-        images, real = step * self.images_per_step, batch["x_1"]
+        images = step * self.images_per_step
+        real = batch["x_1"]
 
         draws = BatchDraws(self.hparams.seed, batch, GENERATOR)
         self.discriminator.requires_grad_(False)
-        loss = generator_loss(self.discriminator(self.shown(self.make(batch["x_0"], draws), images, draws)))
+        shown = self.shown(self.make(batch["x_0"], draws), images, draws)
+        loss = generator_loss(self.discriminator(shown))
         self.take_step(for_generator, loss)
         self.discriminator.requires_grad_(True)
 
         draws = BatchDraws(self.hparams.seed, batch, FAKE)
         with torch.no_grad():
-            fake = self.shown(self.make(draws.normal(self.generator.noise_shape).to(real.device), draws), images, draws)
+            z = draws.normal(*self.generator.noise_shape).to(real.device)
+            fake = self.shown(self.make(z, draws), images, draws)
             seen = self.shown(real, images, BatchDraws(self.hparams.seed, batch, REAL))
-        of_real, of_fake = self.discriminator(seen), self.discriminator(fake)
-        wrong = discriminator_loss(of_real, of_fake)
+        of_real = self.discriminator(seen)
+        wrong = discriminator_loss(of_real, self.discriminator(fake))
         self.take_step(for_discriminator, wrong)
 
         if self.r1 and step % self.r1_every == 0:
             penalty = self.penalty(real, images, BatchDraws(self.hparams.seed, batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
-            self.log("train/last_r1", penalty, sync_dist=True)  # Lightning repeats it until the next one
+            # Lightning repeats it until the next one.
+            self.log("train/last_r1", penalty, sync_dist=True)
         if self.augment is not None:
             self.augment.count(of_real)
             if self.augment.every and step % self.augment.every == 0:
@@ -172,18 +189,21 @@ class LearnGan(Stage):
 
     def make(self, z: Tensor, draws: BatchDraws) -> Tensor:
         """G(z), (B, C, H, W), with random mask and rotation."""
-        uniform = draws.uniform((1, *self.generator.space.shape[1:])).to(z.device) if self.generator.drops else None
-        shift = None if self.generator.angle is None else draws.uniform((1,))[:, 0].to(z.device)
-        return self.generator.made(z, uniform, shift)["image"]
+        gan = self.generator
+        uniform = draws.uniform(1, *gan.space.shape[1:]).to(z.device) if gan.drops else None
+        shift = None if gan.angle is None else draws.uniform().to(z.device)
+        return gan.made(z, uniform, shift=shift)["image"]
 
     def shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:
         """Input x of D after a number of images of the run."""
-        uniform = draws.uniform(tuple(x.shape[1:])).to(x.device) if self.warmup.left(images) else None
+        uniform = None
+        if self.warmup.left(images):
+            uniform = draws.uniform(*x.shape[1:]).to(x.device)
         x = self.warmup(x, images, uniform)
         return x if self.augment is None else self.augment(x, self.augment.draw(draws))
 
     def penalty(self, real: Tensor, images: int, draws: BatchDraws) -> Tensor:
-        """R1 with gradients by the scans, through warm-up and augmentation; in float32 without autocast."""
+        """R1 with gradients by the scans, through warm-up and augmentation, in float32."""
         with torch.autocast(real.device.type, enabled=False):
             x = real.detach().requires_grad_()
             return r1(self.discriminator(self.shown(x, images, draws)), x)

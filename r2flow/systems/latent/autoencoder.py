@@ -1,68 +1,37 @@
-"""LiDM's autoencoder (Ran et al. 2024, "Towards realistic scene generation with LiDAR diffusion models").
+"""LiDM's autoencoder (Ran et al. 2024, "Towards realistic scene generation with LiDAR diffusion").
 
-Padding is circular in azimuth and zero in elevation. Parameter names are those of the published weights.
+Padding is circular in azimuth and zero in elevation. Parameter names are those of the published
+weights.
 """
 
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.base import integers
-from r2flow.backbones.convolutions import GroupNorm
+from r2flow.backbones.convolutions import GroupNorm, projection
 from r2flow.backbones.layers import wrapped
 from r2flow.errors import InputError
 from r2flow.registry import Count, NonNegative
+from r2flow.systems.latent.quantiser import Quantiser
 
-
-class Quantiser(nn.Module):
-    """q(z), the code e_k nearest to each vector z, and the mean over all elements of the loss
-
-        |q - sg z|^2 + beta |sg q - z|^2
-
-    with sg the stop-gradient (van den Oord et al. 2017, eq. 3). The first term moves codes, the second (commitment)
-    vectors. `legacy` applies beta to the first term instead, as in the published code of LiDM.
-    """
-
-    def __init__(self, codes: int, channels: int, beta: float = 0.25, legacy: bool = False) -> None:
-        super().__init__()
-        self.beta, self.legacy = beta, legacy
-        self.embedding = nn.Embedding(codes, channels)
-        nn.init.uniform_(self.embedding.weight, -1 / codes, 1 / codes)
-
-    def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """The codes nearest to z, (B, C, H, W), with straight-through gradient, and the loss, ()."""
-        vectors = z.movedim(1, -1)
-        q = self.embedding(self.nearest(vectors))
-        codebook, commitment = (q - vectors.detach()).square().mean(), (q.detach() - vectors).square().mean()
-        loss = self.beta * codebook + commitment if self.legacy else codebook + self.beta * commitment
-        through = vectors + (q - vectors).detach()
-        return through.movedim(-1, 1), loss
-
-    @torch.no_grad()
-    def nearest(self, vectors: Tensor) -> Tensor:
-        """Index of the code nearest to each vector, (..., C) to (...)."""
-        codes = self.embedding.weight.float()
-        lengths = codes.square().sum(1)
-        with torch.autocast(vectors.device.type, enabled=False):  # full precision, for differences of large numbers
-            parts = [
-                torch.addmm(lengths, part, codes.T, alpha=-2).argmin(1)  # |part|^2 is common to all codes
-                for part in vectors.flatten(0, -2).float().split(4096)  # not all distances at once
-            ]
-        return torch.cat(parts).view(vectors.shape[:-1])
-
-
-GROUPS = 32
 Size = tuple[int, int]
 
-SQUARE: Size = (3, 3)
-FLAT: Size = (1, 4)
-BLOCK = {(1, 2): FLAT, (2, 2): SQUARE}  # stride (rows, columns) -> kernel of decoder blocks
-UP = {(1, 2): (1, 5), (2, 2): SQUARE}  # of upsampling
+_SQUARE: Size = (3, 3)
+_FLAT: Size = (1, 4)
+# Kernels of the decoder by the stride (rows, columns): of blocks and of upsampling.
+_BLOCK = {None: _FLAT, (1, 2): _FLAT, (2, 2): _SQUARE}
+UP = {(1, 2): (1, 5), (2, 2): _SQUARE}
+
+
+def _norm(channels: int) -> GroupNorm:
+    return GroupNorm(32, channels, 1e-6)
 
 
 class CircularConv2d(nn.Conv2d):
@@ -75,59 +44,87 @@ class CircularConv2d(nn.Conv2d):
         self,
         channels: int,
         out_channels: int,
-        kernel: Size = SQUARE,
+        kernel: Size = _SQUARE,
         stride: Size | int = 1,
         margins: tuple[int, int, int, int] | None = None,
     ) -> None:
         super().__init__(channels, out_channels, kernel, stride)
         rows, columns = kernel
-        self.margins = margins or ((columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2)
+        half = ((columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2)
+        self.margins = margins or half
 
     def forward(self, x: Tensor) -> Tensor:
         left, right, top, bottom = self.margins
-        x = wrapped(x, left, right) if left or right else x
-        return super().forward(F.pad(x, (0, 0, top, bottom)) if top or bottom else x)
+        if left or right:
+            x = wrapped(x, left, right)
+        if top or bottom:
+            x = F.pad(x, (0, 0, top, bottom))
+        return super().forward(x)
 
 
-class ResidualBlock(nn.Module):
+class _ResidualBlock(nn.Module):
     """shortcut(x) + conv silu norm conv silu norm (x)."""
 
-    def __init__(self, channels: int, out_channels: int, kernel: Size = SQUARE) -> None:
+    def __init__(self, channels: int, out_channels: int, kernel: Size = _SQUARE) -> None:
         super().__init__()
-        self.norm1 = GroupNorm(channels, GROUPS)
+        self.norm1 = _norm(channels)
         self.conv1 = CircularConv2d(channels, out_channels, kernel)
-        self.norm2 = GroupNorm(out_channels, GROUPS)
+        self.norm2 = _norm(out_channels)
         self.conv2 = CircularConv2d(out_channels, out_channels, kernel)
-        self.nin_shortcut = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
+        self.nin_shortcut = projection(channels, out_channels)
 
     def forward(self, x: Tensor) -> Tensor:
         h = self.conv1(F.silu(self.norm1(x)))
         return self.nin_shortcut(x) + self.conv2(F.silu(self.norm2(h)))
 
 
-class Attention(nn.Module):
+class _Attention(nn.Module):
     """x + attention(norm x) over all pixels, with one head."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm = GroupNorm(channels, GROUPS)
-        self.q, self.k, self.v, self.proj_out = (nn.Conv2d(channels, channels, 1) for _ in range(4))
+        self.norm = _norm(channels)
+        self.q = nn.Conv2d(channels, channels, 1)
+        self.k = nn.Conv2d(channels, channels, 1)
+        self.v = nn.Conv2d(channels, channels, 1)
+        self.proj_out = nn.Conv2d(channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         normed = self.norm(x)
+        maps = (layer(normed).flatten(2).mT[:, None] for layer in (self.q, self.k, self.v))
         # Contiguous with a dimension of heads, as the fast kernels need.
-        q, k, v = (layer(normed).flatten(2).mT[:, None].contiguous() for layer in (self.q, self.k, self.v))
-        attended = F.scaled_dot_product_attention(q, k, v)[:, 0].mT.unflatten(2, x.shape[2:])
-        return x + self.proj_out(attended)
+        attended = F.scaled_dot_product_attention(*(part.contiguous() for part in maps))
+        return x + self.proj_out(attended[:, 0].mT.view_as(x))
 
 
-def _middle(channels: int) -> nn.Module:
-    blocks = ResidualBlock(channels, channels), ResidualBlock(channels, channels)
-    return nn.Sequential(OrderedDict(block_1=blocks[0], attn_1=Attention(channels), block_2=blocks[1]))
+def _middle(channels: int) -> nn.Sequential:
+    return nn.Sequential(
+        OrderedDict(
+            block_1=_ResidualBlock(channels, channels),
+            attn_1=_Attention(channels),
+            block_2=_ResidualBlock(channels, channels),
+        )
+    )
 
 
-class Level(nn.Module):
-    """Residual blocks of one resolution, optionally with attention after each and a resampling to the next level."""
+def _path(
+    first: nn.Module, inner: dict[str, nn.Module], width: int, last: nn.Module
+) -> nn.Sequential:
+    """A convolution, inner layers with an output of a width, and a normalised convolution."""
+    return nn.Sequential(
+        OrderedDict(conv_in=first, **inner, norm_out=_norm(width), silu=nn.SiLU(), conv_out=last)
+    )
+
+
+class _Level(nn.Module):
+    """Residual blocks of one resolution, optional attention after each, and a resampling.
+
+    Args:
+        widths: Width of the input and of each block.
+        kernel: Kernel of the blocks.
+        down: Stride to the next level; None: no downsampling.
+        up: Factors of the upsampling; None: none.
+    """
 
     def __init__(
         self,
@@ -138,16 +135,24 @@ class Level(nn.Module):
         up: Size | None = None,
     ) -> None:
         super().__init__()
-        self.block = nn.ModuleList(ResidualBlock(*pair, kernel) for pair in pairwise(widths))
-        self.attn = nn.ModuleList(Attention(width) if attends else nn.Identity() for width in widths[1:])
         last = widths[-1]
+        self.block = nn.ModuleList(_ResidualBlock(*pair, kernel) for pair in pairwise(widths))
+        self.attn = nn.ModuleList(
+            _Attention(last) if attends else nn.Identity() for _ in self.block
+        )
         self.downsample = self.upsample = nn.Sequential()
         if down is not None:
-            convolution = CircularConv2d(last, last, stride=down, margins=(0, 1, 2 - down[0], 1))
-            self.downsample = nn.Sequential(OrderedDict(conv=convolution))
+            self.downsample = nn.Sequential(
+                OrderedDict(
+                    conv=CircularConv2d(last, last, stride=down, margins=(0, 1, 2 - down[0], 1))
+                )
+            )
         if up is not None:
-            enlarge = nn.Upsample(scale_factor=up, mode="bilinear", align_corners=True)
-            self.upsample = nn.Sequential(OrderedDict(enlarge=enlarge, conv=CircularConv2d(last, last, UP[up])))
+            layers = OrderedDict(
+                enlarge=nn.Upsample(scale_factor=up, mode="bilinear", align_corners=True),
+                conv=CircularConv2d(last, last, UP[up]),
+            )
+            self.upsample = nn.Sequential(layers)
 
     def forward(self, x: Tensor) -> Tensor:
         for block, attention in zip(self.block, self.attn, strict=True):
@@ -155,7 +160,7 @@ class Level(nn.Module):
         return self.upsample(self.downsample(x))
 
 
-class FromCoarse(nn.Sequential):
+class _FromCoarse(nn.Sequential):
     """Levels in order of decreasing resolution, applied from the last to the first."""
 
     def forward(self, x: Tensor) -> Tensor:
@@ -199,46 +204,58 @@ class Autoencoder(nn.Module):
         mask: bool = False,
     ) -> None:
         super().__init__()
-        given = [tuple(stride) for stride in strides]
-        self.strides = [(int(rows), int(columns)) for rows, columns in (s for s in given if s in UP)]
-        levels = max(len(multipliers), 1)
-        if self.strides != given or len(given) != levels - 1:
+        levels = len(multipliers)
+        widths = [width * n for n in integers("multipliers", multipliers, levels)]
+        self.strides: list[Any] = [tuple(stride) for stride in strides]
+        if len(strides) != levels - 1 or not UP.keys() >= set(self.strides):
             raise InputError(
-                f"an autoencoder of {levels} levels needs {levels - 1} strides, each [1, 2] or [2, 2]; found "
-                f"{[list(stride) for stride in given]}."
+                f"an autoencoder of {levels} levels needs {levels - 1} strides, each [1, 2] or "
+                f"[2, 2]; found {[list(stride) for stride in strides]}."
             )
-        widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
-        self.mask, self.code_channels = mask, code_channels
-        finest, coarsest = widths[0], widths[-1]
-        downwards = zip([width, *widths[:-1]], widths, [*self.strides, None], strict=True)
-        upwards = zip([*widths[1:], coarsest], widths, [None, *self.strides], strict=True)
-        down = (
-            Level([before, *[after] * blocks], SQUARE, i in attention, down=stride)
-            for i, (before, after, stride) in enumerate(downwards)
+        self.mask = mask
+        self.code_channels = code_channels
+        coarsest = widths[-1]
+        inputs = [width, *widths]
+        between = [*self.strides, None]  # the last is also that before the first
+        down = nn.Sequential()
+        up = _FromCoarse()
+        for i, after in enumerate(widths):
+            attends = i in attention
+            inner = [after] * blocks
+            above = between[i - 1]
+            down.append(_Level([inputs[i], *inner], _SQUARE, attends, down=between[i]))
+            up.append(
+                _Level(
+                    [widths[min(i + 1, levels - 1)], *inner, after],
+                    _BLOCK[above],
+                    attends,
+                    up=above,
+                )
+            )
+        self.encoder = _path(
+            CircularConv2d(channels, width),
+            {"down": down, "mid": _middle(coarsest)},
+            coarsest,
+            CircularConv2d(coarsest, latent_channels),
         )
-        up = (
-            Level([before, *[after] * (blocks + 1)], BLOCK[stride or (1, 2)], i in attention, up=stride)
-            for i, (before, after, stride) in enumerate(upwards)
+        self.decoder = _path(
+            CircularConv2d(latent_channels, coarsest),
+            {"mid": _middle(coarsest), "up": up},
+            widths[0],
+            CircularConv2d(widths[0], channels + mask, _FLAT),
         )
-        self.encoder = nn.Sequential(OrderedDict(
-            conv_in=CircularConv2d(channels, width), down=nn.Sequential(*down), mid=_middle(coarsest),
-            norm_out=GroupNorm(coarsest, GROUPS), silu=nn.SiLU(), conv_out=CircularConv2d(coarsest, latent_channels),
-        ))  # fmt: skip
-        self.decoder = nn.Sequential(OrderedDict(
-            conv_in=CircularConv2d(latent_channels, coarsest), mid=_middle(coarsest), up=FromCoarse(*up),
-            norm_out=GroupNorm(finest, GROUPS), silu=nn.SiLU(),
-            conv_out=CircularConv2d(finest, channels + mask, FLAT),
-        ))  # fmt: skip
         self.quantize = Quantiser(codes, code_channels, beta, legacy)
         self.quant_conv = nn.Conv2d(latent_channels, code_channels, 1)
         self.post_quant_conv = nn.Conv2d(code_channels, latent_channels, 1)
 
     def latent_shape(self, rows: int, columns: int) -> tuple[int, int, int]:
         """Shape (code_channels, h, w) of the latents of an image."""
-        high, wide = (math.prod(stride[axis] for stride in self.strides) for axis in (0, 1))
+        high = math.prod(stride[0] for stride in self.strides)
+        wide = math.prod(stride[1] for stride in self.strides)
         if rows % high or columns % wide:
             raise InputError(
-                f"the autoencoder makes one latent of {high} x {wide} pixels, which do not divide {rows} x {columns}."
+                f"the autoencoder makes one latent of {high} x {wide} pixels, which do not divide "
+                f"{rows} x {columns}."
             )
         return self.code_channels, rows // high, columns // wide
 

@@ -2,18 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.registry import Count, construct
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.diffusion.generator import DDIM, Share
-from r2flow.systems.diffusion.process import DISCRETE, PREDICTIONS, walk
+from r2flow.systems.diffusion.process import PREDICTIONS, walk
+from r2flow.systems.diffusion.schedules import DISCRETE
 from r2flow.systems.latent.autoencoder import Autoencoder
 from r2flow.systems.latent.unet import LatentUNet
 
@@ -28,25 +29,33 @@ class VQAutoencoder(Generator):
     draws = False
 
     def __init__(
-        self, space: ModelSpace, backbone: Mapping[str, Any], autoencoder: Mapping[str, Any] | None = None
+        self,
+        space: ModelSpace,
+        backbone: Mapping[str, Any],
+        autoencoder: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(space)
-        self.first_stage_model = construct("generator.autoencoder", Autoencoder, autoencoder, space.shape[0])
+        self.first_stage_model = _autoencoder(space, autoencoder)
         self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
 
 
-class LatentDiffusion(Generator):
-    """eps(z_t, t) by a U-Net on an autoencoder's latents, sampled by DDIM and decoded: LiDM (Ran et al. 2024).
+def _autoencoder(space: ModelSpace, options: Mapping[str, Any] | None) -> Autoencoder:
+    return construct("generator.autoencoder", Autoencoder, options, space.shape[0])
 
-    Latents become codes when they are decoded, not before. Its sampler is `LatentDDIM`.
+
+class LatentDiffusion(Generator):
+    """eps(z_t, t) by a U-Net on an autoencoder's latents, sampled by DDIM and decoded.
+
+    LiDM (Ran et al. 2024). Latents become codes when they are decoded, not before. Its sampler is
+    `LatentDDIM`.
 
     Args:
         autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
-        unet: Options of `r2flow.systems.latent.unet.LatentUNet`; `position: learnable` is LiDM + APE.
-        schedule: Name and options of a schedule of N steps in `r2flow.systems.diffusion.process.DISCRETE`.
+        unet: Options of `r2flow.systems.latent.unet.LatentUNet`; `position: learnable` is
+            LiDM + APE.
+        schedule: Name and options of a schedule of N steps in
+            `r2flow.systems.diffusion.schedules.DISCRETE`.
     """
-
-    log_snr: Tensor
 
     def __init__(
         self,
@@ -58,13 +67,13 @@ class LatentDiffusion(Generator):
     ) -> None:
         super().__init__(space)
         self.run_by(LatentDDIM())
+        self.first_stage_model = _autoencoder(space, autoencoder)
+        self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
         with torch.device("cpu"):
             log_snr = DISCRETE.build(schedule or {"name": "square_root_linear"})
-        check(bool((log_snr.abs() < 80).all()), f"generator.schedule: log-SNRs must lie within 80 of 0: {schedule}.")
-        self.first_stage_model = construct("generator.autoencoder", Autoencoder, autoencoder, space.shape[0])
-        self.noise_shape = shape = self.first_stage_model.latent_shape(*space.shape[1:])
-        self.model = nn.ModuleDict({"diffusion_model": construct("generator.unet", LatentUNet, unet, shape)})
-        self.register_buffer("log_snr", log_snr.float(), persistent=False)
+        network = construct("generator.unet", LatentUNet, unet, self.noise_shape)
+        self.model = nn.ModuleDict({"diffusion_model": network})
+        self.log_snr = nn.Buffer(log_snr.float(), persistent=False)
 
     @property
     def unet(self) -> LatentUNet:
@@ -73,7 +82,8 @@ class LatentDiffusion(Generator):
 
     def expected(self, z: Tensor, t: Tensor) -> Tensor:
         """Expected latents given z (B, ...) at step t, ()."""
-        return PREDICTIONS["eps"].split(z, self.unet(z, t.to(z.device).expand(len(z))), self.log_snr[t])[0]
+        eps = self.unet(z, t.to(z.device).expand(len(z)))
+        return PREDICTIONS["eps"].split(z, eps, self.log_snr[t])[0]
 
     def start_from(self, parent: Generator) -> None:
         """Load the weights of an autoencoder or another latent diffusion."""
@@ -85,12 +95,13 @@ class LatentDiffusion(Generator):
 class LatentDDIM(Sampler):
     """DDIM on every (N // steps)-th of the diffusion's N steps, then the decoder.
 
-    The last step goes to lambda_0 and not to the data, as in the published code, and adds noise too.
+    The last step goes to lambda_0 and not to the data, as in the published code, and adds noise
+    too.
     """
 
-    paired: ClassVar[bool] = False
+    paired = False
     draws = DDIM.draws
-    needs: ClassVar[str] = "unet"
+    needs = "unet"
 
     steps: Count = 50
     eta: Share = 1.0  # share of fresh noise
@@ -102,16 +113,25 @@ class LatentDDIM(Sampler):
         super().check(generator)
         self.evaluations(generator)
 
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+    def __call__(
+        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+    ) -> Generated:
         times = some_of(len(generator.log_snr), self.steps)
         log_snrs = generator.log_snr[[*times.tolist(), 0]]
         z = last_of(walk(generator.expected, noise, log_snrs, self.eta, draws, times), progress)
-        with torch.autocast(z.device.type, enabled=False):  # its output is the scan, without later corrections
+        # Its output is the scan, without later corrections.
+        with torch.autocast(z.device.type, enabled=False):
             scans = generator.first_stage_model.decode(z)
         return Generated.after(scans, len(times))
 
 
 def some_of(total: int, steps: int) -> Tensor:
-    """Every (total // steps)-th number below total from 1, decreasing; more than `steps` if not divisible."""
-    check(1 <= steps < total, f"a diffusion of {total} steps is sampled in 1 to {total - 1}, found {steps}.")
+    """Every (total // steps)-th number below total from 1, decreasing.
+
+    There are more than `steps` if it does not divide the total.
+    """
+    if not 1 <= steps < total:
+        raise InputError(
+            f"a diffusion of {total} steps is sampled in 1 to {total - 1}, found {steps}."
+        )
     return torch.arange(1, total, total // steps, device="cpu").flip(0)

@@ -1,6 +1,5 @@
 """Training of LiDM: an adversarial autoencoder, and the diffusion of its latents."""
 
-import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,15 +7,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.processes import averaged
 from r2flow.registry import Count, Natural, NonNegative, construct
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.diffusion.process import noised
 from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
-
-log = logging.getLogger(__name__)
 
 
 class PatchDiscriminator(nn.Module):
@@ -29,15 +25,16 @@ class PatchDiscriminator(nn.Module):
 
     def __init__(self, channels: Count = 1, width: Count = 64, layers: Count = 3) -> None:
         super().__init__()
-        self.smallest = 3 * 2**layers  # rows, columns: after `layers` halvings, two 4 x 4 convolutions without stride
-        parts: list[nn.Module] = [nn.Conv2d(channels, width, 4, 2, 1), nn.LeakyReLU(0.2)]
+        self.main = nn.Sequential(nn.Conv2d(channels, width, 4, 2, 1), nn.LeakyReLU(0.2))
         narrow = width
         for layer in range(1, layers + 1):
             wide = width * min(2**layer, 8)
             stride = 2 if layer < layers else 1
-            parts += [nn.Conv2d(narrow, wide, 4, stride, 1, bias=False), nn.BatchNorm2d(wide), nn.LeakyReLU(0.2)]
+            self.main.append(nn.Conv2d(narrow, wide, 4, stride, 1, bias=False))
+            self.main.append(nn.BatchNorm2d(wide))
+            self.main.append(nn.LeakyReLU(0.2))
             narrow = wide
-        self.main = nn.Sequential(*parts, nn.Conv2d(narrow, 1, 4, 1, 1))
+        self.main.append(nn.Conv2d(narrow, 1, 4, 1, 1))
         for module in self.main:
             if isinstance(module, nn.Conv2d):
                 nn.init.normal_(module.weight, 0, 0.02)
@@ -53,51 +50,62 @@ def hinge_loss(real: Tensor, fake: Tensor) -> Tensor:
     return (F.relu(1 - real).mean() + F.relu(1 + fake).mean()) / 2
 
 
-def adaptive_weight(reconstruction: Tensor, adversarial: Tensor, last: Tensor, weight: float) -> Tensor:
-    """weight |grad R| / (|grad A| + 1e-4), at most 1e4 weight: balances the adversarial loss A with the reconstruction
-    loss R at the decoder's last weights, with gradients averaged over all processes (eq. 7).
+def adaptive_weight(
+    reconstruction: Tensor, adversarial: Tensor, last: Tensor, weight: float
+) -> Tensor:
+    """weight |grad R| / (|grad A| + 1e-4), at most 1e4 weight.
+
+    It balances the adversarial loss A with the reconstruction loss R at the decoder's last weights,
+    with gradients averaged over all processes (Esser et al. 2021, eq. 7).
     """
-    grad_r, grad_a = (
-        averaged(torch.autograd.grad(loss, last, retain_graph=True)[0]).norm() for loss in (reconstruction, adversarial)
-    )
-    return weight * (grad_r / (grad_a + 1e-4)).clamp(0, 1e4).detach()
+    (of_r,) = torch.autograd.grad(reconstruction, last, retain_graph=True)
+    (of_a,) = torch.autograd.grad(adversarial, last, retain_graph=True)
+    ratio = averaged(of_r).norm() / (averaged(of_a).norm() + 1e-4)
+    return weight * ratio.clamp(0, 1e4).detach()
 
 
-def reconstruction_loss(x: Tensor, made: Tensor, mask: Tensor | None = None, mask_factor: float = 0.0) -> Tensor:
-    """mean |x - made|; with a mask, (mean |x - made| + mask_factor mean |mask - predicted mask|) / 2.
+def reconstruction_loss(
+    x: Tensor, made: Tensor, mask: Tensor | None = None, mask_factor: float = 0.0
+) -> Tensor:
+    """mean |x - made|; with a mask, (mean |x - made| + mask_factor mean |mask - predicted|) / 2.
 
     The last channel of `made` is then the predicted mask; 1 is a return, -1 a dropped ray.
     """
-    error = (x - made[:, : x.shape[1]]).abs().mean()
+    channels = x.shape[1]
+    error = F.l1_loss(made[:, :channels], x)
     if mask is None or not mask_factor:
         return error
-    return (error + mask_factor * (mask - made[:, x.shape[1] :]).abs().mean()) / 2
+    return (error + mask_factor * F.l1_loss(made[:, channels:], mask)) / 2
 
 
 def adversarial_factor(step: int, start: int, inverted: bool = False) -> float:
-    """0 before step `start`, then 1; `inverted`, as in LiDM's published code: 1 up to `start`, then 0."""
+    """0 before step `start`, then 1; `inverted`, as in LiDM's code: 1 up to `start`, then 0."""
     return float(step <= start if inverted else step >= start)
 
 
-LEAST = 1 / 255  # metres: shorter ranges are not returns
+_LEAST = 1 / 255  # metres: shorter ranges are not returns
 
 
 def returns(x: Tensor, encoding: Encoding) -> Tensor:
-    """Mask of images in model space, (B, 1, H, W): 1 where a range exceeds `LEAST` (there by 1e-6), else -1."""
-    return torch.where(encoding.format.inverse((x[:, :1] + 1 - 1e-6) / 2) < LEAST, -1.0, 1.0)
+    """Mask of images in model space, (B, 1, H, W): 1 where a range exceeds `_LEAST`, else -1."""
+    # 1e-6: a range of exactly `_LEAST` is no return.
+    return torch.where(encoding.format.inverse((x[:, :1] + 1 - 1e-6) / 2) < _LEAST, -1.0, 1.0)
 
 
 class LearnAutoencoder(Stage):
-    """Reconstruction, codebook and a patch discriminator: R + f w A + c Q for the autoencoder, f H for the latter.
+    """Reconstruction, codebook and a patch discriminator: R + f w A + c Q for the autoencoder, f H
+    for the latter.
 
-    R is the mean absolute error, A the discriminator's verdict, w `adaptive_weight`, Q the quantiser's loss, H the
-    hinge loss and f `adversarial_factor` (Esser et al. 2021, "Taming transformers").
+    R is the mean absolute error, A the discriminator's verdict, w `adaptive_weight`, Q the
+    quantiser's loss, H the hinge loss and f `adversarial_factor` (Esser et al. 2021, "Taming
+    transformers").
 
     Args:
         discriminator: Options of `PatchDiscriminator`: width and layers.
         adversarial_weight: In w.
         adversarial_start: Step that f changes at.
-        inverted: Whether f is 1 up to that step and 0 after it, as in the published code, and not the other way round.
+        inverted: Whether f is 1 up to that step and 0 after it, as in the published code, and not
+            the other way round.
         codebook_weight: c.
         mask_factor: Weight of the mask's error, of an autoencoder with a mask.
         options: Those of `Stage`. The learning rate does not fall.
@@ -124,17 +132,11 @@ class LearnAutoencoder(Stage):
         self.autoencoder = self.generator.first_stage_model
         channels = self.space.shape[0] + self.autoencoder.mask
         self.discriminator = construct("stage.discriminator", PatchDiscriminator, discriminator, channels)
-        (rows, columns), latents = self.space.shape[1:], self.generator.noise_shape[1:]
-        if min(rows, columns) < self.discriminator.smallest:
-            raise InputError(
-                f"stage.discriminator judges images of at least {self.discriminator.smallest} rows and columns, found "
-                f"{rows} x {columns}; give it fewer layers, as stage.discriminator='{{layers: 1}}'."
-            )
-        if any(side % 4 for side in latents):  # its U-Net halves them twice
-            most = 2 - any(side % 2 for side in latents)
-            log.warning("%d x %d latents: latent_diffusion takes at most %d generator.unet.multipliers", *latents, most)
-        self.adversarial_weight, self.codebook_weight = adversarial_weight, codebook_weight
-        self.adversarial_start, self.inverted, self.mask_factor = adversarial_start, inverted, mask_factor
+        self.adversarial_weight = adversarial_weight
+        self.codebook_weight = codebook_weight
+        self.adversarial_start = adversarial_start
+        self.inverted = inverted
+        self.mask_factor = mask_factor
 
     def configure_optimizers(self) -> Any:
         return self.optimizers_for(self.autoencoder.parameters(), self.discriminator.parameters())
@@ -166,7 +168,8 @@ class LearnAutoencoder(Stage):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         x = batch["x_1"]
-        loss = reconstruction_loss(x, self.autoencoder(x)[0], self.mask_of(x), self.mask_factor)
+        made, _ = self.autoencoder(x)
+        loss = reconstruction_loss(x, made, self.mask_of(x), self.mask_factor)
         self.log("val/loss", loss, prog_bar=True, batch_size=len(x), sync_dist=True)
 
 
@@ -191,8 +194,10 @@ class LearnLatentDiffusion(SingleLoss):
         return self.optimizers_for(self.generator.unet.parameters())
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        diffusion, eps = self.generator, batch["x_0"]
+        diffusion = self.generator
+        eps = batch["x_0"]
         with torch.no_grad():
-            z = diffusion.first_stage_model.eval().encode(batch["x_1"]).float()  # full precision for small noise levels
+            # Full precision for small noise levels.
+            z = diffusion.first_stage_model.eval().encode(batch["x_1"]).float()
         t = (u * len(diffusion.log_snr)).to(torch.int64)
         return F.mse_loss(diffusion.unet(noised(z, diffusion.log_snr[t], eps), t), eps)

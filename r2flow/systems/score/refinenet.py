@@ -1,10 +1,10 @@
-"""NCSNv2's RefineNet as in LiDARGen: the score of noised range images (Song and Ermon 2020; Zyrianov et al. 2022).
+"""NCSNv2's RefineNet as in LiDARGen: the score of noised range images.
 
-Most convolutions are circular in azimuth and elevation, as in the published weights, whose parameter names are kept.
+Song and Ermon 2020; Zyrianov et al. 2022. Most convolutions are circular in azimuth and elevation,
+as in the published weights, whose parameter names are kept.
 """
 
 from collections.abc import Sequence
-from itertools import chain
 
 import torch
 import torch.nn.functional as F
@@ -14,15 +14,20 @@ from r2flow.backbones.layers import at_least_float32
 from r2flow.registry import Count
 
 
-def torus_convolution(channels: int, out_channels: int, dilation: int = 1, bias: bool = True) -> nn.Conv2d:
+def _convolution(
+    channels: int, out_channels: int, dilation: int = 1, bias: bool = True
+) -> nn.Conv2d:
     """A 3 x 3 convolution with circular padding in both directions."""
-    return nn.Conv2d(channels, out_channels, 3, 1, dilation, dilation, bias=bias, padding_mode="circular")
+    return nn.Conv2d(
+        channels, out_channels, 3, 1, dilation, dilation, bias=bias, padding_mode="circular"
+    )
 
 
 class InstanceNormPlus(nn.Module):
-    """gamma (instance_norm(x) + alpha m) + beta, with m the channels' means, standardised over the channels.
+    """gamma (instance_norm(x) + alpha m) + beta, with standardised means m of the channels.
 
-    m, with the unbiased standard deviation, restores the means that the norm removes (Song and Ermon 2019, appendix A).
+    m, with the unbiased standard deviation, restores the means that the norm removes (Song and
+    Ermon 2019, appendix A).
     """
 
     def __init__(self, channels: int) -> None:
@@ -34,9 +39,10 @@ class InstanceNormPlus(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         wide = at_least_float32(x)
         means = wide.mean((2, 3), keepdim=True)
-        alpha, gamma, beta = (p[:, None, None] for p in (self.alpha, self.gamma, self.beta))
-        centred = (means - means.mean(1, keepdim=True)) / (means.var(1, keepdim=True) + 1e-5).sqrt()
-        return (gamma * (F.instance_norm(wide) + alpha * centred) + beta).to(x.dtype)
+        deviation = (means.var(1, keepdim=True) + 1e-5).sqrt()
+        centred = (means - means.mean(1, keepdim=True)) / deviation
+        normed = F.instance_norm(wide) + self.alpha[:, None, None] * centred
+        return (self.gamma[:, None, None] * normed + self.beta[:, None, None]).to(x.dtype)
 
 
 class PooledConv2d(nn.Module):
@@ -47,69 +53,83 @@ class PooledConv2d(nn.Module):
         self.conv = nn.Conv2d(channels, out_channels, size, padding=size // 2)
 
     def forward(self, x: Tensor) -> Tensor:
-        # Sums columns first, as published: another rounding changes which pixel is the largest in `PoolChain`.
+        # Sums columns first, as published: another rounding changes which pixel is the largest in
+        # `_PoolChain`.
         return F.avg_pool2d(self.conv(x).mT, 2).mT.contiguous()
 
 
-class ScoreBlock(nn.Module):
+class _ScoreBlock(nn.Module):
     """shortcut(x) + conv elu norm conv elu norm (x).
 
     With `changes`, the shortcut is learned, and without dilation the image is halved.
     """
 
-    def __init__(self, channels: int, out_channels: int, changes: bool = False, dilation: int = 1) -> None:
+    def __init__(
+        self, channels: int, out_channels: int, changes: bool = False, dilation: int = 1
+    ) -> None:
         super().__init__()
-        self.conv1 = torus_convolution(channels, channels if changes else out_channels, dilation)
-        self.normalize2 = InstanceNormPlus(channels if changes else out_channels)
+        middle = channels if changes else out_channels
+        self.conv1 = _convolution(channels, middle, dilation)
+        self.normalize2 = InstanceNormPlus(middle)
         self.normalize1 = InstanceNormPlus(channels)
         self.shortcut: nn.Module = nn.Identity()
         self.conv2: nn.Module
         if changes and dilation == 1:
-            self.conv2, self.shortcut = (PooledConv2d(channels, out_channels, size) for size in (3, 1))
-        else:
-            self.conv2 = torus_convolution(out_channels, out_channels, dilation)
-            if changes:
-                self.shortcut = torus_convolution(channels, out_channels, dilation)
+            self.conv2 = PooledConv2d(channels, out_channels, 3)
+            self.shortcut = PooledConv2d(channels, out_channels, 1)
+            return
+        self.conv2 = _convolution(out_channels, out_channels, dilation)
+        if changes:
+            self.shortcut = _convolution(channels, out_channels, dilation)
 
     def forward(self, x: Tensor) -> Tensor:
         h = self.conv1(F.elu(self.normalize1(x)))
         return self.shortcut(x) + self.conv2(F.elu(self.normalize2(h)))
 
 
-class ResidualUnits(nn.Module):
+class _ResidualUnits(nn.Module):
     """x <- x + conv elu conv elu (x), repeated."""
 
     def __init__(self, channels: int, count: int) -> None:
         super().__init__()
-        self.names = [(f"{unit}_1_conv", f"{unit}_2_conv") for unit in range(1, count + 1)]
-        for name in chain(*self.names):
-            self.add_module(name, torus_convolution(channels, channels, bias=False))
+        self.count = count
+        for unit in range(1, count + 1):
+            for layer in (1, 2):
+                self.add_module(
+                    f"{unit}_{layer}_conv", _convolution(channels, channels, bias=False)
+                )
 
     def forward(self, x: Tensor) -> Tensor:
-        for first, second in self.names:
-            x = x + self.get_submodule(second)(F.elu(self.get_submodule(first)(F.elu(x))))
+        for unit in range(1, self.count + 1):
+            h = x
+            for layer in (1, 2):
+                h = self.get_submodule(f"{unit}_{layer}_conv")(F.elu(h))
+            x = x + h
         return x
 
 
-class Fusion(nn.Module):
+class _Fusion(nn.Module):
     """Sum of several maps after a convolution and upsampling of each."""
 
     def __init__(self, channels: Sequence[int], out_channels: int) -> None:
         super().__init__()
-        self.convs = nn.ModuleList(torus_convolution(width, out_channels) for width in channels)
+        self.convs = nn.ModuleList(_convolution(width, out_channels) for width in channels)
 
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
-        size = maps[0].shape[2:]
-        outputs = [conv(x) for conv, x in zip(self.convs, maps, strict=True)]
-        return sum((F.interpolate(x, size, mode="bilinear", align_corners=True) for x in outputs[1:]), outputs[0])
+        total = self.convs[0](maps[0])
+        for conv, x in zip(self.convs[1:], maps[1:], strict=True):
+            size = total.shape[2:]
+            total = total + F.interpolate(conv(x), size, mode="bilinear", align_corners=True)
+        return total
 
 
-class PoolChain(nn.Module):
+class _PoolChain(nn.Module):
     """x + p_1 + p_2 with p_i = conv maxpool p_{i-1} and p_0 = x = elu(input)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.convs = nn.ModuleList(torus_convolution(channels, channels, bias=False) for _ in range(2))
+        layers = (_convolution(channels, channels, bias=False) for _ in range(2))
+        self.convs = nn.ModuleList(layers)
 
     def forward(self, x: Tensor) -> Tensor:
         x = path = F.elu(x)
@@ -119,16 +139,16 @@ class PoolChain(nn.Module):
         return x
 
 
-class RefineBlock(nn.Module):
+class _RefineBlock(nn.Module):
     """Fusion of maps of several sizes at the size of the first (Lin et al. 2017, "RefineNet")."""
 
-    def __init__(self, channels: Sequence[int], out_channels: int, last: bool = False) -> None:
+    def __init__(self, channels: Sequence[int], out_channels: int, units: int = 1) -> None:
         super().__init__()
-        self.adapt_convs = nn.ModuleList(ResidualUnits(width, 2) for width in channels)
+        self.adapt_convs = nn.ModuleList(_ResidualUnits(width, 2) for width in channels)
         if len(channels) > 1:
-            self.msf = Fusion(channels, out_channels)
-        self.crp = PoolChain(out_channels)
-        self.output_convs = ResidualUnits(out_channels, 3 if last else 1)
+            self.msf = _Fusion(channels, out_channels)
+        self.crp = _PoolChain(out_channels)
+        self.output_convs = _ResidualUnits(out_channels, units)
 
     def forward(self, *maps: Tensor) -> Tensor:
         adapted = [adapt(x) for adapt, x in zip(self.adapt_convs, maps, strict=True)]
@@ -145,34 +165,38 @@ class RefineNet(nn.Module):
         width: Width of the first level; the others are twice as wide.
     """
 
-    sigmas: Tensor
-
     def __init__(self, sigmas: Tensor, channels: Count = 2, width: Count = 128) -> None:
         super().__init__()
-        self.register_buffer("sigmas", sigmas)
+        self.sigmas = nn.Buffer(sigmas)
         wide = 2 * width
         self.begin_conv = nn.Conv2d(channels + 2, width, 3, padding=1)
         self.normalizer = InstanceNormPlus(width)
         self.end_conv = nn.Conv2d(width, channels, 3, padding=1)
-        self.res1 = nn.Sequential(ScoreBlock(width, width), ScoreBlock(width, width))
-        self.res2 = nn.Sequential(ScoreBlock(width, wide, changes=True), ScoreBlock(wide, wide))
-        self.res3, self.res4 = (
-            nn.Sequential(ScoreBlock(wide, wide, True, dilation), ScoreBlock(wide, wide, dilation=dilation))
-            for dilation in (2, 4)
-        )
-        self.refine1 = RefineBlock([wide], wide)
-        self.refine2 = RefineBlock([wide, wide], wide)
-        self.refine3 = RefineBlock([wide, wide], width)
-        self.refine4 = RefineBlock([width, width], width, last=True)
+        self.res1 = nn.Sequential(_ScoreBlock(width, width), _ScoreBlock(width, width))
+        self.res2 = _level(width, wide)
+        self.res3 = _level(wide, wide, dilation=2)
+        self.res4 = _level(wide, wide, dilation=4)
+        self.refine1 = _RefineBlock([wide], wide)
+        self.refine2 = _RefineBlock([wide, wide], wide)
+        self.refine3 = _RefineBlock([wide, wide], width)
+        self.refine4 = _RefineBlock([width, width], width, units=3)
 
     def forward(self, x: Tensor, labels: Tensor) -> Tensor:
-        """Score of images (B, C, H, W) at noise levels `labels`, (B,) int64; H and W must be even."""
-        rows, columns = x.shape[2:]
-        column = torch.linspace(0, 1, columns, device=x.device, dtype=x.dtype).expand(len(x), 1, rows, -1)
-        row = torch.linspace(0, 1, rows, device=x.device, dtype=x.dtype)[:, None].expand(len(x), 1, -1, columns)
-        first = self.res1(self.begin_conv(torch.cat([2 * x - 1, column, row], 1)))
+        """Score of images (B, C, H, W) at noise levels `labels`, (B,) int64; H and W are even."""
+        lines = (torch.linspace(0, 1, size, device=x.device, dtype=x.dtype) for size in x.shape[2:])
+        row, column = torch.meshgrid(*lines, indexing="ij")
+        places = torch.stack([column, row]).expand(len(x), -1, -1, -1)
+        first = self.res1(self.begin_conv(torch.cat([2 * x - 1, places], 1)))
         second = self.res2(first)
         third = self.res3(second)
         refined = self.refine2(third, self.refine1(self.res4(third)))
         refined = self.refine4(first, self.refine3(second, refined))
-        return self.end_conv(F.elu(self.normalizer(refined))) / self.sigmas[labels][:, None, None, None]
+        score = self.end_conv(F.elu(self.normalizer(refined)))
+        return score / self.sigmas[labels][:, None, None, None]
+
+
+def _level(channels: int, out_channels: int, dilation: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        _ScoreBlock(channels, out_channels, changes=True, dilation=dilation),
+        _ScoreBlock(out_channels, out_channels, dilation=dilation),
+    )

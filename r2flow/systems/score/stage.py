@@ -11,7 +11,8 @@ from r2flow.systems.score.generator import ScoreModel, score_loss
 
 
 class MatchScore(SingleLoss):
-    """Denoising score matching at all noise levels alike (`r2flow.systems.score.generator.score_loss`).
+    """Denoising score matching at all noise levels alike
+    (`r2flow.systems.score.generator.score_loss`).
 
     Args:
         power: Exponent of sigma in the weight of each level.
@@ -30,4 +31,6 @@ class MatchScore(SingleLoss):
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         network = self.generator.network
         labels = (u * len(network.sigmas)).to(torch.int64)
-        return score_loss(network, (batch["x_1"] + 1) / 2, batch["x_0"], labels, network.sigmas, self.power).mean()
+        return score_loss(
+            network, (batch["x_1"] + 1) / 2, batch["x_0"], labels, network.sigmas, self.power
+        ).mean()

@@ -1,0 +1,89 @@
+"""Answers of a transfer flow: a density for every ray, and normal numbers to draw from it."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+NEVER = -1e4  # logit of a missing candidate
+# Correlation length of drawn answers: best panel on scans of KITTI raw and object.
+TOGETHER = math.radians(1.5)
+
+
+@dataclass(frozen=True)
+class Answers:
+    """The network's prediction for every ray: p(x_1 | x_t, condition), a mixture of candidates."""
+
+    logits: Tensor  # log probability of each candidate, given a return, (B, 7, H, W)
+    ranges: Tensor  # log r of each candidate, (B, 7, H, W); the last is predicted freely
+    scales: Tensor  # scale b of each candidate's Laplace density on log r, (B, 7, H, W)
+    returns: Tensor  # logit of a return, (B, 1, H, W)
+    strengths: Tensor  # reflectance of each candidate, (B, 7, H, W)
+
+    def log_density(self, log_r: Tensor) -> Tensor:
+        """log p(log r | return), (B, 1, H, W)."""
+        return self._log_densities(log_r).logsumexp(1, keepdim=True)
+
+    def likeliest(self, log_r: Tensor) -> Tensor:
+        """Index of the candidate most likely to have produced log r, (B, 1, H, W)."""
+        return self._log_densities(log_r).argmax(1, keepdim=True)
+
+    def _log_densities(self, log_r: Tensor) -> Tensor:
+        return self.logits - (2 * self.scales).log() - ((log_r - self.ranges).abs() / self.scales)
+
+    def quantile(self, u: Tensor) -> Tensor:
+        """Quantile of log r given a return, at u in (0, 1), (B, 1, H, W), by bisection."""
+        p = self.logits.exp()
+        low = (self.ranges - 20 * self.scales).amin(1, True)
+        high = (self.ranges + 20 * self.scales).amax(1, True)
+        for _ in range(28):
+            middle = (low + high) / 2
+            z = (middle - self.ranges) / self.scales
+            shares = p * torch.where(z < 0, z.exp() / 2, 1 - (-z).exp() / 2)
+            below = shares.sum(1, keepdim=True) < u
+            low = torch.where(below, middle, low)
+            high = torch.where(below, high, middle)
+        return (low + high) / 2
+
+    def least_error(self) -> Tensor:
+        """Index k of the candidate with the smallest expected |log r - m_k|, (B, 1, H, W).
+
+        E|m - X| = |m - m_j| + b_j exp(-|m - m_j| / b_j) for X from the Laplace density of j.
+        """
+        p = self.logits.exp()
+        errors = []
+        for own in self.ranges.split(1, 1):
+            distance = (own - self.ranges).abs()
+            spread = self.scales * (-distance / self.scales).exp()
+            errors.append((p * (distance + spread)).sum(1))
+        missing = self.logits <= NEVER / 2
+        return torch.stack(errors, 1).masked_fill(missing, torch.inf).argmin(1, keepdim=True)
+
+
+def smoothed(e: Tensor, hidden: Tensor, elevations: Tensor) -> Tensor:
+    """Standard normal numbers of hidden rays, (B, 1, H, W), correlated over `TOGETHER`.
+
+    z = sum_k w_k e_k / sqrt(sum_k w_k^2) over hidden rays k, with e_k independent and
+    w_k = exp(-d^2 / 2) for d the angle over `TOGETHER`, in both angles. Other rays get no
+    meaningful number. Elevations are those of the rows in radians, (H,).
+    """
+    rows, columns = e.shape[2:]
+    down = _weights(abs(float(elevations[0] - elevations[-1])) / max(rows - 1, 1), e.device)
+    along = _weights(2 * math.pi / columns, e.device)
+    variance = _convolved(hidden.double(), down**2, along**2)
+    return (_convolved(e.double() * hidden, down, along) / variance.clamp(min=1e-12).sqrt()).to(e)
+
+
+def _weights(step: float, device: torch.device) -> Tensor:
+    """w_k of `smoothed` for rays at an angle of `step`; float64: no autocast or TF32 rounds it."""
+    reach = int(3 * TOGETHER / max(step, 1e-3)) + 1
+    number = torch.arange(-reach, reach + 1, dtype=torch.float64, device=device)
+    return torch.exp(-0.5 * (number * step / TOGETHER) ** 2)
+
+
+def _convolved(x: Tensor, down: Tensor, along: Tensor) -> Tensor:
+    x = F.conv2d(x, down[None, None, :, None], padding=(len(down) // 2, 0))
+    side = len(along) // 2
+    return F.conv2d(F.pad(x, (side, side, 0, 0), "circular"), along[None, None, None])
