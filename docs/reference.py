@@ -73,7 +73,7 @@ def option(parameter: Any, annotation: Any) -> tuple[str, str]:
     if parameter.param_type_name == "argument":
         name = (parameter.metavar or name.upper()) + "..." * kind.startswith("list")
     elif kind not in ("bool", "str"):
-        name += f" {kind}"
+        name += f" {parameter.metavar or kind}"
     default = "" if parameter.default is None or kind == "bool" else f" = {parameter.default}"
     return name + default, first(parameter.help).replace(SETS, "scans by name")
 

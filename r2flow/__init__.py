@@ -61,7 +61,7 @@ def __dir__() -> list[str]:
 
 
 def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoint":
-    """Load a trained generator: a model by name (see `r2flow weights`), a run folder or a checkpoint file.
+    """Load a trained generator: a model by name (see `r2flow info`), a run folder or a checkpoint file.
 
     Args:
         device: cpu, cuda, cuda:1, ..., or auto: a GPU if available.

@@ -42,9 +42,16 @@ def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path)
 
 def test_info_says_what_is_in_a_checkpoint(r2flow, saved):
     said = r2flow("info", saved[0]).said
-    for words in ("hdit", "2 x 8 x 64", "hdl64e", "logscale", "backbone.base_channels", "fixed       False"):
+    for words in ("hdit", "[2, 8, 64]", "hdl64e", "logscale", "config.backbone.base_channels"):
         assert words in said
     assert json.loads(r2flow("info", saved[0], "--json").said)["step"] == 7
+
+
+def test_info_lists_models_and_networks_and_adds_one(r2flow, tmp_path):
+    said = r2flow("info").said
+    assert all(words in said for words in ("street", "rangenet53", "R2FLOW_WEIGHTS"))
+    (tmp_path / "file.txt").write_text("no weights")
+    assert "file.txt" in r2flow("info", "--add", "rangenet53", tmp_path / "file.txt").refusal
 
 
 def test_the_network_and_the_sampler_are_not_written_to_one_file(r2flow, tmp_path, monkeypatch):
@@ -75,13 +82,13 @@ def test_every_verb_has_help_with_an_example(r2flow, verb, monkeypatch):
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (MemoryError(), "has no room;"),
-        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "has no room;"),
-        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"), "for 20.00 GiB more;"),
-        (RuntimeError("can't allocate memory: you tried to allocate 96 bytes.\nx"), "96 bytes more"),
-        (RuntimeError("not enough memory: you tried to allocate 96 bytes."), "for 96 bytes more;"),
-        (TypeError("Cannot convert a MPS Tensor to float64, as the MPS framework doesn't support float64."), "GPU"),
-        (RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly"), "unexpectedly; is there memory for as many"),
+        (MemoryError(), "out of memory. Give smaller batches"),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "object. Give smaller batches"),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"), "20.00 GiB"),
+        (RuntimeError("can't allocate memory: you tried to allocate 96 bytes.\nx"), "96 bytes. Give smaller batches"),
+        (RuntimeError("not enough memory: you tried to allocate 96 bytes."), "96 bytes. Give smaller batches"),
+        (TypeError("Cannot convert a MPS Tensor to float64, as the MPS framework doesn't support float64."), "cpu"),
+        (RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly"), "unexpectedly. Is there memory for as many"),
     ],
 )
 def test_what_a_machine_cannot_do_is_one_line(r2flow, monkeypatch, tmp_path, error, words):

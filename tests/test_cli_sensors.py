@@ -131,13 +131,11 @@ def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, f
     assert read_sensor(tmp_path / file).name == name
 
 
-def test_a_sensor_s_file_is_replaced_only_when_asked(r2flow, scans: Path, tmp_path: Path):
+def test_a_sensor_s_file_is_not_replaced(r2flow, scans: Path, tmp_path: Path):
     out = tmp_path / "mine.yaml"
     out.write_text("mine by hand")
-    assert "--overwrite" in r2flow("sensor", scans, "--out", out).refusal
+    assert "exists" in r2flow("sensor", scans, "--out", out).refusal
     assert out.read_text() == "mine by hand"
-    assert r2flow("sensor", scans, "--out", out, "--overwrite")[0] == 0
-    assert read_sensor(out).reflectance_scale == 255
 
 
 @pytest.mark.parametrize(

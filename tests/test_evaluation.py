@@ -15,7 +15,7 @@ from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
-from r2flow.evaluation.comparing import with_equal_panels
+from r2flow.evaluation.comparing import Comparison, with_equal_panels
 from r2flow.evaluation.measuring import Cache, MetricResult, Statistics, Work, gather_real, key_of, measure, real_rule
 from r2flow.evaluation.sets import reference_sets, sampled_set
 from r2flow.lidar.projection import image_to_points
@@ -23,7 +23,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.metrics.jsd_mmd import JSD, MMD
 from r2flow.metrics.panel import PANEL, REFLECTANCE
 from r2flow.noise import standard_normal
-from r2flow.reports.evaluation import Comparison, _remarks, verdict
+from r2flow.reports.verdict import remarks_of, verdict
 from r2flow.samplers import build_sampler
 from tests.conftest import SENSOR, folder, images
 from tests.test_sampling import flow
@@ -267,7 +267,7 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
 def test_a_figure_by_which_a_baseline_is_nearer_than_real_scans_ranks_nothing(noise, said):
     cases = ("a", 7.0, "judged"), ("real halves", 10.0, "reference"), ("noise", noise, "baseline")
     results = [(name, [MetricResult("jsd", {"jsd": value}, {}, True)], kind) for name, value, kind in cases]
-    assert _remarks([Comparison(name, range(9), range(9), one, kind) for name, one, kind in results]) == said
+    assert remarks_of([Comparison(name, range(9), range(9), one, kind) for name, one, kind in results]) == said
 
 
 def test_the_verdict_is_of_the_panel_if_measured():

@@ -130,7 +130,6 @@ def test_a_missing_package_names_its_extra_before_the_work_begins(r2flow, saved,
 def test_an_exported_sampler_gives_the_same_scans(name, kind, tmp_path):
     checkpoint = flow(name)
     written = export(checkpoint, tmp_path / f"flow.{kind}", SHORT)
-    assert written.any_batch
     for num in (1, 2, 3):
         apart = compare(checkpoint, written, SHORT, num)
         assert apart.metres < 1e-3

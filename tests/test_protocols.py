@@ -122,7 +122,7 @@ def test_several_sets_stand_in_one_table_with_references_and_baselines(
         assert sum(words in line for line in lines) == 1
     assert len(lines) == len(set(lines))
     assert sum("no full rank" in line for line in lines) == 1
-    assert sum("r2flow weights" in line for line in warned.splitlines()) == 1
+    assert sum("r2flow info" in line for line in warned.splitlines()) == 1
     metrics = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"]
     figures = {one["metric"]: one["figures"] for one in metrics}
     assert figures["jsd"] == {"jsd": figure(measured[0], generated, PAPER)}

@@ -35,39 +35,29 @@ sampel -c run -o out # Did you mean 'sample'?
 sample empty -o out
 sample nowhere -o file.txt # file.txt is not a folder that can be written to
 complete nowhere -o file.txt # file.txt is not a folder that can be written to
-info ~nouser/run # ~ stands for nothing
+info ~nouser/run # Write the path in full
+info --add rangenet53 file.txt
 sample run -o out --sampler dopri5 --steps 50 # steps
-sample run -o out --seed 18446744073709551616 # 2^64
+sample run -o out --seed 18446744073709551616 # 18446744073709551615
 sample run -o out --sector 10,10.0000001 # narrower than a column
-sample run -o out --format npy, # --format '' cannot
+sample run -o out --format npy, # --format 'npy,' cannot
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
 sample '' -o out # an argument is empty
 sample run -o out --steps 10000000 # 1,000,000
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
-export run --to onnx --half # --half
-export run --to onx # no export format named 'onx'; known: onnx, pt2, safetensors.
-export run --to safetensors --what network # --what network is for
-export run --what network --steps 4 # a network or .safetensors takes no sampler: leave sampler, steps
+export run --to onx # 'onx' is not one of 'onnx', 'pt2', 'safetensors'
 export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx
 export run --to pt2 --out empty/a.pt2 # --to pt2 writes a .pt2, found --out empty/a.pt2
 report backbones --size ²x²
-report backbones --only hdit,adm_unet --size 31x64 --repeats 0 # height 31 cannot be used
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels
 complete scans/000000.bin -c run -o out --to os1_64
-view scans -o out # ends in .html
 view scans -o file.txt/a.html
-view scans -o out.html --steps 1,2 # of a run, a checkpoint or a model
-view run -o out.html --times 3 --steps 1,2 # one number of --steps
-view run scans -o out.html --times 3 --sequence # --sequence
 simulate -o out --size 1x1 # found 1
 simulate -o out --format npy --labels
 simulate -o scans --num 1 --size 8x64 # holds scans
 interpolate scans/000000.bin bad.bin -c run -o out
 interpolate scans scans -c run -o out # scan
 show file.txt -o out
-show scans -o out.png
-show scans/000000.bin -o scans --format npy # in the folder of the scans
-show scans -o scans/images --format npy # in the folder of the scans
 show scans -o out --projection unfolding
 show run -o out # a run without samples
 show street -o out # sample it first: r2flow sample street --out scans
@@ -80,28 +70,20 @@ prepare simulated:3 -o out
 prepare scans/000000.bin -o out
 prepare scans -o out --drives 77
 pairs run --num 1 --seed 99999999999999999999
-weights --add rangenet53 file.txt
 evaluate scans # nothing to compare with
-evaluate scans scans --generated-split train # no split named 'train'
+show scans -o scans --format npy # is the folder of the scans
 evaluate simulated:3 scans --split test # simulated:3 has no split: leave 'test' out
-evaluate scans --reference --train-split test # --train; found none
-evaluate scans --reference --steps 4 # found none
-evaluate scans --reference --num 4 # --num is of GENERATED; found none
-evaluate scans a b c d --steps 4 # found a; b; c (and 1 more)
-evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans scans --json file.txt/a.json
-evaluate scans scans --json image.npy # --json must be a file
-evaluate scans run --sampler euler,heun2 --tolerance 0.1 # tolerance
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
 report solvers -o out --problems none # nothing to measure
-report solvers -o out --seed 1 # --seed, --batch-size are of a model; found none
 report paper run -o out --results nowhere
 """
 
 # What each verb's wrong values are tried on, and words that no option takes.
 BASES = {
     "sample": "sample run -o out", "pairs": "pairs run --num 1", "simulate": "simulate -o out",
-    "complete": "complete scans/000000.bin -c run -o out", "view": "view run -o out.html", "show": "show scans -o out",
+    "complete": "complete scans/000000.bin -c run -o out", "view": "view scans run -o out.html",
+    "show": "show scans -o out",
     "interpolate": "interpolate scans/000000.bin scans/000001.bin -c run -o out", "sensor": "sensor scans",
     "prepare": "prepare scans -o out", "evaluate": "evaluate scans run --metrics jsd", "compare": "compare run",
     "curvature": "report curvature run -o out", "solvers": "report solvers -o out",

@@ -14,5 +14,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
 )
 
-report = typer.Typer(help="Measure flows and solvers.", no_args_is_help=True, pretty_exceptions_enable=False)
-app.add_typer(report, name="report")
+report = typer.Typer(
+    help="Measure flows and solvers.", no_args_is_help=True, pretty_exceptions_enable=False
+)
+app.add_typer(report, name="report", rich_help_panel="Measure")

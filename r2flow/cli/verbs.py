@@ -12,29 +12,28 @@ import typer
 from r2flow import __version__
 from r2flow.cli import data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
 from r2flow.cli.app import app
-from r2flow.errors import InputError, PlainFormatter, Unbroken, check, explain_mistake, one_line, open_streams
+from r2flow.errors import (
+    InputError,
+    PlainFormatter,
+    Unbroken,
+    explain_mistake,
+    one_line,
+    open_streams,
+)
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import Stopped, listening, stop_at_once
 
 # ClickException: in click for older releases of typer, in typer for newer ones.
 USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
-GROUPS = {  # panels of --help and their verbs, in order
-    "Make": ("train", "pairs"),
-    "Draw": ("sample", "complete", "interpolate"),
-    "Look": ("view", "show"),
-    "Measure": ("evaluate", "compare"),
-    "Data": ("simulate", "prepare", "sensor"),
-    "Files": ("export", "info", "weights"),
+# Errors of torch and Python that a user can act on -> what to do.
+_CURES = {
+    r"MPS framework doesn't support float64": "Use --device cpu.",
+    r"DataLoader worker \(pid": "Is there memory for as many processes that read scans?",
+    r"home directory": "Write the path in full.",
+    r"allocate|out of memory|not enough memory|failed to map segment": "Give smaller batches or images, or more "
+    "memory.",
 }
-for verb in app.registered_commands:
-    assert verb.callback is not None
-    verb.name = verb.callback.__name__
-    verb.rich_help_panel = next((group for group, names in GROUPS.items() if verb.name in names), "Data")
-app.registered_groups[0].rich_help_panel = "Measure"
-app.registered_commands.sort(key=lambda verb: list(GROUPS).index(str(verb.rich_help_panel)))
-
-FULL = ("can't allocate memory", "not enough memory", "out of memory", "failed to map segment")  # errors of torch
 
 
 def run(arguments: Sequence[str], command: Sequence[str]) -> int:
@@ -48,8 +47,11 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     try:
         with listening(stop_at_once):
-            check("" not in arguments, "an argument is empty; is a variable of the shell not set?")
-            arguments = [re.sub("(?<![^=])~(?=/)", lambda _: str(Path.home()), one) for one in arguments]
+            if "" in arguments:
+                raise InputError("an argument is empty; is a variable of the shell not set?")
+            arguments = [
+                re.sub("(?<![^=])~(?=/)", lambda _: str(Path.home()), text) for text in arguments
+            ]
             arguments, plugins = take_plugins(arguments)
             load_plugins(plugins)
             if "--version" in arguments and arguments[0] in ("--version", "train"):
@@ -70,20 +72,13 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
     except (InputError, OSError) as error:
         message = explain_mistake(error)
     except (ImportError, MemoryError, RuntimeError, TypeError) as error:
-        if "home directory" in str(error):
-            message = "~ stands for nothing here: write the path in full, or set HOME; for the cache, XDG_CACHE_HOME."
-        elif isinstance(error, MemoryError) or any(words in str(error) for words in FULL):
-            size = re.search(r"allocate ([\d.]+ \w+)", str(error))
-            more = f" for {size[1]} more" if size else ""
-            message = f"the memory has no room{more}; give smaller batches or images, or more memory."
-        elif "MPS framework doesn't support float64" in str(error):
-            message = "Apple's GPU has no float64, which this needs: use --device cpu."
-        elif "DataLoader worker (pid" in str(error):
-            message = f"{one_line(str(error)).rstrip('. ')}; is there memory for as many processes that read scans?"
-        else:
+        text = str(error) or "out of memory"
+        cures = [cure for words, cure in _CURES.items() if re.search(words, text)]
+        if not cures:
             raise
+        message = f"{text.splitlines()[0].rstrip('.')}. {cures[0]}"
     except USAGE_ERROR as error:
         text = one_line(error.format_message()).rstrip(".") or "no verb given"
-        message = f"{text}{'.' * (not text.endswith('?'))} See --help."
+        message = f"{text}{'' if text.endswith('?') else '.'} See --help."
     print(f"error: {message}", file=sys.stderr)
     return 2

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow import __version__
-from r2flow.errors import InputError, check, require
+from r2flow.errors import InputError, require
 from r2flow.files import write_file
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
 from r2flow.lidar.encoding import ModelSpace
@@ -45,11 +45,12 @@ class _Recorder(nn.Module):
         super().__init__()
         self.vectors = vectors
         self.precision = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=False)
-        self.calls: list[tuple[Tensor, ...]] = []
+        self.calls: list[tuple[float, float, Tensor]] = []
 
-    def forward(self, t: Tensor | float, x: Tensor, s: Tensor | float | None = None) -> Tensor:
-        self.calls.append((torch.as_tensor(t), x, torch.as_tensor(t if s is None else s)))
-        check(len(self.calls) < len(self.vectors), "the sampler evaluates more often than its `evaluations` says.")
+    def forward(self, t: Any, x: Tensor, s: Any = None) -> Tensor:
+        self.calls.append((float(t), float(t if s is None else s), x))
+        if len(self.calls) == len(self.vectors):
+            raise InputError("the sampler evaluates more often than its `evaluations` says.")
         return self.vectors[len(self.calls)].view_as(x)
 
 
@@ -58,27 +59,31 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     sampler.check(flow)
     count = sampler.evaluations(flow)
     if count is None or sampler.draws or sampler.completes:
-        what = "a condition" if sampler.completes else "noise at every step" if sampler.draws else "adaptive steps"
         raise InputError(
-            f"sampler {sampler.name} needs {what} and cannot be exported: give --sampler {USUAL.name} --steps "
-            f"{USUAL.steps}."
+            f"sampler {sampler.name} cannot be exported, as it has no fixed steps of the ODE: give --sampler "
+            f"{USUAL.name} --steps {USUAL.steps}."
         )
     units = torch.eye(count + 1, dtype=torch.float64)  # x_0 is the first unit vector
-    rows, calls = _recorded(flow, sampler, units)
     others = 7 - 1000 * units
-    linear = torch.allclose(_recorded(flow, sampler, others)[0], rows @ others)
-    check(linear, f"{sampler.name} is not linear in the noise and the network's outputs here: it cannot be exported.")
-    times, _, second = zip(*calls, strict=True)
+    rows, calls = _recorded(flow, sampler, units)
+    if not torch.allclose(_recorded(flow, sampler, others)[0], rows @ others):
+        raise InputError(
+            f"{sampler.name} is not linear in the noise and the network's outputs here: it cannot be exported."
+        )
+    times, second, _ = zip(*calls, strict=True)
     rows = rows[:, : len(times) + 1]  # with `finish`, fewer than count
-    return Tableau([float(t) for t in times], [float(s) for s in second] if flow.second_time else None, rows)
+    return Tableau(list(times), list(second) if flow.second_time else None, rows)
 
 
-def _recorded(flow: RectifiedFlow, sampler: Sampler, vectors: Tensor) -> tuple[Tensor, list[tuple[Tensor, ...]]]:
+def _recorded(
+    flow: RectifiedFlow, sampler: Sampler, vectors: Tensor
+) -> tuple[Tensor, list[tuple[float, float, Tensor]]]:
     """States of a sampler and x_1, (E + 1, N), from x_0 and network outputs that are the vectors, (E + 1, N)."""
-    recorder, shadow = _Recorder(vectors), copy(flow)
+    recorder = _Recorder(vectors)
+    shadow = copy(flow)
     shadow._modules = {**flow._modules, "backbone": recorder}
     x_1 = shadow(vectors[0].view(-1, 1, 1, 1), sampler=sampler).x
-    return torch.stack([*(x for _, x, _ in recorder.calls), x_1]).flatten(1), recorder.calls
+    return torch.stack([*(x for *_, x in recorder.calls), x_1]).flatten(1), recorder.calls
 
 
 class Decoded(nn.Module):
@@ -101,34 +106,37 @@ class Scans(nn.Module):
 
     def __init__(self, flow: RectifiedFlow, how: Tableau) -> None:
         super().__init__()
-        self.network, self.decoded, self.how = flow.backbone, Decoded(flow.space), how
+        self.network = flow.backbone
+        self.decoded = Decoded(flow.space)
+        self.how = how
 
     def forward(self, noise: Tensor) -> tuple[Tensor, Tensor]:
         *states, last = self.how.states.tolist()
+        times = [values for values in (self.how.times, self.how.second) if values]
         vectors = [noise]
-        for j, row in enumerate(states):
-            times = [noise.new_tensor(values[j]) for values in (self.how.times, self.how.second) if values]
-            vectors.append(self.network(times[0], _sum(row, vectors), *times[1:]))
-        return self.decoded(_sum(last, vectors))
+        for row, (t, *s) in zip(states, zip(*times, strict=True), strict=True):
+            x = _weighted_sum(row, vectors)
+            v = self.network(noise.new_tensor(t), x, *map(noise.new_tensor, s))
+            vectors.append(v)
+        return self.decoded(_weighted_sum(last, vectors))
 
 
-def _sum(row: list[float], vectors: list[Tensor]) -> Tensor:
-    x = row[0] * vectors[0]
-    for a, v in zip(row[1:], vectors[1:], strict=False):
-        x = x + a * v if a else x
-    return x
+def _weighted_sum(row: list[float], vectors: list[Tensor]) -> Tensor:
+    return sum(a * v for a, v in zip(row, vectors, strict=False) if a)  # type: ignore[return-value]
 
 
 class Exported(NamedTuple):
     """An exported file."""
 
     path: Path
-    any_batch: bool  # whether the batch size is free; else 1
     notes: dict[str, Any]  # metadata
 
 
 def export(
-    checkpoint: Checkpoint, path: str | Path, sampler: Sampler | str | None = None, network: bool = False
+    checkpoint: Checkpoint,
+    path: str | Path,
+    sampler: Sampler | str | None = None,
+    network: bool = False,
 ) -> Exported:
     """Write a rectified flow or a flow map as a `.pt2` (torch.export) or an `.onnx`.
 
@@ -145,71 +153,75 @@ def export(
         InputError: an unknown suffix, another generator, a sampler that cannot be exported, a missing package, or a
             network that torch cannot export.
     """
-    path, flow = Path(path), checkpoint.generator
+    path = Path(path)
+    flow = checkpoint.generator
     if not isinstance(flow, RectifiedFlow):
         kind = type(flow).__name__
-        raise InputError(f"only rectified flows and flow maps can be exported, and {checkpoint.path} holds a {kind}.")
-    write, flow = FORMATS[path.suffix.removeprefix(".")], deepcopy(flow)  # which tracing moves and changes
+        raise InputError(
+            f"only rectified flows and flow maps can be exported, and {checkpoint.path} holds a {kind}."
+        )
+    if network and type(flow).velocity is not RectifiedFlow.velocity:
+        raise InputError(
+            f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler."
+        )
+    write = FORMATS[path.suffix.removeprefix(".")]
     how = sampler if isinstance(sampler, Sampler) else flow.choose(sampler)
-    own = type(flow).velocity is not RectifiedFlow.velocity
-    check(not (network and own), f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler.")
     steps = None if network else tableau(flow, how)
     if write is _write_onnx:
-        require("an .onnx", "export", "onnx", "onnxscript", *([] if network else ["onnxruntime"]))
+        require("an .onnx", "export", "onnx", "onnxscript", "onnxruntime")
     notes = _notes(checkpoint, how, steps)
     logging.getLogger(__name__).info("torch exports the network: this takes up to some minutes")
-    with _quiet():
-        data, any_batch = write(flow, steps, notes)
+    with _unfused():
+        data = write(deepcopy(flow), steps, notes)  # tracing moves and changes it
     write_file(path, data)
-    return Exported(path, any_batch, notes)
+    return Exported(path, notes)
 
 
 def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[str, Any]:
-    flow = checkpoint.generator
-    velocity = "mean velocity of x from t to s" if flow.second_time else "dx/dt at x and t"
-    channels = ["range in metres", "reflectance of [0, 1]"][: 1 + flow.space.encoding.reflectance]
-    scan = {
-        "sampler": how.asdict(),
-        "evaluations": steps and len(steps.times),
-        "times": steps and {"t": steps.times, "s": steps.second},
-        "outputs": {
-            "scan": f"(batch, {len(channels)}, H, W): {', '.join(channels)}; 0 without a return",
-            "points": "(batch, 3, H, W): x ahead, y left, z up in metres; the origin without a return",
-        },
-    }
-    return {
+    space = checkpoint.generator.space
+    notes = {
         "r2flow": __version__,
         "weights": weights_hash(checkpoint),
         "step": checkpoint.step,
-        "image": list(flow.space.shape),
-        "sensor": flow.space.sensor.described(),
+        "image": list(space.shape),
+        "sensor": space.sensor.described(),
         "encoding": checkpoint.config["encoding"],
-        **(scan if steps else {"outputs": {"v": f"{velocity}, in model space"}}),
+    }
+    if steps is None:
+        return {**notes, "outputs": {"v": "dx/dt at x and t, of flow maps its mean from t to s"}}
+    return {
+        **notes,
+        "sampler": how.asdict(),
+        "evaluations": len(steps.times),
+        "times": {"t": steps.times, "s": steps.second},
+        "outputs": {
+            "scan": "(batch, 2 or 1, H, W): range in metres, reflectance of [0, 1]; 0 without a return",
+            "points": "(batch, 3, H, W): x ahead, y left, z up in metres; the origin without a return",
+        },
     }
 
 
-def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> tuple[bytes, bool]:
-    noise = torch.zeros(2, *flow.noise_shape)
-    module, inputs = (flow.backbone, _network_inputs(flow, (2,))) if how is None else (Scans(flow, how), [noise])
-    program, any_batch = _traced(module, *inputs)
+def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> bytes:
+    if how is None:
+        program = _traced(flow.backbone, *_network_inputs(flow, (2,)))
+    else:
+        program = _traced(Scans(flow, how), torch.zeros(2, *flow.noise_shape))
     file = io.BytesIO()
     torch.export.save(program, file, extra_files={NOTES: json.dumps(notes)})
-    return file.getvalue(), any_batch
+    return file.getvalue()
 
 
-def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> tuple[bytes, bool]:
+def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> bytes:
     from r2flow.model.onnx_graphs import sampler_graph, to_onnx
 
-    program, any_batch = _traced(flow.backbone, *_network_inputs(flow, (2,) if how is None else ()))
-    network = to_onnx(program, ["t", "x", "s"][: 2 + flow.backbone.second_time], ["v"])
+    inputs = _network_inputs(flow, (2,) if how is None else ())
+    network = to_onnx(_traced(flow.backbone, *inputs), ["t", "x", "s"][: len(inputs)], ["v"])
     if how is not None:
-        decoded, any_too = _traced(Decoded(flow.space), torch.zeros(2, *flow.noise_shape))
-        any_batch = any_batch and any_too
+        decoded = _traced(Decoded(flow.space), torch.zeros(2, *flow.noise_shape))
         ends = to_onnx(decoded, ["x_1"], ["scan", "points"])
         network = sampler_graph(network, ends, how.times, how.second, how.states.numpy())
     network.metadata_props.add(key="r2flow", value=json.dumps(notes))
-    network.producer_name, network.producer_version = "r2flow", __version__
-    return network.SerializeToString(), any_batch
+    return network.SerializeToString()
 
 
 FORMATS = Registry("export format", pt2=_write_pt2, onnx=_write_onnx)
@@ -217,41 +229,36 @@ FORMATS = Registry("export format", pt2=_write_pt2, onnx=_write_onnx)
 
 def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> list[Tensor]:
     """Example inputs t, x and, for a flow map, s of the network, with times of shape () or (2,)."""
-    network = flow.backbone
-    inputs = [torch.full(shape, 0.25), torch.zeros(2, network.in_channels, *network.coords.shape[2:])]
-    return [*inputs, torch.full(shape, 0.5)] if network.second_time else inputs  # t, s: distinct tensors
+    x = torch.zeros(2, *flow.noise_shape)
+    inputs = [torch.full(shape, 0.25), x, torch.full(shape, 0.5)]  # t, s: distinct tensors
+    return inputs[: 2 + flow.backbone.second_time]
 
 
-def _traced(module: nn.Module, *inputs: Tensor) -> tuple[torch.export.ExportedProgram, bool]:
-    """Export the module for a free batch size; if torch cannot, for one scan."""
+def _traced(module: nn.Module, *inputs: Tensor) -> torch.export.ExportedProgram:
+    """Export the module for any batch size."""
     batch = torch.export.Dim("batch", max=1 << 31)  # torch 2.6 refuses a size without a limit
+    shapes = tuple({0: batch} if value.ndim else {} for value in inputs)
     module = module.cpu().eval()
-    problem = ""
-    for any_batch in (True, False):
-        examples = tuple(value[:1] if value.ndim and not any_batch else value for value in inputs)
-        dynamic_shapes = tuple({0: batch} if value.ndim and any_batch else {} for value in examples)
-        try:
-            with torch.no_grad():
-                # not strict: decisions in Python, such as the attention backend, are made now
-                return torch.export.export(module, examples, dynamic_shapes=dynamic_shapes, strict=False), any_batch
-        except Exception as error:  # torch raises nearly any exception here
-            problem = problem or str(error).strip().split("\n")[0]
-    raise InputError(f"torch cannot export this {type(module).__name__}: {problem}")
+    try:
+        with torch.no_grad():
+            # not strict: decisions in Python, such as the attention backend, are made now
+            return torch.export.export(module, inputs, dynamic_shapes=shapes, strict=False)
+    except Exception as error:  # torch raises nearly any exception here
+        problem = str(error).strip().split("\n")[0]
+        raise InputError(f"torch cannot export this {type(module).__name__}: {problem}") from None
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Disable fused operations, which runtimes may lack, and messages of the exporters."""
-    fast, log = torch.backends.mha.get_fastpath_enabled(), logging.getLogger("torch.onnx")
-    level = log.level
+def _unfused() -> Iterator[None]:
+    """Disable fused operations, which runtimes may lack, and warnings of the exporters."""
+    fast = torch.backends.mha.get_fastpath_enabled()
     torch.backends.mha.set_fastpath_enabled(False)
-    log.setLevel(logging.ERROR)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings(action="ignore"):
             yield
     finally:
         torch.backends.mha.set_fastpath_enabled(fast)
-        log.setLevel(level)
 
 
 class Difference(NamedTuple):
@@ -261,27 +268,35 @@ class Difference(NamedTuple):
     reflectance: float  # largest difference of reflectance over these rays; 0 without reflectance
     rays: int  # number of rays with a return in only one of them
 
+    def __str__(self) -> str:
+        return (
+            f"range within {self.metres:.2g} m, reflectance within {self.reflectance:.2g}, {self.rays} rays differ in "
+            "ray-drop"
+        )
 
-def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None = None, num: int = 2) -> Difference:
+
+def compare(
+    checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None = None, num: int = 2
+) -> Difference:
     """Compare the first scans of seed 0 by the file and by the flow."""
     flow = checkpoint.generator
-    noise = Draws(0, range(num if exported.any_batch else 1)).start(flow.noise_shape)
+    noise = Draws(0, range(num)).start(flow.noise_shape)
     expected, _ = Decoded(flow.space)(flow(noise, sampler=sampler).x)
-    exported_scans = run(exported.path, noise)["scan"]
-    returned, returned_exported = expected[:, 0] > 0, exported_scans[:, 0] > 0
-    both = returned & returned_exported
-    largest = (expected - exported_scans).abs().movedim(1, 0)[:, both].amax(1).tolist() if both.any() else [0.0]
-    return Difference(largest[0], sum(largest[1:]), int((returned != returned_exported).sum()))
+    found = run(exported.path, noise)["scan"]
+    other = (expected[:, :1] > 0) != (found[:, :1] > 0)
+    apart = (expected - found).abs().masked_fill(other, 0)
+    reflectance = apart[:, 1:].max() if len(apart[0]) > 1 else 0.0
+    return Difference(float(apart[:, 0].max()), float(reflectance), int(other.sum()))
 
 
 def run(path: Path, noise: Tensor) -> dict[str, Tensor]:
     """Run an exported sampler: `scan` and `points`."""
     if path.suffix == ".pt2":
         with torch.no_grad(), warnings.catch_warnings(action="ignore"):
-            scan, points = torch.export.load(path).module()(noise)
-        return {"scan": scan, "points": points}
-    import onnxruntime
+            outputs = torch.export.load(path).module()(noise)
+    else:
+        import onnxruntime
 
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    names = [output.name for output in session.get_outputs()]
-    return dict(zip(names, map(torch.from_numpy, session.run(names, {"noise": noise.numpy()})), strict=True))
+        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        outputs = map(torch.from_numpy, session.run(["scan", "points"], {"noise": noise.numpy()}))
+    return dict(zip(("scan", "points"), outputs, strict=True))

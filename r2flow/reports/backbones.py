@@ -16,7 +16,7 @@ from r2flow.backbones import Backbone, build_backbone, configurations
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.sensors import Sensor
-from r2flow.reports.tables import print_table
+from r2flow.reports.tables import Row, print_table
 
 T = TypeVar("T")
 
@@ -26,7 +26,9 @@ RULE = (
 )
 
 ATEN = torch.ops.aten
-OPERATIONS: dict[Any, Callable[..., int]] = {  # two operations a multiply-accumulate, as the counter of torch
+OPERATIONS: dict[
+    Any, Callable[..., int]
+] = {  # two operations a multiply-accumulate, as the counter of torch
     ATEN.native_group_norm: lambda x, weight, *_, **__: 2 * math.prod(x) * (5 if weight else 4),
     ATEN.scaled_dot_product_attention.default: lambda *_, **__: 0,
 }
@@ -54,9 +56,14 @@ def count_macs(model: Backbone) -> int:
 
     A module may have a method `macs(inputs, output)`, which replaces what is counted in its calls outside its children.
     """
-    on_meta = {name: tensor.detach().to("meta") for name, tensor in (*model.named_parameters(), *model.named_buffers())}
+    on_meta = {
+        name: tensor.detach().to("meta")
+        for name, tensor in (*model.named_parameters(), *model.named_buffers())
+    }
     x = torch.empty(1, model.in_channels, *model.coords.shape[2:], device="meta")
-    calls: list[list[int]] = []  # of the modules that are being called: operations before, and those of inner calls
+    calls: list[
+        list[int]
+    ] = []  # of the modules that are being called: operations before, and those of inner calls
     stated: list[int] = []
 
     def enter(module: nn.Module, inputs: Any) -> None:
@@ -73,8 +80,13 @@ def count_macs(model: Backbone) -> int:
     handles = [module.register_forward_pre_hook(enter) for module in model.modules()]
     handles += [module.register_forward_hook(leave) for module in model.modules()]
     try:
-        with torch.inference_mode(), FlopCounterMode(display=False, custom_mapping=OPERATIONS) as counter:
-            torch.func.functional_call(model, on_meta, (torch.empty(1, device="meta"), x), tie_weights=False)
+        with (
+            torch.inference_mode(),
+            FlopCounterMode(display=False, custom_mapping=OPERATIONS) as counter,
+        ):
+            torch.func.functional_call(
+                model, on_meta, (torch.empty(1, device="meta"), x), tie_weights=False
+            )
     finally:
         for handle in handles:
             handle.remove()
@@ -83,7 +95,7 @@ def count_macs(model: Backbone) -> int:
 
 def backbone_costs(
     sensor: Sensor, names: Sequence[str] | None = None, repeats: int = 3, device: str = "cpu"
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[Row]:
     """Parameters, GMAC and median latency in float32 of every configuration for one image of two channels.
 
     The latency is None without `repeats`. A configuration that does not support the size has only an `error`.
@@ -100,7 +112,7 @@ def backbone_costs(
             yield {"name": name, **_cost_of(model, repeats, device)}
 
 
-def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> dict[str, Any]:
+def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> Row:
     """Parameters, GMAC and, if `repeats`, milliseconds of one evaluation for one image of a config's backbone."""
     generator = build_generator(config).eval()
     model = getattr(generator, "backbone", None)
@@ -109,13 +121,17 @@ def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> di
     return _cost_of(model, repeats, device)
 
 
-def _cost_of(model: Backbone, repeats: int, device: str) -> dict[str, Any]:
-    row: dict[str, Any] = {"parameters": count_parameters(model), "gmac": None, "latency_ms": None}
+def _cost_of(model: Backbone, repeats: int, device: str) -> Row:
+    row: Row = {"parameters": count_parameters(model), "gmac": None, "latency_ms": None}
     with suppress(Exception):  # of a network that cannot run on the meta device
         row["gmac"] = count_macs(model) / 1e9
     if repeats:
         shape = 1, model.in_channels, *model.coords.shape[2:]
-        model, x, t = model.to(device), torch.randn(shape, device=device), torch.full((1,), 0.5, device=device)
+        model, x, t = (
+            model.to(device),
+            torch.randn(shape, device=device),
+            torch.full((1,), 0.5, device=device),
+        )
         with torch.inference_mode():
             seconds = [timed(partial(model, t, x), device)[1] for _ in range(repeats + 1)]
         row["latency_ms"] = 1e3 * median(seconds[1:])  # without the warm-up
@@ -124,7 +140,9 @@ def _cost_of(model: Backbone, repeats: int, device: str) -> dict[str, Any]:
 
 def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T, float]:
     """Result of a call and its duration in seconds, including work on the device."""
-    wait = torch.accelerator.synchronize if torch.device(device).type != "cpu" else lambda device: None
+    wait = (
+        torch.accelerator.synchronize if torch.device(device).type != "cpu" else lambda device: None
+    )
     wait(device)
     begin = time.perf_counter()
     result = call()
@@ -132,11 +150,15 @@ def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T,
     return result, time.perf_counter() - begin
 
 
-def print_costs(rows: Sequence[dict[str, Any]], sensor: Sensor, device: str) -> None:
-    forms = {"parameters": "{:,}", "gmac": "{:.2f}", "latency_ms": "{:,.0f}"}
-    cells = [row | {key: form.format(row[key]) for key, form in forms.items() if row.get(key)} for row in rows]
-    columns = {"name": "backbone", "parameters": "parameters", "gmac": "GMAC", "latency_ms": "latency, ms"}
-    if any("error" in row for row in rows):
-        columns["error"] = ""
-    print_table(cells, columns, f"{' x '.join(map(str, sensor.shape))}, batch 1, float32, {device}")
+def print_costs(rows: Sequence[Row], sensor: Sensor, device: str) -> None:
+    """Print rows of `backbone_costs`."""
+    columns = {
+        "name": "backbone",
+        "parameters": "parameters",
+        "gmac": "GMAC",
+        "latency_ms": "latency, ms",
+        "error": "",
+    }
+    size = " x ".join(map(str, sensor.shape))
+    print_table(rows, columns, f"{size}, batch 1, float32, {device}")
     print(f"GMAC: {RULE}.")

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from r2flow import noise
 from r2flow.errors import InputError
@@ -20,24 +19,35 @@ from r2flow.metrics.panel import distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import complete
 from r2flow.reports.pages import Page
-from r2flow.reports.pictures import completed_figure
-from r2flow.reports.tables import table
+from r2flow.reports.tables import Row, table
 
 TASKS = ("rows:4", "rows:2", "random:0.5", "points:0.1", "sector:-11.25,11.25")
-COLUMNS = {
-    "method": "method", "evaluations": "evaluations", "seconds": "seconds",
-    "mae_common_m": "MAE where all return (m)", **UNITS, "panel": "panel",
-    "mae_of_median_m": "MAE of the median (m)", "crps_m": "CRPS (m)", "coverage": "coverage", "nominal": "of nominal",
-}  # fmt: skip
-INTERPOLATIONS: dict[str, Rule] = {"nearest": "nearest", "linear": "linear", "linear, 1/r": "inverse"}
+_COLUMNS = {
+    "method": "method",
+    "evaluations": "evaluations",
+    "seconds": "seconds",
+    "mae_common_m": "MAE where all return (m)",
+    **UNITS,
+    "panel": "panel",
+    "mae_of_median_m": "MAE of the median (m)",
+    "crps_m": "CRPS (m)",
+    "coverage": "coverage",
+    "nominal": "of nominal",
+}
+INTERPOLATIONS: dict[str, Rule] = {
+    "nearest": "nearest",
+    "linear": "linear",
+    "linear, 1/r": "inverse",
+}
 
 
-def measured_by(task: str, sensor: Sensor, number: int) -> np.ndarray:
+def kept_rays(task: str, sensor: Sensor, number: int) -> np.ndarray:
     """Rays of scan `number` that a mask keeps, (H, W) bool; depends only on both."""
-    measured = parse_mask(task)(np.ones(sensor.shape, dtype=bool), noise.generator(0, "condition", number))
-    if measured.all() or not measured.any():
-        raise InputError(f"the task {task!r} hides {'no' if measured.all() else 'every'} ray; give another mask.")
-    return measured
+    draws = noise.generator(0, "condition", number)
+    kept = parse_mask(task)(np.ones(sensor.shape, dtype=bool), draws)
+    if kept.all() or not kept.any():
+        raise InputError(f"the task {task!r} hides no ray or every ray; give another mask.")
+    return kept
 
 
 def completion_rows(
@@ -49,52 +59,55 @@ def completion_rows(
     seed: int = 0,
     batch_size: int = 4,
     progress: Progress = None,
-) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """One row per task and method, means over scans and their `num` answers, and the first answer to the first scan.
+) -> Iterator[Row]:
+    """One row per task and method, means over scans and their `num` answers.
 
     Methods are models with samplers, by name in tables, and interpolations, which have one answer.
     """
-    reference = panel(np.stack(truths), sensor)
+    real = np.stack(truths)
+    reference = panel(real, sensor)
     for task in tasks:
-        masks = [measured_by(task, sensor, i) for i in range(len(truths))]
-        given = [truth * mask for truth, mask in zip(truths, masks, strict=True)]
-        images = torch.from_numpy(np.stack(given))
-        state = ray_states(torch.from_numpy(np.stack(truths)), torch.from_numpy(np.stack(masks)))
-        answers: dict[str, list[np.ndarray]] = {}
-        cost: dict[str, tuple[float, float]] = {}
+        masks = np.stack([kept_rays(task, sensor, number) for number in range(len(real))])
+        given = real * masks[:, None]
+        state = ray_states(torch.from_numpy(real), torch.from_numpy(masks))
+        answers: dict[str, np.ndarray] = {}  # (scans, answers, channels, H, W) by method
         for name, rule in INTERPOLATIONS.items():
-            answers[name] = [interpolated(image, mask, rule)[None] for image, mask in zip(given, masks, strict=True)]
+            filled = [interpolated(*pair, rule)[None] for pair in zip(given, masks, strict=True)]
+            answers[name] = np.stack(filled)
+        cost = {}
+        how: Any = {"batch_size": batch_size, "progress": progress}
         for name, (checkpoint, sampler) in ways.items():
-            how: Any = {"sampler": sampler, "batch_size": batch_size, "progress": progress}
-            results = list(complete(checkpoint, images, state, num, seed, **how))
-            answers[name] = [result.images.numpy() for result in results]
-            evaluations = float(torch.cat([result.evaluations for result in results]).float().mean())
-            cost[name] = evaluations, sum(result.seconds for result in results) / num / len(results)
-        firsts = {name: [images[0] for images in of_method] for name, of_method in answers.items()}
-        channels = min(len(images[0]) for images in firsts.values())  # the panels are means of the same lines
-        cases = zip(truths, zip(*firsts.values(), strict=True), masks, strict=True)
-        common = means([dict(zip(answers, common_mae(x, y, ~mask), strict=True)) for x, y, mask in cases])
-        for name, of_method in answers.items():
-            evaluations, seconds = cost.get(name, (0.0, math.nan))
-            row = {"task": task, "method": name, "evaluations": evaluations, "seconds": seconds}
-            row["mae_common_m"] = common[name]
-            scans = list(zip(truths, of_method, masks, strict=True))
-            off = means([means([errors(x, y, ~mask, sensor) for y in images]) for x, images, mask in scans])
-            row |= {key: value for key, value in off.items() if not math.isnan(value)}
-            row["panel"] = mean_distance(distances(panel(np.stack(firsts[name])[:, :channels], sensor), reference))
-            if num > 1 and name in cost:
-                row |= means([spread_errors(x, images, ~mask) for x, images, mask in scans])
-            yield row, firsts[name][0]
+            how["sampler"] = sampler
+            results = list(complete(checkpoint, torch.from_numpy(given), state, num, seed, **how))
+            answers[name] = np.stack([result.images.numpy() for result in results])
+            cost[name] = {
+                "evaluations": float(np.mean([r.evaluations.float().mean() for r in results])),
+                "seconds": float(np.mean([r.seconds for r in results])) / num,
+            }
+        firsts = [images[:, 0] for images in answers.values()]
+        cases = list(zip(real, zip(*firsts, strict=True), ~masks, strict=True))
+        common = _mean_row([dict(zip(answers, common_mae(*case), strict=True)) for case in cases])
+        channels = min(images.shape[1] for images in firsts)
+        for name, images in answers.items():
+            scans = list(zip(real, images, ~masks, strict=True))
+            completed = panel(images[:, 0, :channels], sensor)
+            row = {"task": task, "method": name, "evaluations": 0.0, **cost.get(name, {})}
+            row["mae_common_m"] = common.get(name, math.nan)
+            row |= _mean_row([errors(x, y, hid, sensor) for x, each, hid in scans for y in each])
+            row["panel"] = mean_distance(distances(completed, reference))
+            if num > 1 and name in ways:
+                row |= _mean_row([spread_errors(*scan) for scan in scans])
+            yield row
 
 
-def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Mean of each column without NaN; NaN if all are NaN."""
-    columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
-    return {key: float("nan") if np.isnan(x).all() else float(np.nanmean(x)) for key, x in columns.items()}
+def _mean_row(rows: Sequence[Row]) -> Row:
+    """Mean of each column over the rows that have a number; without columns that have none."""
+    columns = {key: [row[key] for row in rows if not math.isnan(row[key])] for key in rows[0]}
+    return {key: float(np.mean(values)) for key, values in columns.items() if values}
 
 
-def completion_page(rows: Sequence[Mapping[str, Any]], figure: Figure, about: str, seed: int, device: str) -> Page:
-    """Build the page: a table per task, and the picture."""
+def completion_page(rows: Sequence[Row], about: str, seed: int, device: str) -> Page:
+    """Build the page: a table per task."""
     text = [
         f"{about} Figures are of the hidden rays, means over scans and answers, unless their name says otherwise: "
         "`MAE, all pixels` is LiDARGen's and RangeLDM's, IoU and Chamfer are of whole scans with the measured rays "
@@ -104,15 +117,7 @@ def completion_page(rows: Sequence[Mapping[str, Any]], figure: Figure, about: st
     ]
     for task in dict.fromkeys(row["task"] for row in rows):
         part = [row for row in rows if row["task"] == task]
-        columns = {key: heading for key, heading in COLUMNS.items() if any(key in row for row in part)}
+        known = {key for row in part for key in row}
+        columns = {key: heading for key, heading in _COLUMNS.items() if key in known}
         text += [f"## {task}", table(part, columns)]
-    return Page("completion", "Completed scans", text, rows, {"completion": figure}, {"noise": seed}, device)
-
-
-def pictured(truth: np.ndarray, shown: Sequence[tuple[Mapping[str, Any], np.ndarray]], sensor: Sensor) -> Figure:
-    """Figure of one scan and the first task: measured rays, answers, truth."""
-    task = shown[0][0]["task"]
-    measured = measured_by(task, sensor, 0)
-    answers = [(row["method"], image) for row, image in shown if row["task"] == task]
-    rows = [(f"measured, {task}", truth * measured), *answers]
-    return completed_figure(rows, ~measured, sensor.rays(), truth=(truth, np.zeros_like(measured)))
+    return Page("completion", "Completed scans", text, rows, {}, {"noise": seed}, device)

@@ -1,11 +1,8 @@
 """Straightness of the paths of trained flows: the paper's figure 8."""
 
 import logging
-import math
 from collections.abc import Mapping
-from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,11 +13,17 @@ from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
-from r2flow.reports.compare import labels
-from r2flow.reports.pages import STYLES, Page, blank_figure
-from r2flow.reports.tables import table
+from r2flow.reports.pages import Page, Plot, blank_figure, lines_figure
+from r2flow.reports.tables import Row, short_names, table
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
+
+_COLUMNS = {
+    "checkpoint": "checkpoint",
+    "integral": "int s dt",
+    "integral_normalised": "bend: int s dt / length^2",
+}
+_TIME = "t  (0 noise, 1 data)"
 
 
 def measure_paths(
@@ -40,43 +43,42 @@ def measure_paths(
     flow = as_flow(checkpoint.generator, "curvature")
     parts = []
     for first in range(0, num, batch_size):
-        x_0 = Draws(seed, range(first, min(first + batch_size, num))).start(flow.noise_shape).to(flow.device)
+        numbers = range(first, min(first + batch_size, num))
+        x_0 = Draws(seed, numbers).start(flow.noise_shape).to(flow.device)
         with torch.inference_mode():
             parts.append(straightness(flow.velocity, x_0, steps, most_curved, progress))
-    _, s, squared_length, bends, trajectories = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
-    if broken := int((~s.isfinite().all(1)).sum()):
-        log.warning("%s: s(t) is not finite for %d of %d scans.", label, broken, len(s))
+    joined = [torch.cat(part).cpu() for part in zip(*parts, strict=True)]
+    _, s, squared_length, bends, trajectories = joined
+    broken = int((~s.isfinite().all(1)).sum())
+    if broken:
+        _log.warning("%s: s(t) is not finite for %d of %d scans.", label, broken, len(s))
     order = bends.argsort(descending=True, stable=True)[:most_curved]
     return Straightness(parts[0].t, s, squared_length, bends[order], trajectories[order])
 
 
-def curvature_rows(flows: Mapping[str, Straightness]) -> list[dict[str, Any]]:
+def curvature_rows(flows: Mapping[str, Straightness]) -> list[Row]:
     """s(t) per checkpoint and time, mean over scans, unnormalised and over |d|^2."""
-    return [
-        {"checkpoint": label, "t": float(t), "s": float(s), "s_normalised": float(normalised)}
-        for label, flow in flows.items()
-        for t, s, normalised in zip(flow.t, flow.s.mean(0), flow.s_normalised.mean(0), strict=True)
-    ]
+    rows = []
+    for label, flow in flows.items():
+        means = zip(
+            flow.t.tolist(),
+            flow.s.mean(0).tolist(),
+            flow.s_normalised.mean(0).tolist(),
+            strict=True,
+        )
+        for t, s, normalised in means:
+            rows.append({"checkpoint": label, "t": t, "s": s, "s_normalised": normalised})
+    return rows
 
 
-def summary(label: str, flow: Straightness) -> dict[str, Any]:
-    mean = flow.s.mean(0)
-    total = float(mean.sum()) or math.nan
+def summary(label: str, flow: Straightness) -> Row:
+    """Integrals of s(t) of a flow, means over scans."""
     return {
         "checkpoint": label,
         "scans": len(flow.s),
-        "integral": float(mean.mean()),
+        "integral": float(flow.s.mean()),
         "integral_normalised": float(flow.s_normalised.mean()),
-        "t_of_most": float(flow.t[mean.argmax()]),
-        "first_tenth": float(mean[flow.t < 0.1].sum() / total),
-        "last_tenth": float(mean[flow.t >= 0.9].sum() / total),
     }
-
-
-COLUMNS = {
-    "checkpoint": "checkpoint", "integral": "int s dt", "integral_normalised": "bend: int s dt / length^2",
-    "t_of_most": "t of the maximum", "first_tenth": "share in t < 0.1", "last_tenth": "share in t >= 0.9",
-}  # fmt: skip
 
 
 def curvature_text(flows: Mapping[str, Straightness]) -> list[str]:
@@ -88,42 +90,43 @@ def curvature_text(flows: Mapping[str, Straightness]) -> list[str]:
         "path, which one step follows exactly. An untrained flow with v = 0 is straight too: compare int s dt over "
         "the squared length |x_1 - x_0|^2."
     )
-    return [about, table([summary(*flow) for flow in flows.items()], COLUMNS)]
+    return [about, table([summary(*flow) for flow in flows.items()], _COLUMNS)]
 
 
 def curvature_figure(flows: Mapping[str, Straightness]) -> Figure:
-    """Plot s(t), unnormalised and over |d|^2: one line per checkpoint, with the range over scans."""
-    figure = blank_figure(10, 4.2)
-    panels = {"s": "s(t) = |(x_1 - x_0) - v_t|²", "s_normalised": "s(t) / |x_1 - x_0|²"}
-    for axes, (name, label) in zip(figure.subplots(1, 2), panels.items(), strict=True):
-        for (checkpoint, flow), style in zip(flows.items(), cycle(STYLES), strict=False):
-            values, interval = getattr(flow, name), max(len(flow.t) // 8, 1)
-            axes.plot(flow.t, values.mean(0), **style, ms=5, lw=1.4, markevery=interval, label=checkpoint)
-            axes.fill_between(flow.t, values.amin(0), values.amax(0), color=style["color"], alpha=0.12, lw=0)
-        axes.set(xlabel="t  (0 noise, 1 data)", ylabel=label, xlim=(0, 1))
-        if any((getattr(flow, name) > 0).any() for flow in flows.values()):
-            axes.set_yscale("log")
-        axes.grid(True, which="both", color="0.9", lw=0.6)
-    figure.axes[0].legend(fontsize=8, framealpha=0.9)
-    return figure
+    """Plot s(t), mean over scans, unnormalised and over |d|^2: one line per checkpoint."""
+    plain = {label: (flow.t, flow.s.mean(0)) for label, flow in flows.items()}
+    normalised = {label: (flow.t, flow.s_normalised.mean(0)) for label, flow in flows.items()}
+    plots = [
+        Plot(_TIME, "s(t) = |(x_1 - x_0) - v_t|²", plain),
+        Plot(_TIME, "s(t) / |x_1 - x_0|²", normalised),
+    ]
+    return lines_figure(plots, 2)
 
 
 def trajectories_figure(flows: Mapping[str, Straightness]) -> Figure:
     """Plot the most curved paths, one panel per checkpoint: the paper's figure 8 (b)."""
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
-    for axes, flow, title in zip(panels, flows.values(), labels([Path(label) for label in flows]), strict=True):
-        axes.plot(np.append(flow.t, 1.0), flow.trajectories.T.numpy(), lw=0.7, alpha=0.8, color="0.55")
-        axes.set(xlabel="t  (0 noise, 1 data)", xlim=(0, 1))
-        axes.set_title(title, fontsize=9)
+    titles = short_names([Path(label) for label in flows])
+    for axes, flow, title in zip(panels, flows.values(), titles, strict=True):
+        t = np.append(flow.t, 1.0)
+        axes.plot(t, flow.trajectories.T.numpy(), lw=0.7, alpha=0.8, color="0.55")
         axes.axhline(-1, color="black", lw=0.9, ls=":", zorder=4)
-    panels[0].set_ylabel("value in model space (dotted: -1, ray-drop)")
+        axes.set(xlabel=_TIME, ylabel="value in model space (dotted: -1, ray-drop)")
+        axes.set_title(title, fontsize=9)
     return figure
 
 
 def curvature_page(flows: Mapping[str, Straightness], seed: int, device: str = "cpu") -> Page:
-    figures = {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)}
+    """Build the page of the straightness of flows."""
     return Page(
-        "curvature", "Straightness of flows", curvature_text(flows), curvature_rows(flows), figures,
-        {"scans": seed}, device, {"summary": [summary(*flow) for flow in flows.items()]},
-    )  # fmt: skip
+        "curvature",
+        "Straightness of flows",
+        curvature_text(flows),
+        curvature_rows(flows),
+        {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)},
+        {"scans": seed},
+        device,
+        {"summary": [summary(*flow) for flow in flows.items()]},
+    )

@@ -1,4 +1,4 @@
-"""Writing of reports: figures, JSON and Markdown, each with its provenance."""
+"""Reports: figures, JSON and Markdown, each with its provenance."""
 
 import json
 import math
@@ -8,12 +8,12 @@ import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
 
@@ -23,22 +23,20 @@ from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row, words
 
 # Markers and dashes distinguish lines without colour.
-_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (7, 2)), (0, (1, 1)), "-", "--", "-.", ":", "-")
-_COLOURS = (
-    "#000000", "#1f6fb4", "#b5301c", "#3d7d3a", "#8c4fb0", "#c77c11",
-    "#c2185b", "#0e6f6f", "#8f8f8f", "#d06a9e", "#7a5a2a", "#b9b936",
-)  # fmt: skip
 STYLES: tuple[dict[str, Any], ...] = tuple(
-    {"marker": marker, "linestyle": dash, "color": colour}
-    for marker, dash, colour in zip("os^DvPX*<>hp", _DASHES, _COLOURS, strict=True)
+    {"marker": marker, "linestyle": dash, "color": f"C{number}"}
+    for number, (marker, dash) in enumerate(
+        zip("os^DvPX*<>", ("-", "--", "-.", ":", "-") * 2, strict=True)
+    )
 )
 
 
 def command() -> str:
     """The command line of this process, quoted for a shell."""
     program, *arguments = sys.argv
-    verb = Path(program).stem in ("r2flow", "__main__")
-    return shlex.join([*(["r2flow"] if verb else ["python", program]), *arguments])
+    if Path(program).stem in ("r2flow", "__main__"):
+        return shlex.join(["r2flow", *arguments])
+    return shlex.join(["python", program, *arguments])
 
 
 @dataclass(frozen=True)
@@ -49,36 +47,41 @@ class Page:
     title: str
     text: Sequence[str]
     rows: Sequence[Row]
-    figures: Mapping[str, Figure]
+    figures: dict[str, Figure]
     seeds: Mapping[str, int] = field(default_factory=dict)
     device: str = "cpu"
     more: Mapping[str, Sequence[Row]] = field(default_factory=dict)
 
 
-def write_page(page: Page, out: str | Path) -> list[Path]:
+def write_page(page: Page, out: Path) -> list[Path]:
     """Write `out/NAME.png ...`, `NAME.pdf`, `NAME.json` and `NAME.md` atomically; returns the files."""
-    out, origin = Path(out), provenance(page)
-    written = [
-        save_figure(figure, out / f"{name}.{ending}", title=page.title, about=json.dumps(origin))
-        for name, figure in page.figures.items()
-        for ending in ("png", "pdf")
-    ]
-    for ending, content in ("json", _json(page, origin)), ("md", _markdown(page, origin)):
-        written.append(out / f"{page.name}.{ending}")
-        write_file(written[-1], content)
-    return written
+    origin = provenance(page)
+    written = []
+    for name, figure in page.figures.items():
+        for ending in ("png", "pdf"):
+            path = out / f"{name}.{ending}"
+            written.append(save_figure(figure, path, title=page.title, about=json.dumps(origin)))
+    data = out / f"{page.name}.json"
+    text = out / f"{page.name}.md"
+    write_json(page, data)
+    write_file(text, _markdown(page, origin))
+    return [*written, data, text]
 
 
 def write_json(page: Page, path: Path) -> None:
-    write_file(path, _json(page, provenance(page)))
+    """Write the rows of a page with their provenance."""
+    content = _plain({"origin": provenance(page), "rows": page.rows, **page.more})
+    write_file(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def provenance(page: Page) -> dict[str, Any]:
     """Machine, versions, seeds, date and command of a page; only the command has paths."""
     machine = {
-        "cpu": _cpu_name(), "cores": os.cpu_count() or 1, "threads": torch.get_num_threads(),
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
         "system": platform.platform(terse=True),
-    }  # fmt: skip
+    }
     if page.device.startswith("cuda"):
         machine["gpu"] = torch.cuda.get_device_name(page.device)
     return {
@@ -86,7 +89,11 @@ def provenance(page: Page) -> dict[str, Any]:
         "command": command(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine,
-        "versions": {"r2flow": r2flow.__version__, "torch": torch.__version__, "python": platform.python_version()},
+        "versions": {
+            "r2flow": r2flow.__version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        },
         "seeds": dict(page.seeds),
         "device": page.device,
     }
@@ -97,8 +104,44 @@ def blank_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), facecolor="white", layout="constrained")
 
 
-def _json(page: Page, origin: Mapping[str, Any]) -> str:
-    return json.dumps(_plain({"origin": origin, "rows": page.rows, **page.more}), indent=1, allow_nan=False) + "\n"
+class Plot(NamedTuple):
+    """Lines in one panel of a figure."""
+
+    x: str  # labels of the axes
+    y: str
+    lines: Mapping[str, tuple[Any, Any]]  # x and y by label
+    title: str = ""
+    log_x: bool = False
+
+
+def lines_figure(plots: Sequence[Plot], columns: int) -> Figure:
+    """Draw plots in rows of `columns`; equal labels share a style.
+
+    The y axis is logarithmic if its values are positive and differ by more than three times. The legend is left out
+    if there are more labels than styles.
+    """
+    labels = list(dict.fromkeys(label for plot in plots for label in plot.lines))
+    columns = min(columns, len(plots))
+    rows = math.ceil(len(plots) / columns)
+    legend = len(labels) <= len(STYLES)
+    figure = blank_figure(4.2 * columns + 0.4, 3.3 * rows + (0.18 * len(labels) if legend else 0))
+    for place, plot in enumerate(plots, 1):
+        axes = figure.add_subplot(rows, columns, place)
+        for label, (x, y) in plot.lines.items():
+            style = STYLES[labels.index(label) % len(STYLES)]
+            interval = max(len(x) // 8, 1)
+            axes.plot(x, y, **style, ms=4, lw=1.1, markevery=interval, label=label)
+        axes.set(xlabel=plot.x, ylabel=plot.y, xscale="log" if plot.log_x else "linear")
+        axes.set_title(plot.title, fontsize=9)
+        values = [v for _, y in plot.lines.values() for v in np.ravel(y) if math.isfinite(v)]
+        if values and 0 < 3 * min(values) < max(values):  # else its labels would be 1.11 x 10^0
+            axes.set_yscale("log")
+        axes.grid(color="0.88", lw=0.6)
+        axes.tick_params(which="both", labelsize=8)
+    if legend:
+        handles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
+        figure.legend(handles=handles.values(), fontsize=8, loc="outside lower left", frameon=False)
+    return figure
 
 
 def _plain(value: Any) -> Any:
@@ -107,18 +150,29 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
     pictures = [f"![{name.replace('_', ' ')}]({name}.png)" for name in page.figures]
-    lines = {key: (words(value) or "none") if isinstance(value, Mapping) else value for key, value in origin.items()}
-    notes = [f"- {key}: {text}" for key, text in lines.items() if key not in ("report", "command")]
-    again = ["## Where this comes from", "Made with", f"```\n{origin['command']}\n```", "\n".join(notes)]
+    notes = [
+        f"- {key}: {words(value) if isinstance(value, Mapping) else value}"
+        for key, value in origin.items()
+        if key not in ("report", "command")
+    ]
+    again = [
+        "## Where this comes from",
+        "Made with",
+        f"```\n{origin['command']}\n```",
+        "\n".join(notes),
+    ]
     return "\n\n".join([f"# {page.title}", *pictures, *page.text, *again]) + "\n"
 
 
 def _cpu_name() -> str:
-    with suppress(OSError, IndexError):
-        return re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))[0]
-    return platform.processor() or "unknown"
+    info = Path("/proc/cpuinfo")
+    if not info.is_file():
+        return platform.processor()
+    return str(re.findall(r"model name\s*: (.*)|$", info.read_text(encoding="utf-8"))[0])

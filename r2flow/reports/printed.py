@@ -6,10 +6,13 @@ against all real ones, Euler steps, NVIDIA RTX 6000 Ada.
 
 from typing import NamedTuple
 
-from r2flow.reports.evaluation import PRINTED
+from r2flow.reports.verdict import PRINTED
 
 # Name in `r2flow.metrics` -> (heading, factor of the printed values).
-COLUMNS = {key: PRINTED.get(key, (key.upper(), 1.0)) for key in ("frd", "frid", "fpd", "fpvd", "fsvd", "jsd", "mmd")}
+COLUMNS = {
+    key: PRINTED.get(key, (key.upper(), 1.0))
+    for key in ("frd", "frid", "fpd", "fpvd", "fsvd", "jsd", "mmd")
+}
 
 
 class Printed(NamedTuple):

@@ -1,42 +1,46 @@
 """Tables in Markdown and in the terminal."""
 
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
-
-from rich.cells import cell_len
 
 from r2flow.errors import one_line
 
-Row = Mapping[str, Any]
-# By key, with a heading for each in order; or cells in order, with a heading for each.
+Row = dict[str, Any]
+# Rows by key, with a heading for each key in order; or cells in order, with a heading for each.
 Rows = Sequence[Row] | Sequence[Sequence[Any]]
 Columns = Mapping[str, str] | Sequence[str]
 
-NUMBER = re.compile(r"[-+]?\d|-?$|none$|inf$")  # how cells of a right-aligned column begin
+_NUMBER = re.compile(r"[-+]?\d|-?$|none$|inf$")  # how cells of a right-aligned column begin
 
 
 def table(rows: Rows, columns: Columns) -> str:
     """Format rows as a Markdown table, numbers with three digits."""
-    headings, cells = _text(rows, columns)
-    escaped = [[cell.replace("|", "\\|") for cell in line] for line in (headings, *cells)]
-    first, *others = ["| " + " | ".join(line) + " |" for line in escaped]
-    return "\n".join([first, "|" + "---|" * len(headings), *others])
+    lines = [[cell.replace("|", "\\|") for cell in line] for line in _as_text(rows, columns)]
+    lines.insert(1, ["---"] * len(lines[0]))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
-    """Print rows as a table: numbers right-aligned, cells not truncated, no heading line if all headings are ""."""
-    headings, cells = _text(rows, columns)
-    lines = [headings, *cells] if any(headings) else cells
-    widths = [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
-    right = [bool(cells) and all(map(NUMBER.match, column)) for column in zip(*cells or [headings], strict=True)]
+    """Print rows as a table: numbers right-aligned, no heading line if all headings are ""."""
+    lines = _as_text(rows, columns)
+    first = 1
+    if not any(lines[0]):
+        lines = lines[1:]
+        first = 0
+    padded = []
+    for column in zip(*lines, strict=True):
+        numeric = all(map(_NUMBER.match, column[first:]))
+        pad = str.rjust if numeric else str.ljust
+        width = max(map(len, column))
+        padded.append([pad(cell, width) for cell in column])
     if title:
         print(title)
-    for line in lines:
-        gaps = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
-        padded = [gap + cell if r else cell + gap for cell, gap, r in zip(line, gaps, right, strict=True)]
-        print("  ".join(padded).rstrip())
+    for line in zip(*padded, strict=True):
+        print("  ".join(line).rstrip())
 
 
 def shown(value: Any) -> str:
@@ -49,7 +53,18 @@ def shown(value: Any) -> str:
         return str(value)
     if math.isnan(value):
         return "-"
-    return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.1e}"
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
+        return f"{value:.3g}"
+    return f"{value:.1e}"
+
+
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """Names of files or folders, with as many parents as needed to be unique."""
+    parts = [Path(os.path.abspath(path)).parts for path in paths]  # links keep their names
+    depth = 1
+    while len({names[-depth:] for names in parts}) < len(set(parts)):
+        depth += 1
+    return ["/".join(names[-depth:]) for names in parts]
 
 
 def words(values: Mapping[str, Any]) -> str:
@@ -57,7 +72,9 @@ def words(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{key} {shown(value)}" for key, value in values.items())
 
 
-def _text(rows: Rows, columns: Columns) -> tuple[list[str], list[list[str]]]:
+def _as_text(rows: Rows, columns: Columns) -> list[list[str]]:
+    """Headings and cells, line by line."""
+    lines: list[Any] = [columns, *rows]
     if isinstance(columns, Mapping):
-        rows, columns = [[row.get(key) for key in columns] for row in rows], list(columns.values())  # type: ignore[union-attr]
-    return [*map(one_line, columns)], [[one_line(shown(cell)) for cell in row] for row in rows]
+        lines = [columns.values(), *([row.get(key) for key in columns] for row in rows)]  # type: ignore[union-attr]
+    return [[one_line(shown(cell)) for cell in line] for line in lines]

@@ -178,11 +178,12 @@ def _chain(settings: dict[str, Any], given: Sequence[str], folders: Sequence[str
     if code := train_links(links, folders):
         return code
     if finished:
-        print(f"report: finished before, {out}")
+        print(f"report: finished before, {out / 'compare.md'}")
     elif int(os.environ.get("LOCAL_RANK", "0")) == 0:
-        from r2flow.reports.chain import report
+        from r2flow.reports.compare import report_chain
 
-        report({link.name: link.run_dir for link in links}, out, device=_report_device(settings["trainer"]))
+        runs = {link.name: link.run_dir for link in links}
+        report_chain(runs, out, _report_device(settings["trainer"]))
     return 0
 
 

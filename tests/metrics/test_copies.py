@@ -80,7 +80,6 @@ def test_real_scans_that_are_training_scans_are_left_out_of_the_test(r2flow, tmp
     for name, one in (("generated", nearest["generated"]), ("real halves", nearest["held"])):
         assert found["held"][name]["figures"]["copies"] == pytest.approx(np.median(one.distances), rel=1e-6)
     assert found["held"]["noise"]["metric"] != "copies"
-    assert (tmp_path / "page" / "evaluation_copies.png").stat().st_size > 0
 
 
 def test_scans_without_a_return_have_no_neighbour(sets, tmp_path):

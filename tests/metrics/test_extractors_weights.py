@@ -66,7 +66,7 @@ def test_every_network_says_where_its_weights_are_got(folder):
         assert page.startswith("http")
         assert kept(name) is None
         assert EXTRACTORS[name].name == name
-        with pytest.raises(InputError, match=f"no weights of {name} in {folder}.*r2flow weights --add {name} FILE"):
+        with pytest.raises(InputError, match=f"no weights of {name} in {folder}.*r2flow info --add {name} FILE"):
             EXTRACTORS[name].trained()
     with pytest.raises(InputError, match="no extractor named 'pointnett'"):
         EXTRACTORS["pointnett"].trained()
@@ -164,7 +164,7 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path):
 
 def test_the_table_says_which_weights_are_here(r2flow, pointnet, folder):
     def here() -> set[str]:
-        said = r2flow("weights").said
+        said = r2flow("info").said
         for words in ("FRD", "FRID", "FPD", "FSVD", "FPVD", "darknet53-1024.tar.gz", f"Looked for in {folder}"):
             assert words in said
         rows = [line.split() for line in said.splitlines() if line.split(" ")[0] in SOURCES]
@@ -172,11 +172,11 @@ def test_the_table_says_which_weights_are_here(r2flow, pointnet, folder):
         return {row[0] for row in rows if row[2] != "no"}
 
     assert here() == set()
-    said = r2flow("weights", "--add", "pointnet", pointnet[1]).said
+    said = r2flow("info", "--add", "pointnet", pointnet[1]).said
     assert said.startswith(f"{folder / 'pointnet.safetensors'}: weights ")
     assert said.endswith("of cls_model_39.pth\n")
     assert here() == {"pointnet"}
-    assert f"{said.split(': weights ')[1].split()[0]} of cls_model_39.pth" in r2flow("weights")[1]
+    assert f"{said.split(': weights ')[1].split()[0]} of cls_model_39.pth" in r2flow("info")[1]
 
 
 def test_the_table_of_networks_is_light():

@@ -51,8 +51,6 @@ def test_the_figures_are_those_of_paths_kept_whole(batch_size):
     np.testing.assert_allclose(found.trajectories, paths, atol=1e-5)
     row = summary("falling", found)
     assert row["integral"] == pytest.approx(s.mean(), rel=1e-4)
-    assert row["t_of_most"] == s.mean(0).argmax() / STEPS
-    assert row["last_tenth"] == pytest.approx(s[:, 15].sum() / s.sum(), rel=1e-4)  # of 16 steps, one begins after .9
     rows = curvature_rows({"falling": found})
     assert [r["t"] for r in rows] == [k / STEPS for k in range(STEPS)]
     assert rows[3]["s"] == pytest.approx(s[:, 3].mean(), rel=1e-4)

@@ -17,7 +17,6 @@ from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.noise import Draws
 from r2flow.reports.view import MOST, Panel, page
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
@@ -201,14 +200,6 @@ class TestTheVerb:
             data = Parsed((tmp_path / "a.html").read_text()).data
             assert [data["rays"][one["rays"]]["rows"] for one in data["scans"]] == rows
 
-    def test_goes_from_noise_to_scan(self, r2flow, saved, tmp_path):
-        assert r2flow("view", saved[0], "--num", 1, "--times", 3, "--out", tmp_path / "a.html")[0] == 0
-        data = Parsed((tmp_path / "a.html").read_text()).data
-        assert data["frames"] == ["t = 0", "t = 0.5", "t = 1"]
-        flow = load(saved[0])
-        noise = flow.encoding.decode(Draws(0, [0]).start(flow.generator.noise_shape))
-        assert np.abs(unpacked(data, 0, 0)[0] - noise[0, 0].numpy()).max() < 0.0021
-
     @pytest.mark.parametrize("screen", [True, False])
     def test_opens_a_browser_where_there_is_a_screen(self, r2flow, tmp_path, monkeypatch, screen):
         opened = []
@@ -223,7 +214,3 @@ class TestTheVerb:
         monkeypatch.setattr("r2flow.reports.view.MOST", 1)
         assert "Take fewer scans" in r2flow("view", tmp_path / "a.npy").refusal
         assert [path.name for path in tmp_path.iterdir()] == ["a.npy"]
-
-
-def test_the_way_of_a_model_that_draws_noise_is_that_of_its_ode(r2flow, tmp_path):
-    assert r2flow("view", "street", "--num", 1, "--times", 2, "--out", tmp_path / "way.html")[0] == 0

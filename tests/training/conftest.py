@@ -101,7 +101,6 @@ def run_train(cwd: Path, scans: Path, *overrides: str, check: bool = True, flags
     """The tiny run, a chain's links and a sweep's jobs too in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("r2flow.runs.chain.run_process", link_in_process)
-        patch.setattr("r2flow.reports.chain.MANY", 4)
         return in_process(cwd, [*flags, *tiny(scans, *overrides)], check)
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
-from r2flow.reports.chain import report
+from r2flow.reports.compare import report_chain
 from r2flow.runs.chain import Link, is_finished, links_of
 from r2flow.runs.composing import compose
 from r2flow.training import build
@@ -69,11 +70,11 @@ def assert_alike(first: Path, second: Path) -> None:
 
 def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
     run, said = chained
-    for name in ("report/chain.png", "report/chain.md", "report/chain.json", "report/000000.ply"):
+    for name in ("report/steps.png", "report/compare.md", "report/compare.json", "report/000000.ply"):
         assert (run / name).is_file(), name
     for words in ("[1/3] rf1", "[2/3] rf2", "[3/3] td2", "8 pairs", "evaluations a pair", "pairs/s", "r2flow sample"):
         assert words in said
-    assert said.rstrip().endswith("Open runs/demo/report/chain.png first.")
+    assert said.rstrip().endswith("Open runs/demo/report/steps.png first.")
     first, second, third = (load_checkpoint(run / link) for link in LINKS)
     assert [flow.config["stage"]["name"] for flow in (first, second, third)] == ["rectify", "reflow", "distill"]
     assert second.config["parent"]["weights"] == weights_hash(first)
@@ -210,13 +211,18 @@ def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path
 def test_a_chain_s_report_draws_what_each_system_can(chained: tuple[Path, str], tmp_path: Path):
     judge, first = {"name": "dcgan", "halvings": 2}, {"name": "autoencoder", "discriminator": {"layers": 1}}
     others = {
-        "gan.ckpt": {"stage": {"name": "gan", "discriminator": judge}, "generator": {"name": "dusty2", "doublings": 2}},
-        "ae.ckpt": {"stage": first, "generator": {"name": "vq_autoencoder"}},
+        "ae": {"stage": first, "generator": {"name": "vq_autoencoder"}},
+        "gan": {"stage": {"name": "gan", "discriminator": judge}, "generator": {"name": "dusty2", "doublings": 2}},
     }
-    runs = {name: write_checkpoint(tmp_path / name, CONFIG | other) for name, other in others.items()}
-    report({"rf1": chained[0] / "rf1"} | runs, tmp_path / "report", num=2)
-    rows = json.loads((tmp_path / "report" / "chain.json").read_text())["rows"]
-    assert [(row["flow"], row["steps"]) for row in rows] == [("rf1", 1), ("rf1", 32), ("gan.ckpt", 1)]
+    runs = {}
+    for name, other in others.items():
+        config = {**CONFIG, **other}
+        runs[name] = write_checkpoint(tmp_path / name / "checkpoints" / "step-00000007.ckpt", config).parent.parent
+        (runs[name] / "config.yaml").write_text(yaml.safe_dump(config))
+    report_chain({"rf1": chained[0] / "rf1"} | runs, tmp_path / "report")
+    rows = json.loads((tmp_path / "report" / "compare.json").read_text())["rows"]
+    assert [row["name"] for row in rows] == ["rf1", "ae", "gan"]
+    assert len(list((tmp_path / "report").glob("0*.ply"))) == 4  # of the GAN, the last that makes scans
 
 
 def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_options():

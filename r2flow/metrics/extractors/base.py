@@ -43,7 +43,7 @@ LARGEST = 2**31  # maximum file size in bytes; the largest network has 0.2 GB
 class Extractor(nn.Module, ABC):
     """A network that computes features of scans, for inference only.
 
-    A subclass defines `features`, and `trained` unless its weights come from `r2flow weights`.
+    A subclass defines `features`, and `trained` unless its weights come from `r2flow info --add`.
     """
 
     name: str  #: name in `r2flow.metrics.extractors.EXTRACTORS`
@@ -68,8 +68,8 @@ class Extractor(nn.Module, ABC):
         if not path.exists():
             raise InputError(
                 f"no weights of {cls.name} in {path.parent}: get "
-                f"{PurePosixPath(SOURCES[cls.name]).name} and give r2flow weights --add {cls.name} "
-                "FILE (r2flow weights lists sources)."
+                f"{PurePosixPath(SOURCES[cls.name]).name} and give r2flow info --add {cls.name} "
+                "FILE (r2flow info lists sources)."
             )
         with telling(path):
             extractor = cls.from_tensors(read_tensors(path)[0])

@@ -2,7 +2,7 @@
 
     rays = flow.sensor.rays()
     panels = [Panel(f"sample {i}", image[None], rays) for i, image in enumerate(flow.sample(4).numpy())]
-    write_page("scans.html", panels)
+    write_viewer(Path("scans.html"), panels)
 
 The page stores two bytes of range and one of reflectance per pixel, compressed by zlib, and the rays once; the browser
 computes the points.
@@ -27,9 +27,9 @@ from r2flow.files import write_file
 from r2flow.reports.pictures import HEIGHTS, RANGES, class_colours, colours
 
 MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB
-STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at most 2 mm
-CODES = 2**16
-SCALES = ("range", "height", "reflectance")  # in the order of `view.js`
+_STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at most 2 mm
+_CODES = 2**16
+_SCALES = ("range", "height", "reflectance")  # in the order of `view.js`
 
 
 class Panel(NamedTuple):
@@ -48,53 +48,81 @@ def page(panels: Sequence[Panel], title: str = "r2flow") -> str:
     Panels may differ in size and number of frames. The page takes about 50 kB and 130 kB for each image of 64 x 1024.
     Texts in it are never read as HTML.
     """
-    count, pixels = sum(len(p.images) for p in panels), sum(p.images[:, 0].size for p in panels)
+    # Only "<" could end the script element.
+    data = json.dumps(_contents(panels), separators=(",", ":"), allow_nan=False)
+    folder = files(__package__)
+    style = folder.joinpath("view.css").read_text("utf-8")
+    script = folder.joinpath("view.js").read_text("utf-8")
+    # The content security policy allows only this script and this style, by hash.
+    return Template(folder.joinpath("view.html").read_text("utf-8")).substitute(
+        title=html.escape(printable(title)),
+        data=data.replace("<", "\\u003c"),
+        style=style,
+        script=script,
+        style_hash=_digest(style),
+        script_hash=_digest(script),
+    )
+
+
+def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
+    """What the script of a page draws."""
+    count = sum(len(panel.images) for panel in panels)
+    pixels = sum(panel.images[:, 0].size for panel in panels)
     if not 0 < pixels <= MOST:
         raise InputError(
             f"a page holds 1 to 256 images of 64 x 1024 (33 MB), or {MOST:,} pixels; found {count} images with "
             f"{pixels:,}. Take fewer scans or frames (--num)."
         )
-    sensors: dict[bytes, tuple[int, dict[str, Any]]] = {}
-    labelled = [p.labels[p.labels > 0] for p in panels if p.labels is not None]
+    sensors: dict[bytes, int] = {}
+    described = []
+    labelled = [panel.labels[panel.labels > 0] for panel in panels if panel.labels is not None]
     classes = class_colours(np.concatenate(labelled), most=255) if labelled else {}
-    step = max(STEP, max(float(np.nan_to_num(p.images[:, 0], posinf=0).max(initial=0)) for p in panels) / (CODES - 1))
+    farthest = max(np.nan_to_num(panel.images[:, 0], posinf=0).max() for panel in panels)
+    step = max(_STEP, float(farthest) / (_CODES - 1))
     scans = []
-    for caption, images, rays, labels, _ in panels:
-        assert images.shape[1] in (1, 2)
-        assert rays.shape == (2, *images.shape[2:]), f"{caption}: images of {images.shape[2:]}, rays of {rays.shape}"
-        angles = np.asarray(rays, dtype=np.float64)
-        number, _ = sensors.setdefault(angles.tobytes(), (len(sensors), _described(angles)))
-        numbers = [None] * len(images) if labels is None else _numbered(labels, classes)
-        scans.append({
-            "caption": printable(caption), "rays": number,
-            "frames": [packed_image(image, step, ids) for image, ids in zip(images, numbers, strict=True)],
-            "reflectance": images.shape[1] > 1, "labels": labels is not None,
-        })  # fmt: skip
-    contents = {
+    for panel in panels:
+        angles = np.asarray(panel.rays, dtype=np.float64)
+        key = angles.tobytes()
+        if key not in sensors:
+            sensors[key] = len(sensors)
+            described.append(_described(angles))
+        classified: Any = [None] * len(panel.images)
+        if panel.labels is not None:
+            classified = _class_numbers(panel.labels, classes)
+        scans.append(
+            {
+                "caption": printable(panel.caption),
+                "rays": sensors[key],
+                "frames": [
+                    packed_image(image, step, numbers)
+                    for image, numbers in zip(panel.images, classified, strict=True)
+                ],
+                "reflectance": panel.images.shape[1] > 1,
+                "labels": panel.labels is not None,
+            }
+        )
+    table = [colours(name)(np.arange(256), bytes=True) for name in _SCALES]
+    return {
         "scans": scans,
-        "rays": [described for _, described in sensors.values()],
+        "rays": described,
         "frames": [printable(frame) for frame in max((p.frames for p in panels), key=len)],
         "metres": step,
         "ranges": RANGES,
         "heights": HEIGHTS,
-        "colours": _text(b"".join(colours(name)(np.arange(256), bytes=True).tobytes() for name in SCALES)),
+        "colours": _base64(np.stack(table).tobytes()),
         "classes": [("no class", "#808080"), *classes.values()],
         "legend": list(dict(classes.values()).items()),
-        "shown": {"reflectance": any(s["reflectance"] for s in scans), "label": any(s["labels"] for s in scans)},
+        "shown": {
+            "reflectance": any(scan["reflectance"] for scan in scans),
+            "label": bool(labelled),
+        },
     }
-    # The content security policy allows only this script and this style, by hash.
-    part = {name: files(__package__).joinpath(f"view.{name}").read_text("utf-8") for name in ("html", "css", "js")}
-    # Only "<" could end the script element.
-    data = json.dumps(contents, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    return Template(part["html"]).substitute(
-        title=html.escape(printable(title)), data=data, style=part["css"], script=part["js"],
-        style_hash=_hash(part["css"]), script_hash=_hash(part["js"]),
-    )  # fmt: skip
 
 
-def write_page(path: str | Path, panels: Sequence[Panel], title: str = "r2flow") -> Path:
+def write_viewer(path: Path, panels: Sequence[Panel], title: str = "r2flow") -> Path:
+    """Write `page` to a file."""
     write_file(path, page(panels, title))
-    return Path(path)
+    return path
 
 
 def most_images(shape: Sequence[int]) -> int:
@@ -109,36 +137,41 @@ def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = No
     levels; optionally class numbers. Code c means c `step` metres, 0 no return.
     """
     r = np.nan_to_num(image[0].astype(np.float64), posinf=0, neginf=0)
-    codes = np.where(r > 0, np.clip(np.rint(r / step), 1, CODES - 1), 0).astype(np.int32)
-    differences = (np.diff(codes, axis=1, prepend=0) % CODES).astype(">u2")
+    codes = np.where(r > 0, np.clip(np.rint(r / step), 1, _CODES - 1), 0).astype(np.int32)
+    differences = (np.diff(codes, axis=1, prepend=0) % _CODES).astype(">u2")
     planes = [differences.view(np.uint8).reshape(-1, 2).T.tobytes()]
     if len(image) > 1:
         planes.append(np.rint(255 * np.nan_to_num(image[1]).clip(0, 1)).astype(np.uint8).tobytes())
     if numbers is not None:
         planes.append(numbers.astype(np.uint8).tobytes())
-    return _text(zlib.compress(b"".join(planes), 6))
+    return _base64(zlib.compress(b"".join(planes), 6))
 
 
 def _described(rays: np.ndarray) -> dict[str, Any]:
     """Rays, (2, H, W), as elevations of rows and azimuths of columns, which all sensors have."""
-    e, a = rays
+    elevations = rays[0, :, 0]
+    azimuths = rays[1, 0]
     # The geometric mean of the median angles between neighbouring rows and columns, in radians.
-    gaps = [float(np.median(np.abs(np.diff(x, axis=axis)))) for axis, x in enumerate((e, a)) if x.shape[axis] > 1]
-    spacing = float(np.prod(gaps) ** (1 / len(gaps))) if gaps else 0.01
-    angles = {"elevations": e[:, 0].round(7).tolist(), "azimuths": a[0].round(7).tolist()}
-    return {"rows": e.shape[0], "columns": e.shape[1], "spacing": spacing, **angles}
+    gaps = [np.median(np.abs(np.diff(x))) for x in (elevations, azimuths) if len(x) > 1]
+    return {
+        "rows": len(elevations),
+        "columns": len(azimuths),
+        "spacing": float(np.prod(gaps) ** (1 / len(gaps))),
+        "elevations": elevations.round(7).tolist(),
+        "azimuths": azimuths.round(7).tolist(),
+    }
 
 
-def _numbered(ids: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:
+def _class_numbers(ids: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:
     """Class number of each id, from 1, (T, H, W); 0 for ids without a class."""
-    table = np.zeros(int(max(ids.max(initial=0), *classes, 0)) + 1, np.uint8)
+    table = np.zeros(int(max(ids.max(), *classes, 0)) + 1, np.uint8)
     table[list(classes)] = np.arange(1, len(classes) + 1)
     return table[ids]
 
 
-def _hash(text: str) -> str:
-    return "sha256-" + _text(hashlib.sha256(text.encode()).digest())
+def _digest(text: str) -> str:
+    return "sha256-" + _base64(hashlib.sha256(text.encode()).digest())
 
 
-def _text(content: bytes) -> str:
+def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode()

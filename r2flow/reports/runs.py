@@ -1,0 +1,92 @@
+"""Runs read from their folders, for comparison."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+from r2flow.errors import InputError, naming
+from r2flow.model.checkpoint import checkpoints_of, step_of
+from r2flow.plugins import made_with
+from r2flow.reports.backbones import cost
+from r2flow.reports.tables import Row, short_names
+from r2flow.reports.training import CURVES, Curve, read_curves
+from r2flow.runs.folder import CONFIG, read_config
+
+
+class ComparedRun(NamedTuple):
+    """A run, read from its folder."""
+
+    label: str
+    config: Row
+    values: Row  # by column; None where the folder does not hold one
+    curves: dict[str, Curve]  # (steps, values) by logged name
+
+
+def find_runs(paths: Sequence[Path]) -> list[Path]:
+    """Given run folders, and the runs in folders of runs (a chain, a sweep, a sweep of chains).
+
+    Other paths, as in `runs/sweep/*`, are skipped if there is any run.
+    """
+    runs: dict[Path, Path] = {}  # a link and its run are one
+    for path in paths:
+        inside = [
+            run.parent for level in ("", "*/", "*/*/") for run in sorted(path.glob(level + CONFIG))
+        ]
+        if path in inside:
+            inside = [path]
+        runs |= {
+            run.resolve(): run for run in inside if run == path or not run.name.startswith(".")
+        }
+    wrong = [path for path in paths if not runs or not path.exists()]
+    if wrong:
+        raise InputError(
+            f"{wrong[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written."
+        )
+    return list(runs.values())
+
+
+def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
+    """Read all runs; build each network once."""
+    folders = find_runs(paths)
+    costs: dict[str, Row] = {}
+    runs = []
+    for path, label in zip(folders, short_names(folders), strict=True):
+        config = read_config(path) or {}
+        if not {"stage", "backbone", "data", "sensor", "encoding"} <= config.keys():
+            raise InputError(f"{path / CONFIG} is not the config of a run.")
+        keys = ("sensor", "encoding", "backbone", "generator")
+        architecture = json.dumps([config.get(key) for key in keys], sort_keys=True)
+        if architecture not in costs:
+            with naming(path), made_with(config, str(path)):
+                costs[architecture] = cost(config)
+        curves = read_curves(path, tuple(CURVES))
+        values = costs[architecture] | _read_values(path, config, curves)
+        runs.append(ComparedRun(label, config, values, curves))
+    return runs
+
+
+def _read_values(path: Path, config: Row, curves: Mapping[str, Curve]) -> Row:
+    """Columns of a run that do not depend on its network."""
+    train, validation, bend = (
+        curves[name][1].tolist() if name in curves else [] for name in CURVES
+    )
+    kept = [step_of(checkpoint) for checkpoint in checkpoints_of(path)[:1]]
+    step = max(kept or [int(steps[-1]) for steps, _ in curves.values()], default=None)
+    stage = config["stage"]
+    data = config["data"]
+    scans = "" if data["name"] == "pairs" else data.get("root") or ""
+    return {
+        "stage": f"{stage['name']} {stage.get('steps', '')}".strip(),
+        "loss": str([stage.get(key) for key in ("loss", "time")]),
+        "data": f"{data['name']} {scans}".strip(),
+        "backbone": (config["backbone"] or {}).get("name"),
+        "steps": step,
+        "images": step and step * int(data["batch_size"]),
+        "train_loss": fmean(train[-max(len(train) // 10, 1) :]) if train else None,
+        "val_best": min(validation, key=lambda loss: (math.isnan(loss), loss), default=None),
+        "val_last": validation[-1] if validation else None,
+        "bend": bend[-1] if bend else None,
+    }
