@@ -18,6 +18,21 @@ from .progress import Progress
 from .reflow_pairs import ReflowPairs
 from .stopping import Stopping
 
+__all__ = [
+    "CALLBACKS",
+    "EMA",
+    "Checkpoints",
+    "Curvature",
+    "Guard",
+    "HalfLifeEMA",
+    "LearningRates",
+    "Progress",
+    "ReflowPairs",
+    "SamplePictures",
+    "Stopping",
+    "build_callbacks",
+]
+
 if __name__ != "r2flow.callbacks":  # callbacks look up each other by class, and a second copy has other classes
     raise ImportError("import r2flow.callbacks, not callbacks: the folder is part of the package r2flow.")
 

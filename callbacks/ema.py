@@ -114,7 +114,7 @@ class HalfLifeEMA(EMA):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         super().on_train_start(trainer, pl_module)
-        self.batch_size = pl_module.images_per_step
+        self.batch_size: Any = pl_module.images_per_step
 
     def _decay(self) -> float:
         return half_life_decay(self._step + 1, self.batch_size, self.half_life, self.rampup)

@@ -10,7 +10,6 @@ from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, 
 
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
-from pydantic.dataclasses import dataclass as checked_dataclass
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from r2flow.errors import InputError
@@ -28,11 +27,10 @@ Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Portion = Annotated[float, Field(ge=0, lt=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
-# A frozen dataclass of options whose values are checked, also by Python callers.
-options_class = partial(checked_dataclass, frozen=True, config=STRICT)
+strict = with_config(STRICT)  # decorates a dataclass of options: no unknown ones, no NaN
 
 
-def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:  # noqa: N802 (as pydantic's Field)
+def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:
     """Range of an option, in its annotation: `width: Annotated[int, Bound("odd", lambda n: n % 2)]`."""
 
     def validate(value: Any) -> Any:
@@ -85,11 +83,13 @@ class Registry(Mapping[str, T]):
     def __getitem__(self, name: str) -> T:
         if name not in self:
             names = sorted({*self, *presets(self.kind)})
-            raise UnknownName(f"no {self.kind} named {name!r}; known: {', '.join(names)}.{did_you_mean(str(name), names)}")
-        entry = self._entries[name]
+            hint = did_you_mean(str(name), names)
+            raise UnknownName(f"no {self.kind} named {name!r}; known: {', '.join(names)}.{hint}")
+        entry: Any = self._entries[name]
         if isinstance(entry, _Lazy):
             found: Any = resolve_name(entry.place)
-            entry = self._entries[name] = partial(found, *entry.given) if entry.given else found
+            entry = partial(found, *entry.given) if entry.given else found
+            self._entries[name] = entry
         return entry
 
     def __iter__(self) -> Iterator[str]:
@@ -155,7 +155,9 @@ def presets(group: str) -> dict[str, dict[str, Any]]:
     return {name: merged(name) for name in read}
 
 
-def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> dict[str, Any]:
+def check_options(
+    what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0
+) -> dict[str, Any]:
     """Options as a constructor takes them that has `given` further arguments by position.
 
     Raises:
@@ -199,9 +201,9 @@ def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[dict[str
     for name, parameter in _by_keyword(constructor, given).items():
         annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
         fields[name] = Required[annotation] if parameter.default is parameter.empty else NotRequired[annotation]
-    options = TypedDict("options", fields)  # type: ignore[operator]
-    open_ended = ConfigDict(STRICT, extra="allow") if _takes_any(constructor) else STRICT
-    return TypeAdapter(with_config(open_ended)(options))
+    make: Any = TypedDict
+    config = ConfigDict(STRICT, extra="allow") if _takes_any(constructor) else STRICT
+    return TypeAdapter(with_config(config)(make("options", fields)))
 
 
 def _takes_any(constructor: Callable[..., Any]) -> bool:

@@ -38,7 +38,7 @@ from r2flow.errors import InputError, check_folder, one_line
 from r2flow.model.checkpoint import MODEL, checkpoints_of, config_of, step_of
 from r2flow.model.lineage import Parent, find_parent, model_options
 from r2flow.plugins import loaded_plugins, made_with
-from r2flow.registry import Bound, Natural, Seed, construct, options_class
+from r2flow.registry import Bound, Natural, Seed, construct, strict
 from r2flow.reports.training import finish, read_curves
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import check_run, has_ended, open_run, read_config, run_lock
@@ -66,14 +66,16 @@ Named = Annotated[Mapping[str, Any], Bound("a group with a name", lambda group: 
 InRuns = Annotated[str, Bound("a folder in runs", lambda name: name.strip("./") and ".." not in Path(name).parts)]
 
 
-@options_class
+@strict
+@dataclass(frozen=True)
 class SampleOptions:
     """Samples drawn at the end of a run."""
 
     num: Natural = 4
 
 
-@options_class
+@strict
+@dataclass(frozen=True)
 class RunConfig:
     """Top-level keys of a run's config. Those of the groups are the options of the classes that they are for."""
 
@@ -244,7 +246,9 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
         if options["max_steps"] > 0:  # a short run is validated once, at its end
             interval = min(interval, options["max_steps"])
         options["val_check_interval"] = interval * options["accumulate_grad_batches"]
-    callbacks = [Progress()] if options["fast_dev_run"] else build_callbacks(run.callbacks)
+    callbacks: list[L.Callback] = [Progress()]
+    if not options["fast_dev_run"]:
+        callbacks = build_callbacks(run.callbacks)
     for key, kind in (("enable_checkpointing", Checkpoint), ("enable_progress_bar", ProgressBar)):
         if not options[key]:
             callbacks = [callback for callback in callbacks if not isinstance(callback, kind)]

@@ -56,10 +56,10 @@ def build_backbone(
     """
     if options is None:
         raise InputError("stage.parent names a run without a backbone: leave it out, or name a flow.")
-    channels = {"in_channels": in_channels, "out_channels": out_channels or in_channels}
-    times = {"second_time": True} if second_time else {}  # a plug-in may have one time only
-    built = BACKBONES.build(options, rays, **channels, **times)
-    return built
+    given: dict[str, Any] = {"in_channels": in_channels, "out_channels": out_channels or in_channels}
+    if second_time:  # a plug-in may have one time only
+        given["second_time"] = True
+    return BACKBONES.build(options, rays, **given)
 
 
 def configurations() -> Registry[dict[str, Any]]:

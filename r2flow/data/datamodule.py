@@ -76,7 +76,8 @@ class ScanDataModule(L.LightningDataModule):
             if self.augment:
                 raise InputError("data.augment changes scans, and an augmented pair is not a flow's; leave it out.")
         self.described_sets = [Described(part.name, part) for part in self.plan.sets]  # listed once
-        self.described_held_out = self.plan.held_out and Described(self.plan.held_out.name, self.plan.held_out)
+        held_out = self.plan.held_out
+        self.described_held_out = None if held_out is None else Described(held_out.name, held_out)
         self.item_format: ItemFormat | None = None
         self.names: list[str] = []
         self.opened: Sequence[Mixture] = ()  # as found, before they are read

@@ -161,8 +161,8 @@ class Described:
             return
         theirs, ours = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (self.stored.sensor, sensor))
         raise InputError(
-            f"{self.options.folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: give no other --sensor "
-            "or --size, no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, "
+            f"{self.options.folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: give no other "
+            "--sensor or --size, no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, "
             ".bin)."
         )
 
@@ -296,10 +296,7 @@ def reading_for(
     described = [describe(spec) for spec in scans if spec is not None]
     stored = next((one.stored for one in described if one.stored is not None), None)
     first = described[0] if described else Described("", SourceOptions(FOLDER))
-    if model:
-        reading = _reading_of(model)
-    else:
-        reading = stored or Reading(SENSORS[first.kind.sensor])
+    reading = _reading_of(model) if model else stored or Reading(SENSORS[first.kind.sensor])
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if v is not None}
     reading = replace(reading, **given)
     if described and not (model or stored or sensor):
@@ -347,8 +344,8 @@ def read(
     scans = describe(path)
     if scans.file is None:
         raise InputError(f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
-    given = {"sensor": sensor, "reflectance_scale": reflectance_scale, "columns": columns}
-    reading = reading_for([scans], estimate_scale=True, **given)
+    fields = {"reflectance_scale": reflectance_scale, "columns": columns}
+    reading = reading_for([scans], sensor=sensor, estimate_scale=True, **fields)
     image = torch.from_numpy(open_scans(scans, replace(reading, on_bad_scan="error", within_limits=True)).source[0])
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
 

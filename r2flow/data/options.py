@@ -1,7 +1,7 @@
 """Keys of a run's `data`: types, defaults and meaning."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +11,7 @@ from r2flow.errors import InputError
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
-from r2flow.registry import Count, Natural, NonNegative, Portion, Positive, Seed, options_class
+from r2flow.registry import Count, Natural, NonNegative, Portion, Positive, Seed, strict
 from r2flow.samplers import build_sampler
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # names in `r2flow.data.opening.SOURCES`
@@ -19,7 +19,8 @@ MIXED, PAIRS = "mixed", "pairs"  # other values of `data.name`: several sets of 
 Data = dict[str, Any]  # of a config
 
 
-@options_class
+@strict
+@dataclass(frozen=True)
 class ReadingOptions:
     """Fields of a `Reading` in a config (`data.reading`); None: from the parent run or the scans, or default."""
 
@@ -38,7 +39,8 @@ class ReadingOptions:
         return {key: value for key, value in asdict(self).items() if value is not None}
 
 
-@options_class
+@strict
+@dataclass(frozen=True)
 class SourceOptions:
     """One set of scans."""
 
@@ -62,7 +64,8 @@ class SourceOptions:
         return Path(str(self.root)).expanduser()
 
 
-@options_class
+@strict
+@dataclass(frozen=True)
 class PartOptions(SourceOptions):
     """One part of a mixture (`data.parts`)."""
 
@@ -70,7 +73,8 @@ class PartOptions(SourceOptions):
     sensor: Mapping[str, Any] | None = None  # `build_sensor`; None: the run's. Only stage=transfer takes several
 
 
-@options_class
+@strict
+@dataclass(frozen=True)
 class ValidationOptions:
     """Held-out scans (`data.validation`)."""
 
@@ -79,12 +83,13 @@ class ValidationOptions:
     data: Mapping[str, Any] | None = None  # another set of scans to hold out instead: {name, root, split, drives, ...}
 
 
-@options_class
+@strict
+@dataclass(frozen=True)
 class PairOptions:
     """Settings of a set of pairs (`data.pairs`)."""
 
     num: Count = 1000
-    sampler: Mapping[str, Any] = Field(default_factory=lambda: {"name": "adams3"})  # of the flow that draws them
+    sampler: Mapping[str, Any] = field(default_factory=lambda: {"name": "adams3"})  # of the flow that draws them
     batch_size: Count = 16  # pairs solved in one batch; the last bits of a pair depend on it
     shard_mib: Positive = 16.0  # size of a shard; a killed process repeats its shard
     seed: Seed = 0  # seed of the noise, separate from the run's: runs of several seeds can share one set of pairs
@@ -97,7 +102,8 @@ class PairOptions:
         build_sampler(self.sampler)
 
 
-@options_class
+@strict
+@dataclass(frozen=True)
 class DataOptions(SourceOptions):
     """All keys of a run's `data`. `name` may also be `mixed` or `pairs`; for `pairs`, `root` is their folder.
 

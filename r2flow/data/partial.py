@@ -71,14 +71,16 @@ def open_partial(
         elif scans.file is not None:
             files.setdefault(scans.file.parent, []).append(scans)
         else:
-            paths = [points_beside(scans.paths[number]) for number in spread(len(scans.paths), most or len(scans.paths))]
+            count = len(scans.paths)
+            paths = [points_beside(Path(scans.paths[number])) for number in spread(count, most or count)]
             opened.append(_files(scans, paths, reading, source, scale))
     for together in files.values():
-        opened.append(_files(together[0], [one.file for one in together if one.file], reading, source, scale))
-    scans = [scan for some, _ in opened for scan in some]
-    if duplicates := [name for name, count in Counter(scan.name for scan in scans).items() if count > 1]:
+        paths = [one.file for one in together if one.file]
+        opened.append(_files(together[0], paths, reading, source, scale))
+    partial_scans = [scan for some, _ in opened for scan in some]
+    if duplicates := [name for name, count in Counter(scan.name for scan in partial_scans).items() if count > 1]:
         raise InputError(f"two of the scans would have answers called {duplicates[0]}: complete them apart.")
-    return scans, [line for _, lines in opened for line in lines]
+    return partial_scans, [line for _, lines in opened for line in lines]
 
 
 def _files(

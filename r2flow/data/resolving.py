@@ -1,7 +1,7 @@
 """Fill in the defaults of a run's `data`, once."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from r2flow.data.opening import SOURCES, Described
@@ -46,7 +46,7 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
     if options.name == MIXED:
         sets = _parts(options, sensor)
     elif options.name != PAIRS:
-        single = {key: getattr(options, key) for key in SourceOptions.__dataclass_fields__}
+        single = {field.name: getattr(options, field.name) for field in fields(SourceOptions)}
         sets = [_complete(PartOptions(**single), options.chosen, sensor)]
     held_out = None
     if options.validation.data is not None:

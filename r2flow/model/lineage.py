@@ -90,6 +90,7 @@ def model_options(
     encoding = given.get("encoding")
     generator = _generator(given.get("generator"), theirs.get("generator"), generator_name)
     backbone = given.get("backbone")
+    options: dict[str, Any]
     if parent is None:
         options = {
             "backbone": BACKBONES.options(backbone or DEFAULT_BACKBONE),
@@ -108,7 +109,8 @@ def model_options(
         for group, keys in free.items():
             _refuse_other(group, options[group], theirs[group], keys, parent.path)
     if options["encoding"]["reflectance"] == AUTO:
-        options["encoding"] = {**options["encoding"], "reflectance": theirs.get("encoding", {}).get("reflectance", True)}
+        reflectance = theirs.get("encoding", {}).get("reflectance", True)
+        options["encoding"] = {**options["encoding"], "reflectance": reflectance}
     return {**options, "generator": generator}
 
 

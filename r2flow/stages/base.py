@@ -152,11 +152,11 @@ class Stage(L.LightningModule):
     @property
     def images_per_step(self) -> int:
         """Images of an optimiser step, on all devices."""
-        data = self.trainer.datamodule
+        data = getattr(self.trainer, "datamodule", None)
         if data is not None and hasattr(data, "batch_size"):
             return int(data.batch_size)
         self.trainer.fit_loop.setup_data()
-        loader = self.trainer.train_dataloader
+        loader: Any = self.trainer.train_dataloader
         return loader.batch_size * self.trainer.world_size * self.trainer.accumulate_grad_batches
 
     @property
@@ -190,12 +190,12 @@ class Stage(L.LightningModule):
         # Dropout uses torch's global generator: seeding it by position makes a resumed run draw the same numbers.
         parts = self.trainer.accumulate_grad_batches
         position = self.global_step * parts + batch_idx % parts
-        seed_torch(self.hparams.seed, "dropout", position * self.trainer.world_size + self.global_rank)
+        seed_torch(self.hparams["seed"], "dropout", position * self.trainer.world_size + self.global_rank)
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Scans of the numbers `k`: range in metres and reflectance, (B, 2 or 1, H, W), 0 without a return."""
         numbers = self.whole_batch(batch)["k"].tolist()
-        return draw(self.generator, numbers, self.hparams.seed).images
+        return draw(self.generator, numbers, self.hparams["seed"]).images
 
     def on_test_start(self) -> None:
         self.panel = METRICS["panel"](sensor=self.sensor)
@@ -215,12 +215,13 @@ class Stage(L.LightningModule):
     def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
         """AdamW or `Muon` with a schedule for each group of parameters, in the format of `configure_optimizers`."""
         options = self.hparams
-        adam = {"lr": options.learning_rate, "betas": tuple(options.betas), "weight_decay": options.weight_decay}
+        adam: dict[str, Any] = {"lr": options["learning_rate"], "betas": tuple(options["betas"])}
+        adam["weight_decay"] = options["weight_decay"]
         optimizers: list[torch.optim.Optimizer] = []
         for group in groups:
-            muon = options.muon
+            muon = options["muon"]
             optimizers.append(torch.optim.AdamW(group, **adam) if muon is None else Muon(group, muon, **adam))
-        warmup = options.warmup_images // self.images_per_step
+        warmup = options["warmup_images"] // self.images_per_step
 
         def factor(step: int) -> float:
             if step < warmup:

@@ -50,15 +50,15 @@ class LearnFlowMap(Reflow):
         self.rho = rho
 
     def prepare_generator(self) -> None:
-        self.jumps = construct("stage.jumps", JumpTimes, self.hparams.jumps)
+        self.jumps = construct("stage.jumps", JumpTimes, self.hparams["jumps"])
         self.generator.run_by(Jump(grid=self.jumps.grid))
 
     def setup(self, stage: str) -> None:
-        data = self.trainer.datamodule
+        data = getattr(self.trainer, "datamodule", None)
         self.on_pairs = getattr(data, "pairs", None) is not None
         if getattr(data, "scans", None) is not None and self.objective is not straight:
             raise InputError(
-                f"objective={self.hparams.objective} learns jumps from velocities of pairs, which are not those of "
+                f"objective={self.hparams['objective']} learns jumps from velocities of pairs, which are not those of "
                 "scans: leave data.scans out, or give stage.objective=straight."
             )
 

@@ -89,4 +89,4 @@ class Distill(Reflow):
         self.time = build_density({"name": "discrete", "k": steps, "grid": grid})
 
     def prepare_generator(self) -> None:
-        self.generator.run_by(FixedSteps(self.hparams.steps, self.hparams.grid), fixed=True)
+        self.generator.run_by(FixedSteps(self.hparams["steps"], self.hparams["grid"]), fixed=True)

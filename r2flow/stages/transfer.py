@@ -116,7 +116,7 @@ class Transfer(SingleLoss):
         images = self.space.decode(batch["x_1"]).cpu()
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.EMPTY))
         state[:, torch.arange(images.shape[2]) % 4 != 0] = int(Ray.UNKNOWN)
-        answers = complete(self.generator, images, state, seed=self.hparams.seed)
+        answers = complete(self.generator, images, state, seed=self.hparams["seed"])
         return torch.cat([answer.images for answer in answers])
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:

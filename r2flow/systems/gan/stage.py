@@ -144,8 +144,8 @@ class LearnGan(Stage):
             self.augment = construct("stage.augment", AdaptiveAugment, augment)
 
     def configure_optimizers(self) -> Any:
-        learning_rate = self.hparams.learning_rate
-        betas = tuple(self.hparams.betas)
+        learning_rate = self.hparams["learning_rate"]
+        betas = tuple(self.hparams["betas"])
         lazy = lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
         return [
             torch.optim.Adam(self.generator.parameters(), learning_rate, betas),
@@ -158,24 +158,24 @@ class LearnGan(Stage):
         images = step * self.images_per_step
         real = batch["x_1"]
 
-        draws = BatchDraws(self.hparams.seed, batch, GENERATOR)
+        draws = BatchDraws(self.hparams["seed"], batch, GENERATOR)
         self.discriminator.requires_grad_(False)
         shown = self.shown(self.make(batch["x_0"], draws), images, draws)
         loss = generator_loss(self.discriminator(shown))
         self.take_step(for_generator, loss)
         self.discriminator.requires_grad_(True)
 
-        draws = BatchDraws(self.hparams.seed, batch, FAKE)
+        draws = BatchDraws(self.hparams["seed"], batch, FAKE)
         with torch.no_grad():
             z = draws.normal(*self.generator.noise_shape).to(real.device)
             fake = self.shown(self.make(z, draws), images, draws)
-            seen = self.shown(real, images, BatchDraws(self.hparams.seed, batch, REAL))
+            seen = self.shown(real, images, BatchDraws(self.hparams["seed"], batch, REAL))
         of_real = self.discriminator(seen)
         wrong = discriminator_loss(of_real, self.discriminator(fake))
         self.take_step(for_discriminator, wrong)
 
         if self.r1 and step % self.r1_every == 0:
-            penalty = self.penalty(real, images, BatchDraws(self.hparams.seed, batch, PENALTY))
+            penalty = self.penalty(real, images, BatchDraws(self.hparams["seed"], batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
             # Lightning repeats it until the next one.
             self.log("train/last_r1", penalty, sync_dist=True)
