@@ -29,7 +29,7 @@ class Curvature(Periodic):
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         flow = pl_module.generator
-        if not isinstance(flow, Flow) or not flow.draws or flow.fixed:
+        if not isinstance(flow, Flow) or not flow.unconditional or flow.fixed:
             return
         x_0 = Draws(seed_of(pl_module), range(self.num)).start(flow.noise_shape).to(pl_module.device)
         result = straightness(flow.velocity, x_0, self.steps)

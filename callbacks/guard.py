@@ -13,7 +13,7 @@ from r2flow.data.loader import RunSampler
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count, NonNegative
-from r2flow.signals import outlive_parent
+from r2flow.signals import wait_for_launcher
 
 log = logging.getLogger(__name__)
 
@@ -113,7 +113,7 @@ class Guard(L.Callback):
 
     def _end(self, trainer: L.Trainer, message: str) -> NoReturn:
         if not trainer.is_global_zero:
-            outlive_parent()
+            wait_for_launcher()
         raise InputError(message)
 
     def state_dict(self) -> dict[str, Any]:

@@ -84,14 +84,14 @@ class SamplePictures(Periodic):
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         generator: Generator = pl_module.generator  # type: ignore[assignment]
-        if self.every and generator.draws:
+        if self.every and generator.unconditional:
             self.sampler(generator)  # refuses wrong steps before training
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         step = trainer.global_step
         path = Path(trainer.default_root_dir, "pictures", f"step-{step:08d}.png")
         generator: Generator = pl_module.generator  # type: ignore[assignment]
-        if path.exists() or not generator.draws:
+        if path.exists() or not generator.unconditional:
             return
         drawn = draw(generator, range(self.num), seed_of(pl_module), self.sampler(generator))
         figure = contact_sheet(list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"])

@@ -17,7 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count
-from r2flow.signals import LATER, STOPPING, Stopped, code_of, hear, listening, outlive_parent
+from r2flow.signals import LATER, STOPPING, Stopped, code_of, handling_signals, install_handlers, wait_for_launcher
 
 from .checkpoints import Checkpoints
 
@@ -42,7 +42,7 @@ class Stopping(L.Callback):
         self.every = every
         self.run_dir = Path()  # of the trainer
         self.job = slurm_job()
-        self.told: int | None = None
+        self.received: int | None = None
         self._process = os.getpid()
         self._training = False
 
@@ -51,22 +51,22 @@ class Stopping(L.Callback):
         return STOPPING if self.job is None else (*STOPPING, signal.SIGUSR1)
 
     @contextmanager
-    def listening(self) -> Iterator[None]:
+    def handling_signals(self) -> Iterator[None]:
         """Context that handles the signals and restores the previous handlers."""
-        with listening(self.hear, self.signals):
+        with handling_signals(self.on_signal, self.signals):
             try:
                 yield
             except Exception:
-                if self.told is None:  # other errors, as of a killed worker, follow from the signal
+                if self.received is None:  # other errors, as of a killed worker, follow from the signal
                     raise
-            if self.told is not None:
+            if self.received is not None:
                 self._leave("stopped")
 
-    def hear(self, number: int, frame: FrameType | None = None) -> None:
+    def on_signal(self, number: int, frame: FrameType | None = None) -> None:
         if os.getpid() != self._process:  # a loader's worker with an inherited handler
             return
-        again = self.told is not None
-        self.told = self.told or number
+        again = self.received is not None
+        self.received = self.received or number
         if not self._training and not again:
             self._leave("stopped")
 
@@ -74,22 +74,22 @@ class Stopping(L.Callback):
         self._training = True
         self.run_dir = Path(trainer.default_root_dir)
         with suppress(ValueError):  # only the main thread can set handlers
-            hear(self.hear, self.signals)
+            install_handlers(self.on_signal, self.signals)
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         if (batch_idx + 1) % trainer.accumulate_grad_batches:
             return
-        received = self.told is not None
+        stopped = self.received is not None
         if trainer.world_size > 1:
             if trainer.global_step % self.every:
                 return
-            received = trainer.strategy.reduce_boolean_decision(received, all=False)
-            for number in self.signals if received else ():  # all devices stop for the same signal
-                if trainer.strategy.reduce_boolean_decision(self.told == number, all=False):
-                    self.told = number
-        if received and trainer.global_step < trainer.estimated_stepping_batches:
+            stopped = trainer.strategy.reduce_boolean_decision(stopped, all=False)
+            for number in self.signals if stopped else ():  # all devices stop for the same signal
+                if trainer.strategy.reduce_boolean_decision(self.received == number, all=False):
+                    self.received = number
+        if stopped and trainer.global_step < trainer.estimated_stepping_batches:
             if trainer.checkpoint_callbacks:  # a plug-in's own callback does not save where the run stops
                 ours = (callback for callback in trainer.checkpoint_callbacks if isinstance(callback, Checkpoints))
                 next(ours, Checkpoints(keep=sys.maxsize)).save(trainer)
@@ -97,7 +97,7 @@ class Stopping(L.Callback):
             trainer._logger_connector.update_train_step_metrics()  # as Lightning does after the callbacks
             environment = getattr(trainer.strategy, "cluster_environment", None)
             if not trainer.is_global_zero and isinstance(environment, LightningEnvironment):
-                outlive_parent()
+                wait_for_launcher()
             self._leave(f"stopped at step {trainer.global_step}")
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -107,9 +107,9 @@ class Stopping(L.Callback):
         self._training = False
 
     def _leave(self, where: str) -> None:
-        assert self.told is not None
-        code, first = code_of(self.told), getattr(rank_zero_only, "rank", 0) == 0
-        if self.told == signal.SIGUSR1:
+        assert self.received is not None
+        code, first = code_of(self.received), getattr(rank_zero_only, "rank", 0) == 0
+        if self.received == signal.SIGUSR1:
             code = LATER
             if first:
                 log.info("%s; scontrol requeue %s", where, self.job)
@@ -117,7 +117,7 @@ class Stopping(L.Callback):
                     subprocess.run(["scontrol", "requeue", str(self.job)], check=True)
                 except (OSError, subprocess.CalledProcessError) as error:
                     refused = f"error: {where}, but SLURM did not take job {self.job} back ({error})"
-                    raise Stopped(2, f"{refused}. Submit the same script again.") from None  # `listening` passes it on
+                    raise Stopped(2, f"{refused}. Submit the same script again.") from None  # `handling_signals` passes it on
         has_checkpoint = bool(checkpoints_of(self.run_dir))
         consequence = "resumes from the last checkpoint" if has_checkpoint else "starts it again: no checkpoint yet"
         raise Stopped(code, f"{where}; the same command {consequence}" if first else "") from None

@@ -81,7 +81,7 @@ def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Ite
     """Read a regular file of `least` to `largest` bytes: every error becomes an InputError that
     names it.
     """
-    with telling(path):
+    with reading_errors(path):
         # reading a pipe or a device may never end
         size = path.stat().st_size if path.is_file() else None
         if not path.exists():
@@ -105,7 +105,7 @@ def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Ite
 
 
 @contextmanager
-def telling(path: Path) -> Iterator[None]:
+def reading_errors(path: Path) -> Iterator[None]:
     """Turn every error of a reader into an InputError of one line with the file's name."""
     try:
         with naming(path):

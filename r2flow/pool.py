@@ -14,7 +14,7 @@ from types import FrameType, SimpleNamespace
 from typing import Any
 
 from r2flow.errors import InputError
-from r2flow.signals import code_of, end_with_parent, out_of_reach
+from r2flow.signals import blocking_signals, code_of, end_with_parent
 
 Work = Callable[[int], None]
 
@@ -38,7 +38,7 @@ def attempts_of(
     doing = {}
     left = iter(items)
     try:
-        with out_of_reach():
+        with blocking_signals():
             for _ in range(count):
                 end, other = context.Pipe()
                 process = context.Process(target=_serve, args=(other,))

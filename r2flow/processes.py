@@ -9,16 +9,16 @@ import torch
 from torch import Tensor, nn
 
 
-def place() -> tuple[int, int]:
+def rank_and_world_size() -> tuple[int, int]:
     """Rank of this process and number of processes; (0, 1) for a single process."""
     if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
         return 0, 1
     return torch.distributed.get_rank(), torch.distributed.get_world_size()
 
 
-def summed(x: Tensor) -> Tensor:
+def sum_over_processes(x: Tensor) -> Tensor:
     """Sum over all processes; x itself for a single process."""
-    if place()[1] == 1:
+    if rank_and_world_size()[1] == 1:
         return x
     x = x.clone()
     torch.distributed.all_reduce(x)
@@ -28,20 +28,20 @@ def summed(x: Tensor) -> Tensor:
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
     """Average each gradient over all processes, in one message; nothing for a single process."""
     trained = [p for p in parameters if p.grad is not None]
-    if not trained or place()[1] == 1:
+    if not trained or rank_and_world_size()[1] == 1:
         return
-    mean = averaged(torch.cat([p.grad.flatten() for p in trained if p.grad is not None]))
+    mean = mean_over_processes(torch.cat([p.grad.flatten() for p in trained if p.grad is not None]))
     for parameter, gradient in zip(trained, mean.split([p.numel() for p in trained]), strict=True):
         parameter.grad = gradient.view_as(parameter)
 
 
-def averaged(x: Tensor) -> Tensor:
+def mean_over_processes(x: Tensor) -> Tensor:
     """Mean over all processes, which share a batch equally."""
-    return summed(x) / place()[1]
+    return sum_over_processes(x) / rank_and_world_size()[1]
 
 
 @contextmanager
-def joined(device: str) -> Iterator[str]:
+def process_group(device: str) -> Iterator[str]:
     """Join torchrun's process group for a block; without torchrun, run as a single process.
 
     Processes take batches in turn and sum statistics, so that each has all figures. Yields this

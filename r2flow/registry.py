@@ -201,9 +201,9 @@ def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[dict[str
     for name, parameter in _by_keyword(constructor, given).items():
         annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
         fields[name] = Required[annotation] if parameter.default is parameter.empty else NotRequired[annotation]
-    make: Any = TypedDict
     config = ConfigDict(STRICT, extra="allow") if _takes_any(constructor) else STRICT
-    return TypeAdapter(with_config(config)(make("options", fields)))
+    options: Any = TypedDict("options", fields)  # type: ignore[misc]
+    return TypeAdapter(with_config(config)(options))
 
 
 def _takes_any(constructor: Callable[..., Any]) -> bool:

@@ -45,7 +45,7 @@ def code_of(number: int) -> int:
     return 128 + number
 
 
-def outlive_parent(seconds: float = 10.0) -> None:
+def wait_for_launcher(seconds: float = 10.0) -> None:
     """Wait for the end of the launching process, which Lightning kills once a child ends with a
     nonzero code.
     """
@@ -55,7 +55,7 @@ def outlive_parent(seconds: float = 10.0) -> None:
         time.sleep(0.1)
 
 
-def hear(handler: _Handler, signals: Sequence[int] = STOPPING) -> dict[int, Any]:
+def install_handlers(handler: _Handler, signals: Sequence[int] = STOPPING) -> dict[int, Any]:
     """Handle signals, and return their former handlers.
 
     Stop signals stay ignored if they were, as Ctrl-C in background jobs of a shell and SIGHUP under
@@ -66,14 +66,14 @@ def hear(handler: _Handler, signals: Sequence[int] = STOPPING) -> dict[int, Any]
 
 
 @contextmanager
-def listening(handler: _Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
-    """Handle signals within a block as `hear`; without effect outside the main thread, which alone
+def handling_signals(handler: _Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
+    """Handle signals within a block as `install_handlers`; without effect outside the main thread, which alone
     receives them.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = hear(handler, signals)
+    before = install_handlers(handler, signals)
     try:
         yield
     finally:
@@ -100,15 +100,15 @@ def end_at_once(number: int, frame: FrameType | None = None) -> None:
 
 
 @contextmanager
-def heard_from_the_first_import() -> Iterator[None]:
+def handling_signals_of_program() -> Iterator[None]:
     """Answer stop signals by one line during a whole program, its imports and its exit."""
-    atexit.register(partial(hear, signal.SIG_IGN))  # registered first, so that it is called last
-    with listening(end_at_once):
+    atexit.register(partial(install_handlers, signal.SIG_IGN))  # registered first, so that it is called last
+    with handling_signals(end_at_once):
         try:
             yield
         finally:
-            atexit.unregister(hear)
-            atexit.register(hear, end_at_once)  # registered last, so that it is called first
+            atexit.unregister(install_handlers)
+            atexit.register(install_handlers, end_at_once)  # registered last, so that it is called first
 
 
 def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exit(1)) -> None:
@@ -125,13 +125,13 @@ def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exi
 
 
 @contextmanager
-def out_of_reach() -> Iterator[None]:
+def blocking_signals() -> Iterator[None]:
     """Start processes that block stop signals; this process hears them after the block."""
     heard: list[int] = []
     resource_tracker.ensure_running()  # which unblocks signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # also in the processes
     try:
-        with listening(lambda number, frame: heard.append(number)):  # in other threads
+        with handling_signals(lambda number, frame: heard.append(number)):  # in other threads
             yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -139,15 +139,15 @@ def out_of_reach() -> Iterator[None]:
             signal.raise_signal(heard[0])
 
 
-def outlive_the_signal(worker: int = 0) -> None:
+def init_loader_worker(worker: int = 0) -> None:
     """Keep a loader's worker alive for 30 s after a signal, since its run may need it; it also ends
     with its run.
     """
     end_with_parent()
     sys.excepthook = lambda *_: None  # called if a stopped run drops the connection for a tensor
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    hear(lambda number, frame: signal.alarm(30))
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # blocked if started `out_of_reach`
+    install_handlers(lambda number, frame: signal.alarm(30))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # blocked if started `blocking_signals`
 
 
 def run_process(command: Sequence[str]) -> int:
@@ -160,7 +160,7 @@ def run_process(command: Sequence[str]) -> int:
             process.send_signal(number)
 
     process: subprocess.Popen[bytes] | None = None
-    with listening(pass_on):
+    with handling_signals(pass_on):
         # PR_SET_PDEATHSIG: a run that outlived its sweep would block the same command when given again.
         end = (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL)) if sys.platform == "linux" else None
         process = subprocess.Popen(command, preexec_fn=end)

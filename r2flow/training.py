@@ -42,7 +42,7 @@ from r2flow.registry import Bound, Natural, Seed, construct, strict
 from r2flow.reports.training import finish, read_curves
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import check_run, has_ended, open_run, read_config, run_lock
-from r2flow.signals import LATER, STOPPING, Stopped, listening
+from r2flow.signals import LATER, STOPPING, Stopped, handling_signals
 from r2flow.stages import STAGES
 from r2flow.stages.base import Stage
 
@@ -287,7 +287,7 @@ def fit(run: Run) -> Result:
     stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping())
     stopping.run_dir = run.folder
     first = run.trainer.is_global_zero
-    with stopping.listening(), _quiet(repeated=False):  # each trains on scans of its own
+    with stopping.handling_signals(), _quiet(repeated=False):  # each trains on scans of its own
         if run.config["trainer"]["fast_dev_run"]:
             run.trainer.fit(run.stage, run.data)
             return _result(run, run.trainer.global_step, finished=True)
@@ -300,7 +300,7 @@ def fit(run: Run) -> Result:
                 run.data.read()  # a bad scan leaves no folder
         with run_lock(run.folder) if first else nullcontext():
             # Python hears no signal while it waits for other machines; from its first step on, `Stopping` does.
-            with listening(SIG_DFL, STOPPING if run.trainer.num_nodes > 1 else ()):
+            with handling_signals(SIG_DFL, STOPPING if run.trainer.num_nodes > 1 else ()):
                 step = _fit_in_folder(run, stopping)
             finished = has_ended(run.folder) or not run.trainer.checkpoint_callbacks
             if first:
@@ -337,7 +337,7 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     except RuntimeError as error:
         if isinstance(cause := error.__context__, OSError) and re.search("combined_loader|Too many open", str(error)):
             raise cause from None
-        if run.trainer.world_size > 1 and stopping.told is None and re.search(PEER_LOST, str(error)):
+        if run.trainer.world_size > 1 and stopping.received is None and re.search(PEER_LOST, str(error)):
             if any(map(_failed, getattr(run.trainer.strategy.launcher, "procs", ()))):
                 raise InputError("a process of this run on another device ended with an error.") from error
             again = "resumes" if checkpoints_of(run.folder) else "starts it again: no checkpoint yet"

@@ -24,7 +24,6 @@ from r2flow.data.opening import find_drives
 from r2flow.data.prepared import plan_files, prepare
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
-from r2flow.generators import build_generator
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.model.checkpoint import MODEL, Checkpoint

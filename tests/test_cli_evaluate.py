@@ -20,9 +20,9 @@ from r2flow.generators import build_generator
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
+from r2flow.metrics.base import SumMetric
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.scans import Scans
-from r2flow.metrics.base import SumMetric
 from r2flow.model.checkpoint import Checkpoint, save_checkpoint
 from r2flow.reports.paper import read_results
 from r2flow.samplers import build_sampler

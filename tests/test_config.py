@@ -9,6 +9,7 @@ from typing import Any
 import lightning as L
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from r2flow.runs.lineage import Parent
 
 from r2flow.backbones import BACKBONES, configurations
 from r2flow.callbacks import CALLBACKS
@@ -18,7 +19,6 @@ from r2flow.data.options import DataOptions, PairOptions
 from r2flow.errors import InputError
 from r2flow.registry import options_of
 from r2flow.runs.composing import CONF, choices, compose
-from r2flow.runs.lineage import Parent
 from r2flow.stages import STAGES
 from r2flow.training import check
 

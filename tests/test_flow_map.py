@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from r2flow.runs.lineage import Parent, generator_of
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import FlowDataset
@@ -15,7 +16,6 @@ from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import FlowMap, RectifiedFlow, build_generator
 from r2flow.noise import Draws, standard_normal
-from r2flow.runs.lineage import Parent, generator_of
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap

@@ -43,7 +43,7 @@ def test_the_page_runs_block_by_block(tmp_path: Path, monkeypatch: pytest.Monkey
             environment = {"PYTHONPATH": str(ROOT), "PATH": "", "OMP_NUM_THREADS": "1", "HOME": str(tmp_path)}
             subprocess.run([sys.executable, script], check=True, timeout=200, cwd=tmp_path, env=environment)
         else:
-            exec(compile(code, f"docs/lightning.md, block {number + 1}", "exec"), names)  # noqa: S102
+            exec(compile(code, f"docs/lightning.md, block {number + 1}", "exec"), names)
     assert {"test/panel", "test/run lengths"} <= names["trainer"].callback_metrics.keys() | set(names["tested"])
     assert names["scans"][0].shape == (4, 2, 32, 256)
     assert names["flow"].hparams.learning_rate == 2e-3

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit
 
 from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
-from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit
 from r2flow.store import Store
 from tests.conftest import CONFIG as BOTH
 from tests.conftest import write_checkpoint

@@ -29,7 +29,7 @@ def test_a_model_of_the_package_draws(name):
     assert found.path == find_model(name) == find_checkpoint(f"{name}/")
     assert name_of(found.path) == name
     assert all(value.isfinite().all() for value in found.generator.state_dict().values())
-    if not found.generator.draws:
+    if not found.generator.unconditional:
         with pytest.raises(InputError, match="give one of which a ray is known, as r2flow complete"):
             found.sample(1)
         return

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from r2flow.errors import InputError
-from r2flow.signals import STOPPING, Stopped, listening, out_of_reach, outlive_the_signal, stop_at_once
+from r2flow.signals import STOPPING, Stopped, blocking_signals, handling_signals, init_loader_worker, stop_at_once
 from r2flow.store import Store
 from tests.conftest import ROOT
 from tests.killing import Unreadable, be_killed, fail, is_gone, refuse, wait_until
@@ -87,25 +87,25 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path, script: str):
 
 
 def test_workers_of_a_failed_run_end_with_it(tmp_path: Path):
-    script = LOADER.replace("end_with_parent", "outlive_the_signal").replace("time.sleep(100)", "")
+    script = LOADER.replace("end_with_parent", "init_loader_worker").replace("time.sleep(100)", "")
     assert start(tmp_path, ["-c", script], [sys.executable]).communicate(timeout=25)[0] == ""
 
 
 def test_a_run_hears_the_signal_of_its_job_that_its_launcher_ignores():
-    with listening(signal.SIG_IGN, [signal.SIGUSR1]), listening(stop_at_once, [signal.SIGUSR1]):
+    with handling_signals(signal.SIG_IGN, [signal.SIGUSR1]), handling_signals(stop_at_once, [signal.SIGUSR1]):
         assert signal.getsignal(signal.SIGUSR1) is stop_at_once
 
 
 def test_a_worker_does_not_hear_what_its_run_ignores(monkeypatch):
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-    with listening(signal.SIG_IGN):  # as a hang-up under nohup
-        outlive_the_signal()
+    with handling_signals(signal.SIG_IGN):  # as a hang-up under nohup
+        init_loader_worker()
         assert {signal.getsignal(number) for number in STOPPING} == {signal.SIG_IGN}
 
 
 WORKERS = """
 import functools, os, signal, sys, types
-from r2flow.signals import Stopped, listening, stop_at_once
+from r2flow.signals import Stopped, handling_signals, stop_at_once
 from r2flow.store import Store
 
 if __name__ != "__main__":
@@ -115,7 +115,7 @@ else:
     signal.signal({number}, lambda *_: None)  # for the signal of the second worker
     source = types.SimpleNamespace(drives={{}}, drawn=False, batch=lambda numbers: os.killpg(0, {number}))
     try:
-        with listening(stop_at_once):
+        with handling_signals(stop_at_once):
             {work}
     except Stopped as stop:
         sys.exit(stop.code)
@@ -151,7 +151,7 @@ def test_the_parent_logs_what_a_worker_logs(tmp_path: Path, caplog):
 
 
 def test_a_signal_waits_until_workers_are_started():
-    with pytest.raises(Stopped) as stop, listening(stop_at_once), out_of_reach():  # noqa: PT012
+    with pytest.raises(Stopped) as stop, handling_signals(stop_at_once), blocking_signals():  # noqa: PT012
         signal.raise_signal(signal.SIGTERM)
         raise OSError("a worker is gone")  # ended by the same signal
     assert isinstance(stop.value.__context__, OSError)

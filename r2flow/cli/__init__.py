@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 
 from r2flow.memory import prepare_process
-from r2flow.signals import heard_from_the_first_import
+from r2flow.signals import handling_signals_of_program
 
 
 def main(*verb: str, command: Sequence[str] = ("-m", "r2flow", "train")) -> None:
@@ -13,7 +13,7 @@ def main(*verb: str, command: Sequence[str] = ("-m", "r2flow", "train")) -> None
     `verb` precedes the command line; Python with `command` trains a link of a chain or a job of a sweep.
     """
     prepare_process()
-    with heard_from_the_first_import():
+    with handling_signals_of_program():
         from r2flow.cli.verbs import run
 
         sys.exit(run([*verb, *sys.argv[1:]], [sys.executable, *command]))

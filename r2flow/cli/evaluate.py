@@ -40,12 +40,12 @@ def evaluate(
     several --steps or --sampler plot distance against evaluations and seconds. The same command with --out resumes.
     Under torchrun, processes share the scans.
     """
-    from r2flow.processes import joined
+    from r2flow.processes import process_group
 
     named = list(dict.fromkeys(generated or []))
     if not (named or options.reference or options.baselines):
         raise InputError("nothing to compare with: give GENERATED or --reference.")
-    with joined(choose_device(options.device)) as device:
+    with process_group(choose_device(options.device)) as device:
         _evaluate(real, named, options, how, device)
 
 
@@ -59,7 +59,7 @@ def _evaluate(
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.metrics import METRICS
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.processes import place
+    from r2flow.processes import rank_and_world_size
 
     rules = PROTOCOLS[options.protocol]
     chosen: dict[str, Any] = {}
@@ -88,7 +88,7 @@ def _evaluate(
     compare = Comparer(metrics, work, rules, cache, results, device)
     pairs = pairs_of(truth, judged, options.reference, options.baselines)
     comparisons = with_equal_panels([compare(*pair) for pair in pairs])
-    if place()[0] > 0:  # the first process prints and writes the results
+    if rank_and_world_size()[0] > 0:  # the first process prints and writes the results
         return
     if training:
         nearest = find_nearest({**judged, _REAL: truth}, training, work, device)

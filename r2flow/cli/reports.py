@@ -263,7 +263,7 @@ def paper(
     for (role, model), label in zip(named, labels, strict=True):
         checkpoint = load_checkpoint(model, where)
         runs.append(PaperRun(role or role_of(checkpoint, label), model, checkpoint))
-        if not checkpoint.generator.draws:
+        if not checkpoint.generator.unconditional:
             raise InputError(f"{model} does not generate scans from noise.")
         if checkpoint.sensor.shape != runs[0].checkpoint.sensor.shape:
             raise InputError(f"{model} makes images of another size than {runs[0].label}.")

@@ -21,7 +21,7 @@ from r2flow.errors import (
     open_streams,
 )
 from r2flow.plugins import load_plugins, take_plugins
-from r2flow.signals import Stopped, listening, stop_at_once
+from r2flow.signals import Stopped, handling_signals, stop_at_once
 
 # ClickException: in click for older releases of typer, in typer for newer ones.
 USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
@@ -46,7 +46,7 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
     handler.setFormatter(PlainFormatter("%(levelname)s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     try:
-        with listening(stop_at_once):
+        with handling_signals(stop_at_once):
             if "" in arguments:
                 raise InputError("an argument is empty; is a variable of the shell not set?")
             arguments = [

@@ -26,7 +26,7 @@ from r2flow.lidar.encoding import Encoding, encoding_options
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 from r2flow.progress import track
 from r2flow.registry import check_options, construct
-from r2flow.signals import outlive_the_signal
+from r2flow.signals import init_loader_worker
 
 log = logging.getLogger(__name__)
 
@@ -336,6 +336,6 @@ class ScanDataModule(L.LightningDataModule):
             sampler=sampler,
             num_workers=self.options.workers,
             persistent_workers=self.options.workers > 0,
-            worker_init_fn=outlive_the_signal,
+            worker_init_fn=init_loader_worker,
             pin_memory=torch.cuda.is_available(),
         )

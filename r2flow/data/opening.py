@@ -162,8 +162,8 @@ class Described:
         theirs, ours = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (self.stored.sensor, sensor))
         raise InputError(
             f"{self.options.folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: give no other "
-            "--sensor or --size, no scans of another sensor next to them, and for a model of another sensor point clouds (.ply, "
-            ".bin)."
+            "--sensor or --size, no scans of another sensor next to them, and for a model of another sensor point "
+            "clouds (.ply, .bin)."
         )
 
     def refuse_parts(self) -> None:
@@ -344,7 +344,7 @@ def read(
     scans = describe(path)
     if scans.file is None:
         raise InputError(f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
-    fields = {"reflectance_scale": reflectance_scale, "columns": columns}
+    fields: dict[str, Any] = {"reflectance_scale": reflectance_scale, "columns": columns}
     reading = reading_for([scans], sensor=sensor, estimate_scale=True, **fields)
     image = torch.from_numpy(open_scans(scans, replace(reading, on_bad_scan="error", within_limits=True)).source[0])
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])

@@ -16,10 +16,10 @@ from r2flow import noise
 from r2flow.data.loader import FlowDataset, Item, Key, Permutations
 from r2flow.data.options import PairOptions
 from r2flow.errors import InputError, check
-from r2flow.files import telling
+from r2flow.files import reading_errors
 from r2flow.generators import Flow, Generator, as_flow
 from r2flow.models import name_of
-from r2flow.processes import place
+from r2flow.processes import rank_and_world_size
 from r2flow.progress import Bar
 from r2flow.samplers import build_sampler
 from r2flow.signals import LATER, Stopped
@@ -126,7 +126,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
 
     with Bar("drawing", store.missing_pairs(), "pairs", lines="WORLD_SIZE" in os.environ) as bar:
         store.begin()
-        rank, ranks = place()  # of a run, whose processes verify a part each
+        rank, ranks = rank_and_world_size()  # of a run, whose processes verify a part each
         for shard in store.shards[rank::ranks]:
             store.mend(shard)
         missing = store.missing(store.shards)  # shuffled: processes rarely meet, also without common locks
@@ -177,7 +177,7 @@ class PairDataset(Dataset[Item]):
         k, index = (key, key) if isinstance(key, int) else key
         store, number = self.store, int(self.numbers[index])
         shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
-        with telling(path := store.files(shard)[0]), safe_open(path, framework="pt") as file:
+        with reading_errors(path := store.files(shard)[0]), safe_open(path, framework="pt") as file:
             x_1 = file.get_slice("x_1")[offset].float()
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
         item = {"x_0": store.noise(store.first + number), "x_1": x_1, "u": u, "k": torch.tensor(k)}

@@ -27,7 +27,7 @@ from r2flow.data.quantise import OTHER_LEVELS, find_levels, range_codes, reflect
 from r2flow.data.reading import Reading, lacks_reflectance, read_image
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError, check
-from r2flow.files import telling
+from r2flow.files import reading_errors
 from r2flow.progress import Bar, track
 from r2flow.store import MANIFEST, Damaged, Store, checksum, read_manifest
 
@@ -242,7 +242,7 @@ class PreparedScans(ScanSource):
         _, shard, row = map(int, self.rows[index])
         codes = [*self.store.codes.items()][: 1 + self.reflectance]
         if shard not in self._shards:
-            with telling(path := self.store.files(shard)[0]):  # damaged since it was opened
+            with reading_errors(path := self.store.files(shard)[0]):  # damaged since it was opened
                 file = safe_open(path, framework="numpy")
                 self._shards[shard] = [file.get_slice(name) for name, _ in codes]
         stored = [image[row : row + 1][0] for image in self._shards[shard]]

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 from r2flow.data.sources import ScanSource, spread
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator
-from r2flow.signals import out_of_reach, outlive_the_signal
+from r2flow.signals import blocking_signals, init_loader_worker
 
 
 class ScanSet:
@@ -74,8 +74,8 @@ class ScanSet:
         chunks: Any = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
         # Processes take seconds to start; samples are drawn in the process of the network.
         workers = 0 if self.source.drawn or len(chunks) < 8 else workers
-        loader = DataLoader(chunks, None, collate_fn=read, num_workers=workers, worker_init_fn=outlive_the_signal)
-        with out_of_reach() if workers else nullcontext():  # the end of a process would be an error here
+        loader = DataLoader(chunks, None, collate_fn=read, num_workers=workers, worker_init_fn=init_loader_worker)
+        with blocking_signals() if workers else nullcontext():  # the end of a process would be an error here
             return iter(loader)
 
 

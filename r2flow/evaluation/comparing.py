@@ -26,7 +26,7 @@ from r2flow.evaluation.sets import baseline_sets, reference_sets
 from r2flow.files import read_json, write_file
 from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, mean_distance
 from r2flow.plugins import plugin_digests
-from r2flow.processes import place
+from r2flow.processes import rank_and_world_size
 from r2flow.store import checksum
 
 Kind = Literal["judged", "reference", "baseline"]
@@ -121,7 +121,7 @@ class Comparer:
         results = measure(self.metrics, statistics, other, self.work, self.rules)
         if other.source.drawn:
             results.append(speed_result(real, other))
-        if path is not None and place()[0] == 0:
+        if path is not None and rank_and_world_size()[0] == 0:
             write_file(path, json.dumps([asdict(result) for result in results]))
         return Comparison(name, real, other, results, kind)
 

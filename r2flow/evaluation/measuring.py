@@ -20,7 +20,7 @@ from r2flow.files import cache_folder
 from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.scans import Scans
 from r2flow.plugins import plugin_digests
-from r2flow.processes import place, summed
+from r2flow.processes import rank_and_world_size, sum_over_processes
 from r2flow.progress import Bar
 from r2flow.store import Damaged, Store, checksum
 
@@ -99,7 +99,7 @@ class Work:
 
 def bar(doing: str, total: int) -> Bar:
     """Create a progress bar, shown only by the first process."""
-    return Bar(doing, total, shown=None if place()[0] == 0 else False)
+    return Bar(doing, total, shown=None if rank_and_world_size()[0] == 0 else False)
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,8 @@ def gather_real(
         for name, metric in metrics.items():
             keys[name] = key_of(metric, real, choices[name][1] + points)
             cached = cache.read(keys[name])
-            readers = summed(torch.tensor(int(cached is not None)))
-            if cached is not None and readers == place()[1]:  # all processes have read it
+            readers = sum_over_processes(torch.tensor(int(cached is not None)))
+            if cached is not None and readers == rank_and_world_size()[1]:  # all processes have read it
                 gathered[name] = cached
     numbers_of = {chosen: numbers for numbers, chosen in choices.values()}
     for chosen, numbers in numbers_of.items():
@@ -185,7 +185,7 @@ def measure(
         metric.load_real_state(real[name].states)
     before = getattr(generated.source, "unsolved", 0)
     empty = _update(metrics, generated, range(len(generated)), False, work, protocol)
-    unsolved = int(summed(torch.tensor(getattr(generated.source, "unsolved", 0) - before)))
+    unsolved = int(sum_over_processes(torch.tensor(getattr(generated.source, "unsolved", 0) - before)))
     sensor = generated.sensor
     described = {
         "name": protocol.name,
@@ -243,7 +243,7 @@ def _update(
     Returns how many of all scans are empty within the mask.
     """
     device = next(iter(metrics.values())).device
-    rank, ranks = place()
+    rank, ranks = rank_and_world_size()
     size = work.batch_size
     shares = [numbers[i : i + size] for i in range(0, len(numbers), size)][rank::ranks]
     shared = [number for share in shares for number in share]
@@ -266,4 +266,4 @@ def _update(
             for metric in metrics.values():
                 metric.update(batch, real, share)
             advance(len(images))
-    return int(summed(torch.tensor(empty)))
+    return int(sum_over_processes(torch.tensor(empty)))

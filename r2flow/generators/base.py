@@ -85,19 +85,19 @@ class Generator(nn.Module):
     """
 
     # Whether it makes scans of N(0, I) alone; False for autoencoders and transfer flows.
-    draws = True
-    told = False  # whether it takes a condition of `condition_of`
+    unconditional = True
+    takes_condition = False  # whether it takes a condition of `condition_of`
     # Whether it learns a vector per direction: no rotation in training.
     learns_directions = False
-    usual: ClassVar[Sampler] = FixedSteps()  # default sampler of a new generator
+    default_sampler: ClassVar[Sampler] = FixedSteps()  # default sampler of a new generator
     # Class used when fine-tuned with a velocity loss; None: the same.
-    goes_on_as: ClassVar[str | None] = None
+    finetuned_as: ClassVar[str | None] = None
 
     def __init__(self, space: ModelSpace, noise_shape: tuple[int, ...] | None = None) -> None:
         super().__init__()
         self.space = space
         self.noise_shape = noise_shape or space.shape
-        self.run_by(self.usual)
+        self.run_by(self.default_sampler)
 
     def run_by(self, sampler: Sampler, few: Sampler | None = None, fixed: bool = False) -> None:
         """Set the default samplers."""
@@ -133,7 +133,7 @@ class Generator(nn.Module):
         """
         how = sampler or self.sampler
         how.check(self)
-        if condition is not None and not (self.told or how.completes):
+        if condition is not None and not (self.takes_condition or how.completes):
             raise InputError(
                 f"this {type(self).__name__} takes no condition; complete scans by --sampler mmps."
             )

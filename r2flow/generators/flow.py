@@ -145,7 +145,7 @@ def _optional(name: str) -> bool:
 class RectifiedFlow(NetworkFlow):
     """v(t, x) by a backbone. 1-RF, k-RF and k-TD differ only in training and sampler."""
 
-    usual: ClassVar[Sampler] = USUAL
+    default_sampler: ClassVar[Sampler] = USUAL
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         return self.backbone(t, x)
@@ -180,9 +180,9 @@ class FlowMap(RectifiedFlow):
     """
 
     second_time = True
-    usual = Jump()
+    default_sampler = Jump()
     # A velocity loss would leave the jumps to those of the old flow.
-    goes_on_as = "rectified_flow"
+    finetuned_as = "rectified_flow"
 
     def mean_velocity(
         self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None
@@ -206,7 +206,7 @@ def as_flow(generator: Generator, what: str, distilled: bool = False) -> Flow:
         InputError: If it is none, or if it is distilled for the times of its steps, unless
             `distilled`.
     """
-    if not isinstance(generator, Flow) or not generator.draws:
+    if not isinstance(generator, Flow) or not generator.unconditional:
         raise InputError(
             f"{what} needs the velocity of a flow from noise; a {type(generator).__name__} has "
             "none."

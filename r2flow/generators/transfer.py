@@ -31,7 +31,7 @@ from r2flow.generators.surroundings import (
     within_reach,
 )
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.processes import averaged
+from r2flow.processes import mean_over_processes
 from r2flow.registry import NonNegative
 from r2flow.samplers import Jump
 
@@ -67,10 +67,10 @@ class TransferFlow(Flow):
         sigma: Standard deviation of the noise in x_0, in model space.
     """
 
-    told = True
-    draws = False
+    takes_condition = True
+    unconditional = False
     singular = True
-    usual = Jump(steps=1)
+    default_sampler = Jump(steps=1)
 
     def __init__(
         self, space: ModelSpace, backbone: Mapping[str, Any], sigma: NonNegative = 0.25
@@ -272,7 +272,7 @@ class TransferFlow(Flow):
         def mean(values: Tensor, weight: Tensor) -> Tensor:
             total = weight.float().sum(dims)
             if self.training:
-                total = averaged(total)
+                total = mean_over_processes(total)
             return ((values * weight).sum(dims) / total.clamp(min=1)).mean()
 
         surprise = F.binary_cross_entropy_with_logits(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from r2flow.errors import InputError, check, naming, require
-from r2flow.files import telling
+from r2flow.files import reading_errors
 from r2flow.lidar.scan_files.points import Points, column_points
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -37,7 +37,7 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points
         check(whole, f"{folder} has no metadata.yaml: give a .mcap, or make it by ros2 bag reindex {folder}")
     store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
     # rosbags and the stores below it raise many kinds on damaged files
-    with telling(path), (Reader1 if old else Reader2)(folder) as reader:
+    with reading_errors(path), (Reader1 if old else Reader2)(folder) as reader:
         chosen = _choose(path, list(reader.connections), topic)
         for connection, stamp, data in reader.messages(connections=chosen):
             message: Any = (store.deserialize_ros1 if old else store.deserialize_cdr)(data, connection.msgtype)

@@ -13,7 +13,7 @@ from torchmetrics import Metric
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.metrics.scans import MASK, Scans
-from r2flow.processes import place
+from r2flow.processes import rank_and_world_size
 
 SIDES = ("real", "generated")
 Figures = dict[str, float]  # values by name
@@ -168,7 +168,7 @@ class ScanMetric(Metric):
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
         """Load the states from `real_state`, after `reset`; only on the first process."""
-        if place()[0] == 0:
+        if rank_and_world_size()[0] == 0:
             for name, value in state.items():  # into the first row of a tensor, or an empty list
                 getattr(self, name)[:1] = value.to(self.device)[None]
 

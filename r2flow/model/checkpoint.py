@@ -23,7 +23,7 @@ from r2flow.config import check_tree, learned
 from r2flow.data.opening import describe, reading_for
 from r2flow.data.partial import PartialScan, open_partial
 from r2flow.errors import IN_MEMORY, InputError, check, naming
-from r2flow.files import telling, write_file
+from r2flow.files import reading_errors, write_file
 from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding, build_space
@@ -205,7 +205,7 @@ def find_checkpoint(path: str | Path) -> Path:
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> Any:
     """Read an r2flow checkpoint, a dict, or a published one. Only tensors and plain values: a file cannot run code."""
-    with telling(Path(path)), open(path, "rb") as file:
+    with reading_errors(Path(path)), open(path, "rb") as file:
         return read_torch(file, path, map_location)
 
 
@@ -256,7 +256,7 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     """
     path = find_checkpoint(path)
     try:
-        with naming(path), telling(path):
+        with naming(path), reading_errors(path):
             if path.suffix == ".safetensors":
                 notes = read_safetensors(path)
                 checkpoint = _built(notes["config"], notes["weights"], notes, path, int(notes["step"]))

@@ -39,9 +39,9 @@ def completing(generator: Generator, name: str | None = None, *, several: bool =
 
     For `several` different answers, a transfer flow uses `transport`. `changes` are fields of the sampler.
     """
-    if not (generator.told or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
+    if not (generator.takes_condition or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
         raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")
-    if generator.told:
+    if generator.takes_condition:
         if several and name is None and not changes and hasattr(generator, Transport.needs):
             name = "transport"
         return generator.choose(name, **changes)

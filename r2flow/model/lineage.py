@@ -145,7 +145,7 @@ def _generator(
     if given:
         return GENERATORS.options(given)
     parental = theirs or {"name": DEFAULT_GENERATOR}
-    chosen = of_stage or GENERATORS[parental["name"]].goes_on_as or parental["name"]
+    chosen = of_stage or GENERATORS[parental["name"]].finetuned_as or parental["name"]
     shared = options_of(GENERATORS[chosen], given=2)
     return {"name": chosen, **{key: value for key, value in parental.items() if key in shared}}
 

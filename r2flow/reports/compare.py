@@ -179,7 +179,7 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     print_comparison(groups)
     page = compare_page(groups)
     loaded = {name: load_checkpoint(run, device) for name, run in runs.items()}
-    makers = {name: model for name, model in loaded.items() if model.generator.draws}
+    makers = {name: model for name, model in loaded.items() if model.generator.unconditional}
     page.figures["steps"] = _steps_figure(makers)
     name, last = list(makers.items())[-1]
     write_samples(last, out, num=4, seed=0, pictures=4, replace=True)

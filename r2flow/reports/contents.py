@@ -19,7 +19,7 @@ def describe(path: str | Path) -> dict[str, Any]:
     about: dict[str, Any] = {}
     if model:
         about = {"model": model, "samples": MODELS[model].about, "licence": MODELS[model].licence}
-    if generator.draws or generator.told:
+    if generator.unconditional or generator.takes_condition:
         about |= generator.drawing()
     return {
         "path": str(loaded.path),

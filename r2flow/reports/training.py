@@ -96,7 +96,7 @@ def finish(
         print(f"{name}: {start}{values[-tenth:].mean():.4f} at step {steps[-1]}{single}")
     print(f"\ncheckpoint    {checkpoint.path}")
     num = samples["num"]
-    if num == 0 or not checkpoint.generator.draws:
+    if num == 0 or not checkpoint.generator.unconditional:
         return
     out = run / "samples"
     write_samples(checkpoint, out, num, seed, pictures=num, replace=True)

@@ -26,7 +26,7 @@ from r2flow.config import key_of, override
 from r2flow.errors import InputError
 from r2flow.plugins import load_plugins
 from r2flow.runs.composing import CONF, WRONG, add_choices, as_hydra_takes, in_one_line, plain, with_choices
-from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, run_process
+from r2flow.signals import LATER, STOPPING, Stopped, code_of, handling_signals, run_process
 
 
 class JobEnded(RuntimeError):
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
     # SLURM signals every process of a job: a run handles the signal, a chain waits for the run.
     ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
     try:
-        with listening(signal.SIG_IGN, ignored):
+        with handling_signals(signal.SIG_IGN, ignored):
             _run_hydra(_parsed(_with_plugins(arguments, plugins) or ["experiment=demo"]), command, codes, errors)
             if errors:  # jobs have printed theirs
                 raise next((error for error in errors if not isinstance(error, JobEnded)), errors[0])

@@ -86,13 +86,13 @@ class Sampler(ABC):
     def check(self, generator: Any) -> None:
         """Refuse a generator that the sampler cannot run."""
         kind = type(generator).__name__
-        draws = getattr(generator, "draws", True)
+        unconditional = getattr(generator, "unconditional", True)
         if getattr(generator, self.needs, None) is None:
-            reason = "has none" if draws or generator.told else "draws no scans"
+            reason = "has none" if unconditional or generator.takes_condition else "draws no scans"
             raise InputError(
                 f"sampler {self.name} needs a generator with a {self.needs}; a {kind} {reason}."
             )
-        if self.draws and not draws and self.needs in ("velocity", "map"):
+        if self.draws and not unconditional and self.needs in ("velocity", "map"):
             raise InputError(
                 f"{self.name} adds noise of N(0, 1); a {kind} starts from other: give jump."
             )

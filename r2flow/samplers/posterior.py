@@ -45,7 +45,7 @@ class Posterior(OnGrid):
 
     def check(self, generator: Any) -> None:
         super().check(generator)
-        if generator.told:
+        if generator.takes_condition:
             raise InputError(
                 f"sampler {self.name} needs an unconditional flow; for this model give jump."
             )

@@ -35,7 +35,7 @@ class Rectify(SingleLoss):
 
     def __init__(self, *model: Any, loss: str | None = None, time: Options | None = None, **options: Any) -> None:
         super().__init__(*model, **options)
-        if self.generator.told and type(self).condition is Rectify.condition:
+        if self.generator.takes_condition and type(self).condition is Rectify.condition:
             name = type(self.generator).__name__
             raise InputError(f"a {name} needs a condition: give stage=transfer, or its own stage.")
         self.loss = LOSSES[loss or self.default_loss]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from r2flow.runs.lineage import find_parent, pairs_of
 
 from r2flow.cli.train import pairs
 from r2flow.data.options import PairOptions
@@ -18,7 +19,6 @@ from r2flow.data.pairs import PairDataset, PairStore, default_folder, make_pairs
 from r2flow.errors import InputError
 from r2flow.models import find_model
 from r2flow.noise import standard_normal
-from r2flow.runs.lineage import find_parent, pairs_of
 from r2flow.samplers import build_sampler
 from r2flow.signals import LATER, Stopped
 from r2flow.store import Store

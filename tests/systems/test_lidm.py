@@ -11,6 +11,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 import yaml
+from r2flow.runs.lineage import Parent
 from torch import Tensor
 
 from r2flow.data.opening import reading_for
@@ -23,7 +24,6 @@ from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws
 from r2flow.registry import options_of
 from r2flow.runs.composing import CONF
-from r2flow.runs.lineage import Parent
 from r2flow.samplers import build_sampler
 from r2flow.systems.diffusion.process import PREDICTIONS, noised, walk
 from r2flow.systems.diffusion.schedules import square_root_linear

@@ -28,7 +28,7 @@ class Hold(L.Callback):
             return
         self.file.touch()
         (stopping,) = (one for one in trainer.callbacks if isinstance(one, Stopping))
-        while stopping.told is None and time.monotonic() - begin < self.seconds:
+        while stopping.received is None and time.monotonic() - begin < self.seconds:
             time.sleep(0.01)
 
 

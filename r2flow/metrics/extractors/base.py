@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.files import cache_folder, reading, telling, write_file
+from r2flow.files import cache_folder, reading, reading_errors, write_file
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.scans import Scans
@@ -71,7 +71,7 @@ class Extractor(nn.Module, ABC):
                 f"{PurePosixPath(SOURCES[cls.name]).name} and give r2flow info --add {cls.name} "
                 "FILE (r2flow info lists sources)."
             )
-        with telling(path):
+        with reading_errors(path):
             extractor = cls.from_tensors(read_tensors(path)[0])
         extractor.weights = weights_hash(extractor)
         return extractor
@@ -105,7 +105,7 @@ def kept(name: str) -> str | None:
     path = kept_file(name)
     if not path.exists():
         return None
-    with telling(path):
+    with reading_errors(path):
         return read_tensors(path)[1][NOTES]
 
 
@@ -116,7 +116,7 @@ def add(name: str, path: Path) -> str:
     """
     SOURCES[name]
     tensors = read_published(path)
-    with telling(path):
+    with reading_errors(path):
         weights = weights_hash(EXTRACTORS[name].from_tensors(tensors))
     whole = {name: tensor.clone().contiguous() for name, tensor in tensors.items()}
     content = save(whole, metadata={NOTES: f"{weights} of {path.name}"})
@@ -132,7 +132,7 @@ def weights_hash(extractor: Extractor) -> str:
 
 def read_published(path: Path) -> dict[str, Tensor]:
     """Read tensors by name from a file, an archive or a folder."""
-    with telling(path) if path.is_dir() else reading(path, LARGEST, "file of weights"):
+    with reading_errors(path) if path.is_dir() else reading(path, LARGEST, "file of weights"):
         if path.suffix == ".safetensors":
             return read_tensors(path)[0]
         tensors: dict[str, Tensor] = {}

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32
 from r2flow.noise import generator
-from r2flow.processes import summed
+from r2flow.processes import sum_over_processes
 from r2flow.registry import Natural, NonNegative, Portion, Registry
 
 # Low-pass filter of the wavelet sym6 (Daubechies 1992), for up- and downsampling.
@@ -107,8 +107,8 @@ class AdaptiveAugment(nn.Module):
 
     def count(self, real: Tensor) -> None:
         """Accumulate D's scores of real images over all processes."""
-        self.sign_cum.add_(summed(real.detach().float().sign().sum()))
-        self.n_pred_cum.add_(summed(torch.tensor(float(len(real)), device=real.device)))
+        self.sign_cum.add_(sum_over_processes(real.detach().float().sign().sum()))
+        self.n_pred_cum.add_(sum_over_processes(torch.tensor(float(len(real)), device=real.device)))
 
     def move(self) -> Tensor:
         """Update p by the accumulated scores, reset them, and return their mean sign r_t."""

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, uncast, wrapped
-from r2flow.processes import averaged
+from r2flow.processes import mean_over_processes
 
 DROPPED = -1.0  # value of a dropped ray in model space
 # Outputs of a network.
@@ -206,7 +206,7 @@ class LatentGenerator(nn.Module):
         """
         w: Tensor = self.mapping_network(z)
         if self.training:
-            mean = averaged(w.detach().mean(0, keepdim=True))
+            mean = mean_over_processes(w.detach().mean(0, keepdim=True))
             self.w_avg.lerp_(mean.to(self.w_avg), 1 - self.decay)
         elif truncation != 1:
             w = self.w_avg.lerp(w, truncation)

@@ -16,7 +16,7 @@ from r2flow.backbones.convolutions import Resample
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, halved
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.processes import averaged
+from r2flow.processes import mean_over_processes
 from r2flow.registry import Count, Positive
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (
@@ -88,7 +88,7 @@ class _ModulatedConv(nn.Module):
             weight = weight * (1 / math.sqrt(x.shape[1])) * (style + 1)[:, None]
         mean_square: Tensor = self.ema_var
         if self.training:
-            batch_mean = averaged(at_least_float32(x.detach()).square().mean())
+            batch_mean = mean_over_processes(at_least_float32(x.detach()).square().mean())
             mean_square = mean_square.lerp(batch_mean, 1 - self.decay)
             self.ema_var.copy_(mean_square)
         weight = weight / (mean_square.sqrt() + 1e-8)

@@ -26,7 +26,7 @@ class VQAutoencoder(Generator):
         autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
     """
 
-    draws = False
+    unconditional = False
 
     def __init__(
         self,

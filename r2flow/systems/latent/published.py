@@ -15,7 +15,7 @@ import yaml
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.files import telling
+from r2flow.files import reading_errors
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.published import Format, Published
@@ -175,7 +175,7 @@ def _unet(state: Mapping[str, Tensor]) -> dict[str, Any]:
 def _notes(path: Path) -> Mapping[str, Any]:
     """Read the published `config.yaml` next to a file; empty if missing."""
     file = path.with_name("config.yaml")
-    with telling(file):
+    with reading_errors(file):
         content = yaml.safe_load(file.read_text()) if file.is_file() else {}
     return content if isinstance(content, Mapping) else {}
 

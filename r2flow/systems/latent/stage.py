@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.lidar.encoding import Encoding
-from r2flow.processes import averaged
+from r2flow.processes import mean_over_processes
 from r2flow.registry import Count, Natural, NonNegative, construct
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.diffusion.process import noised
@@ -60,7 +60,7 @@ def adaptive_weight(
     """
     (of_r,) = torch.autograd.grad(reconstruction, last, retain_graph=True)
     (of_a,) = torch.autograd.grad(adversarial, last, retain_graph=True)
-    ratio = averaged(of_r).norm() / (averaged(of_a).norm() + 1e-4)
+    ratio = mean_over_processes(of_r).norm() / (mean_over_processes(of_a).norm() + 1e-4)
     return weight * ratio.clamp(0, 1e4).detach()
 
 

@@ -100,7 +100,7 @@ class ScoreModel(Generator):
         sigma_first, sigma_last, levels, spacing: The noise levels, see `noise_levels`.
     """
 
-    told = True
+    takes_condition = True
 
     def __init__(
         self,

@@ -22,7 +22,7 @@ class Completion(RectifiedFlow):
         image, mask = (known[name].to(x) for name in ("image", "mask"))
         return self.backbone(t, torch.cat([x, image * mask, mask], dim=1))
 
-    told = True
+    takes_condition = True
 
     def forward(self, noise, condition=None, **options):
         made = super().forward(noise, condition, **options)
