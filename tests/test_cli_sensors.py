@@ -90,9 +90,6 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
     for wrong in (given, f"folder:{given}"):
         with pytest.raises(InputError, match="is a folder"):
             package.read(wrong)
-    for wrong in ("4x64", 4, (4,), (4.5, 64)):
-        with pytest.raises(InputError, match="size"):
-            open_scans(given, size=wrong)
     with pytest.raises(InputError, match="not both"):
         open_scans(given, Reading(SENSORS["hdl64e"]), sensor="vlp16")
 

@@ -36,8 +36,6 @@ def write_scans(folder: Path) -> None:
         (folder / f"{kind or 'a'}.{ending}").write_bytes(content)
     np.savetxt(folder / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="", fmt="%.2f")
     np.savetxt(folder / "a.xyz", TABLE, fmt="%.2f")
-    np.savez(folder / "a.npz", xyz=XYZ, intensity=REFLECTANCE)
-    np.savez_compressed(folder / "packed.npz", x=XYZ[:, 0], y=XYZ[:, 1], z=XYZ[:, 2])
     if importlib.util.find_spec("pyarrow"):
         import pyarrow
         from pyarrow import feather, parquet

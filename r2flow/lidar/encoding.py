@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import check
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import (
@@ -33,7 +33,8 @@ class RangeFormat:
     """Maps ranges r in metres, (..., 1, H, W), to values y in [0, 1] and back: r / r_max."""
 
     def __init__(self, sensor: Sensor) -> None:
-        self.min_range, self.max_range = sensor.min_range, sensor.max_range
+        self.min_range = sensor.min_range
+        self.max_range = sensor.max_range
 
     def forward(self, r: Tensor) -> Tensor:
         return r / self.max_range
@@ -58,8 +59,8 @@ class LogScale(RangeFormat):
 class ShiftedLog(LogScale):
     """log2(r + 1.0001) / scale, with scale = log2(r_max + 1) rounded up to hundredths.
 
-    Used by LiDARGen (r_max 63 m, scale 6) and LiDM (56 m, 5.84). A ray without return is log2(1.0001) / scale, not
-    exactly 0; the inverse, 2^(scale y) - 1, keeps the offset of 0.1 mm.
+    Used by LiDARGen (r_max 63 m, scale 6) and LiDM (56 m, 5.84). A ray without return is
+    log2(1.0001) / scale, not exactly 0; the inverse, 2^(scale y) - 1, keeps the offset of 0.1 mm.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -73,7 +74,10 @@ class ShiftedLog(LogScale):
 
 
 class Inverse(RangeFormat):
-    """r_min / r, 0 for no return; float32 resolves r to r^2 / r_min 2^-26, 2 mm for limits of 0.3 and 200 m."""
+    """r_min / r, 0 for no return.
+
+    float32 resolves r to r^2 / r_min 2^-26: 2 mm for limits of 0.3 and 200 m.
+    """
 
     def forward(self, r: Tensor) -> Tensor:
         return torch.where(r > 0, self.min_range / r.clamp(min=1e-12), 0.0)
@@ -82,7 +86,7 @@ class Inverse(RangeFormat):
 
 
 class InverseDepth(Inverse):
-    """r_min / r within the range limits, else 0, in both directions and without tolerance, as in DUSty."""
+    """r_min / r within the range limits, else 0, in both directions, as in DUSty: no tolerance."""
 
     def forward(self, r: Tensor) -> Tensor:
         return torch.where((r >= self.min_range) & (r <= self.max_range), super().forward(r), 0.0)
@@ -108,25 +112,30 @@ class Encoding:
 
     Args:
         sensor: Sensor of the images; ranges within its limits are returns.
-        format: `logscale` (the paper's), `shifted_log` (LiDARGen's and LiDM's), `inverse`, `inverse_depth` (DUSty's),
-            or `metric`.
+        format: `logscale` (the paper's), `shifted_log` (LiDARGen's and LiDM's), `inverse`,
+            `inverse_depth` (DUSty's), or `metric`.
         reflectance: Whether reflectance is a channel, in addition to range.
-        limits: `closed`: ranges equal to the sensor's limits are returns. `open`, as in R2DM: they are not, and ranges
-            outside the limits are encoded as dropped rays.
-        levels: Decoded reflectance is rounded to n / levels, as the sensor reports it; None: it is not rounded.
+        limits: `closed`: ranges equal to the sensor's limits are returns. `open`, as in R2DM: they
+            are not, and ranges outside the limits are encoded as dropped rays.
+        levels: Decoded reflectance is rounded to n / levels, as the sensor reports it; None: it is
+            not rounded.
     """
 
     def __init__(
         self,
         sensor: Sensor,
         format: str = "logscale",
-        reflectance: Annotated[bool, Bound("(auto is decided by a run, from its scans)", lambda b: True)] = True,
+        reflectance: Annotated[
+            bool, Bound("(auto is decided by a run, from its scans)", lambda b: True)
+        ] = True,
         limits: Literal["closed", "open"] = "closed",
-        levels: Annotated[float, Bound("that is whole and above 0", lambda n: n > 0 and n % 1 == 0)] | None = None,
+        levels: Annotated[float, Bound("that is whole and above 0", lambda n: n > 0 and n % 1 == 0)]
+        | None = None,
     ) -> None:
         self.sensor = sensor
         self.reflectance = reflectance
-        self.limits, self.levels = limits, levels
+        self.limits = limits
+        self.levels = levels
         self.format = FORMATS[format](sensor)
 
     def described(self) -> dict[str, Any]:
@@ -135,9 +144,10 @@ class Encoding:
         return {"format": name, "reflectance": self.reflectance, "limits": self.limits, "levels": self.levels}
 
     def through(self, sensor: Sensor) -> "Encoding":
-        """The same encoding of another sensor's ranges; the levels of its reflectance are not known."""
+        """The same encoding of another sensor's ranges, whose levels of reflectance are unknown."""
         other = copy(self)
-        other.sensor, other.format = sensor, type(self.format)(sensor)
+        other.sensor = sensor
+        other.format = type(self.format)(sensor)
         other.levels = self.levels if sensor.name == self.sensor.name else None
         return other
 
@@ -151,15 +161,21 @@ class Encoding:
         return self.channels, *self.sensor.shape
 
     def encode(self, image: Tensor) -> Tensor:
-        """Map range in metres and reflectance in [0, 1], (..., 2 or 1, H, W), to (..., channels, H, W).
+        """Map range in metres and reflectance in [0, 1] to model space.
 
-        A dropped ray, range 0, becomes exactly -1, or nearly under `shifted_log`; values are clipped to [-1, 1].
+        Shapes are (..., 2 or 1, H, W) and (..., channels, H, W).
+        A dropped ray, range 0, becomes exactly -1, or nearly under `shifted_log`; values are
+        clipped to [-1, 1].
         """
         r = image[..., :1, :, :]
-        y = self.format.forward(r * self._between(r) if self.limits == "open" else r)
-        if self.limits == "open":  # 2 y - 1 rounds y below 1/2, to the least y of a return or below it: keep these
-            kept, rounded = (self._between(self.format.inverse(z)) for z in (y, (2 * y - 1 + 1) / 2))
+        if self.limits == "open":
+            y = self.format.forward(r * self._is_return(r))
+            # 2 y - 1 rounds y below 1/2, to the least y of a return or below it: keep these.
+            kept = self._is_return(self.format.inverse(y))
+            rounded = self._is_return(self.format.inverse((2 * y - 1 + 1) / 2))
             y = torch.where(kept & ~rounded, y + 2**-24, y)
+        else:
+            y = self.format.forward(r)
         if self.reflectance:
             assert image.shape[-3] > 1, "the model has a reflectance channel and the scan has none"
             y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)
@@ -168,13 +184,14 @@ class Encoding:
     def decode(self, x: Tensor) -> Tensor:
         """Map (..., channels, H, W) to range in metres and reflectance, (..., 2 or 1, H, W).
 
-        Ranges outside the limits are dropped rays, 0 in both; reflectance is clamped to [0, 1] and rounded to `levels`.
+        Ranges outside the limits are dropped rays, 0 in both; reflectance is clamped to [0, 1] and
+        rounded to `levels`.
         """
         y = (x + 1) / 2
-        near, far = self.sensor.min_range, self.sensor.max_range
         r = self.format.inverse(y[..., :1, :, :])
-        returned = self._between(r)
-        image = torch.where(returned, r.clamp(near * (1 + 1e-6), far * (1 - 1e-6)), 0.0)  # also their rounded points
+        returned = self._is_return(r)
+        near = self.sensor.min_range * (1 + 1e-6)  # also the rounded points are within the limits
+        image = torch.where(returned, r.clamp(near, self.sensor.max_range * (1 - 1e-6)), 0.0)
         if self.reflectance:
             reflectance = y[..., 1:, :, :].clamp(0, 1)
             if self.levels is not None:
@@ -182,24 +199,34 @@ class Encoding:
             image = torch.cat([image, torch.where(returned, reflectance, 0.0)], dim=-3)
         return image
 
-    def _between(self, r: Tensor) -> Tensor:
-        slack = 0.0 if self.limits == "open" else max(LIMIT_TOLERANCE, torch.finfo(r.dtype).eps)
-        return (r > self.sensor.min_range * (1 - slack)) & (r < self.sensor.max_range * (1 + slack))
+    def _is_return(self, r: Tensor) -> Tensor:
+        slack = 0.0
+        if self.limits == "closed":
+            slack = max(LIMIT_TOLERANCE, torch.finfo(r.dtype).eps)
+        near = self.sensor.min_range * (1 - slack)
+        return (r > near) & (r < self.sensor.max_range * (1 + slack))
 
 
 def wrong_with(image: Tensor, far: float = FAR) -> str | None:
-    """Problem of a range image, (2 or 1, H, W), with a hint; None if its values are metres and [0, 1]."""
-    low, high = image.amin((1, 2)).tolist(), image.amax((1, 2)).tolist()  # NaN if a channel contains NaN
+    """Problem of a range image, (2 or 1, H, W), with a hint; None if it is in metres and [0, 1]."""
+    low = image.amin((1, 2)).tolist()  # NaN if a channel contains NaN
+    high = image.amax((1, 2)).tolist()
     for name, least, most in zip(("range", "reflectance"), low, high, strict=False):
-        if not math.isfinite(least) or not math.isfinite(most):
+        if not math.isfinite(least - most):
             return f"its {name} is NaN or infinite in places; 0 stands for a ray without a return"
         if least < 0:
-            hint = "is it in model space ([-1, 1])? Decode it" if max(-least, most) <= 1 else "0 stands for no return"
+            hint = "0 stands for no return"
+            if max(-least, most) <= 1:
+                hint = "is it in model space ([-1, 1])? Decode it"
             return f"its {name} goes down to {least:.4g}; {hint}"
-    if high[0] >= far and (median := float(image[0][image[0] > 0].median())) >= far:
-        return f"its median range is {median:.4g} m; are these millimetres? Give metres"
-    if max(high[1:], default=0) > FULL:
-        return f"its reflectance goes up to {high[1]:.4g}, not 1; divide by its full scale, often 255"
+    if high[0] >= far:
+        median = image[0][image[0] > 0].median().item()
+        if median >= far:
+            return f"its median range is {median:.4g} m; are these millimetres? Give metres"
+    if len(high) > 1 and high[1] > FULL:
+        return (
+            f"its reflectance goes up to {high[1]:.4g}, not 1; divide by its full scale, often 255"
+        )
     return None
 
 
@@ -224,18 +251,18 @@ class ModelSpace:
         """Decode model space, (B, C, h, w), to metres and reflectance, (B, 2 or 1, h, w)."""
         return self.encoding.decode(x)
 
-    def points(self, images: Tensor) -> list[np.ndarray]:
+    def points(self, images: Tensor) -> list[ndarray]:
         """The returns of each range image as a point cloud, along rays through the pixels' centres.
 
         Args:
-            images: Range in metres and, optionally, reflectance, (B, 2 or 1, H, W); 0 for dropped rays.
+            images: Range in metres and, optionally, reflectance, (B, 2 or 1, H, W); 0 for dropped
+                rays.
 
         Returns:
-            For each image x, y, z in metres (x ahead, y left, z up) and reflectance, (N, 4) float32; N differs between
-            scans. Reflectance is 0 if the images have none.
+            For each image x, y, z in metres (x ahead, y left, z up) and reflectance, (N, 4)
+            float32; N differs between scans. Reflectance is 0 if the images have none.
         """
-        images, rays = torch.as_tensor(images), self.sensor.rays()
-        check(images.ndim == 4 and images.shape[1] < 3, f"images are (B, 2 or 1, H, W), found {tuple(images.shape)}.")
+        rays = self.sensor.rays()
         clouds = (image_to_points(image, rays) for image in images.detach().float().cpu().numpy())
         return [np.column_stack(cloud) for cloud in clouds]
 
@@ -255,7 +282,6 @@ def encoding_options(encoding: Encoding | str | Mapping[str, Any]) -> dict[str, 
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:
     """The model space of a config with the keys `sensor` and `encoding`."""
-    check({"sensor", "encoding"} <= config.keys(), "the config of a model needs 'sensor' and 'encoding'.")
     sensor = construct("sensor", build_sensor, config["sensor"])
     check_options("encoding", Encoding, config["encoding"], given=1)
     rays = sensor.rays(config["sensor"].get("rays", "centre"))

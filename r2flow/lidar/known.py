@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.lidar.interpolation import nearest_known
 from r2flow.lidar.region import region
 from r2flow.lidar.scan_files import read_numbers
@@ -40,21 +41,27 @@ def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
     returned = images[:, 0] > 0
     state = torch.where(returned, int(Ray.RETURN), int(Ray.EMPTY)).to(torch.uint8)
     if measured is not None:
-        check(measured.shape[-2:] == images.shape[2:], f"measured is {(*measured.shape,)}, images {(*images.shape,)}.")
-        state[~measured.to(images.device, torch.bool).expand_as(returned)] = int(Ray.UNKNOWN)
+        if measured.shape[-2:] != images.shape[2:]:  # it would be repeated
+            raise InputError(f"measured is {(*measured.shape,)}, images {(*images.shape,)}.")
+        known = measured.to(images.device, torch.bool).expand_as(returned)
+        state[~known] = int(Ray.UNKNOWN)
     return state
 
 
-def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
-    """Share of the unknown rays of a state, (H, W), in sectors of at least `least` degrees without any known ray."""
+def share_in_sectors(state: ndarray, least: float = 5.0) -> float:
+    """Share of the unknown rays of a state, (H, W), in sectors without any known ray.
+
+    The sectors are of at least `least` degrees.
+    """
     unknown = state == Ray.UNKNOWN
-    columns = state.shape[1]
+    rows, columns = state.shape
     before, after = nearest_known(np.tile(~unknown.all(0), 3))  # in three turns
     wide = (after - before)[columns : 2 * columns] > math.ceil(least / 360 * columns)
-    return float(wide.sum() * len(state) / max(unknown.sum(), 1))
+    return float(wide.sum() * rows / max(unknown.sum(), 1))
 
 
-Mask = Callable[[np.ndarray, np.random.Generator], np.ndarray]  # measured rays, (H, W) bool -> those to keep, (H, W)
+# Measured rays, (H, W) bool, and draws -> those to keep, (H, W).
+Mask = Callable[[ndarray, np.random.Generator], ndarray]
 
 
 def every_row(step: Count, first: Natural = 0) -> Mask:
@@ -64,7 +71,9 @@ def every_row(step: Count, first: Natural = 0) -> Mask:
 
 def random_rows(share: Share) -> Mask:
     """A random share of the measured rows."""
-    return lambda measured, draws: _rows(measured, lambda rows: rows[_chosen(len(rows), share, draws)])
+    return lambda measured, draws: _rows(
+        measured, lambda rows: rows[_chosen(len(rows), share, draws)]
+    )
 
 
 def random_points(share: Share) -> Mask:
@@ -74,59 +83,67 @@ def random_points(share: Share) -> Mask:
 
 def without_sector(first: float, last: float) -> Mask:
     """All rays except a sector from azimuth `first` counter-clockwise to `last`, in degrees."""
-    return lambda rays, draws: ~np.isin(np.indices(rays.shape)[1], region(rays.shape, sector=(first, last)).columns)
+    return lambda rays, draws: (
+        ~np.isin(np.indices(rays.shape)[1], region(rays.shape, sector=(first, last)).columns)
+    )
 
 
 MASKS: Registry[Callable[..., Mask]] = Registry(
     "mask", rows=every_row, random=random_rows, points=random_points, sector=without_sector
 )
-FORMS = "rows:4, rows:4,FIRST, random:0.5, points:0.1, sector:-30,30 or a .npy of (H, W)"
 
 
 def parse_mask(text: str) -> Mask:
-    """Parse a mask: `NAME:NUMBERS` of `MASKS`, a .npy file, or the intersection of several masks joined by +."""
+    """Parse a mask: `NAME:NUMBERS` of `MASKS`, a .npy file, or the intersection of several by +."""
     parts = [_one_mask(part.strip()) for part in text.split("+")]
     return lambda measured, draws: np.logical_and.reduce([part(measured, draws) for part in parts])
 
 
 def mask_identity(text: str) -> str:
     """A mask's text with a hash of each file in it."""
-    parts = [part.strip() for part in text.split("+")]
-    return "+".join(
-        f"{one} ({hashlib.sha256(Path(one).read_bytes()).hexdigest()[:16]})" if one.lower().endswith(".npy") else one
-        for one in parts
-    )
+    parts = []
+    for part in text.split("+"):
+        part = part.strip()
+        if part.lower().endswith(".npy"):
+            part += f" ({hashlib.sha256(Path(part).read_bytes()).hexdigest()[:16]})"
+        parts.append(part)
+    return "+".join(parts)
 
 
 def _one_mask(text: str) -> Mask:
     if text.lower().endswith(".npy"):
-        return _from_file(Path(text))
+        return _from_file(text)
     name, _, numbers = text.partition(":")
     mask = MASKS[name]
     try:
-        values = [int(x) if (x := float(number)).is_integer() else x for number in numbers.split(",")]
-        options = inspect.signature(mask).bind(*values).arguments
+        values = map(float, numbers.split(","))
+        whole = [int(value) if value.is_integer() else value for value in values]
+        options = inspect.signature(mask).bind(*whole).arguments
     except (ValueError, TypeError):
-        raise InputError(f"the mask {text!r} lacks its numbers: give {FORMS}.") from None
+        raise InputError(
+            f"the mask {text!r} lacks its numbers: give rows:4, rows:4,FIRST, random:0.5, "
+            "points:0.1, sector:-30,30 or a .npy of (H, W)."
+        ) from None
     return construct(f"the mask {text!r}", mask, options)
 
 
-def _from_file(path: Path) -> Mask:
+def _from_file(path: str) -> Mask:
     kept = read_numbers(path)
     if kept.ndim != 2 or not np.isin(kept, (0, 1)).all():
-        raise InputError(f"the mask {path} must be an array (H, W) of booleans, found {kept.dtype} of {kept.shape}.")
+        found = f"{kept.dtype} of {kept.shape}"
+        raise InputError(f"the mask {path} must be an array (H, W) of booleans, found {found}.")
 
-    def mask(measured: np.ndarray, draws: np.random.Generator) -> np.ndarray:
+    def mask(measured: ndarray, draws: np.random.Generator) -> ndarray:
         if kept.shape != measured.shape:
-            raise InputError(f"the mask {path} is of {kept.shape}, the scans are of {measured.shape} rays.")
+            raise InputError(f"the mask {path} is of {kept.shape}, the scans of {measured.shape}.")
         return kept.astype(bool)
 
     return mask
 
 
-def _rows(measured: np.ndarray, choose: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _rows(measured: ndarray, choose: Callable[[ndarray], ndarray]) -> ndarray:
     return np.isin(np.indices(measured.shape)[0], choose(np.flatnonzero(measured.any(1))))
 
 
-def _chosen(count: int, share: float, draws: np.random.Generator) -> np.ndarray:
+def _chosen(count: int, share: float, draws: np.random.Generator) -> ndarray:
     return np.isin(np.arange(count), draws.permutation(count)[: round(share * count)])

@@ -3,49 +3,84 @@
 from pathlib import Path
 
 import numpy as np
+from numpy import ndarray
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.files import reading
 from r2flow.lidar.scan_files import LARGEST_FILE, Points
 
-# SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue, people red, plants green,
-# buildings and fences brown; moving objects have the colour of static ones).
+# SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue,
+# people red, plants green, buildings and fences brown; moving objects as static ones).
 CLASSES = {
-    0: ("unlabeled", "#6b727c"), 1: ("outlier", "#454b54"),
-    10: ("car", "#3f8efc"), 11: ("bicycle", "#7fd1ff"), 13: ("bus", "#2a5bd7"), 15: ("motorcycle", "#58b4e8"),
-    16: ("on-rails", "#1b3a9e"), 18: ("truck", "#5c7cfa"), 20: ("other vehicle", "#8aa2ff"),
-    30: ("person", "#ff4d4d"), 31: ("bicyclist", "#ff8787"), 32: ("motorcyclist", "#d6336c"),
-    40: ("road", "#9a86c9"), 44: ("parking", "#c3a6e8"), 48: ("sidewalk", "#d9b8d9"), 49: ("other ground", "#a07f8f"),
-    50: ("building", "#d9a441"), 51: ("fence", "#b5713c"), 52: ("other structure", "#8f6a3a"),
-    60: ("lane marking", "#f4ecff"), 70: ("vegetation", "#37a046"), 71: ("trunk", "#7a5a2f"),
-    72: ("terrain", "#a8cf6a"), 80: ("pole", "#ffe066"), 81: ("traffic sign", "#ff922b"), 
+    0: ("unlabeled", "#6b727c"),
+    1: ("outlier", "#454b54"),
+    10: ("car", "#3f8efc"),
+    11: ("bicycle", "#7fd1ff"),
+    13: ("bus", "#2a5bd7"),
+    15: ("motorcycle", "#58b4e8"),
+    16: ("on-rails", "#1b3a9e"),
+    18: ("truck", "#5c7cfa"),
+    20: ("other vehicle", "#8aa2ff"),
+    30: ("person", "#ff4d4d"),
+    31: ("bicyclist", "#ff8787"),
+    32: ("motorcyclist", "#d6336c"),
+    40: ("road", "#9a86c9"),
+    44: ("parking", "#c3a6e8"),
+    48: ("sidewalk", "#d9b8d9"),
+    49: ("other ground", "#a07f8f"),
+    50: ("building", "#d9a441"),
+    51: ("fence", "#b5713c"),
+    52: ("other structure", "#8f6a3a"),
+    60: ("lane marking", "#f4ecff"),
+    70: ("vegetation", "#37a046"),
+    71: ("trunk", "#7a5a2f"),
+    72: ("terrain", "#a8cf6a"),
+    80: ("pole", "#ffe066"),
+    81: ("traffic sign", "#ff922b"),
     99: ("other object", "#5fd3bc"),
-    252: ("moving car", "#3f8efc"), 253: ("moving bicyclist", "#ff8787"), 254: ("moving person", "#ff4d4d"),
-    255: ("moving motorcyclist", "#d6336c"), 256: ("moving on-rails", "#1b3a9e"), 257: ("moving bus", "#2a5bd7"),
-    258: ("moving truck", "#5c7cfa"), 259: ("moving other vehicle", "#8aa2ff"),
-}  # fmt: skip
+    252: ("moving car", "#3f8efc"),
+    253: ("moving bicyclist", "#ff8787"),
+    254: ("moving person", "#ff4d4d"),
+    255: ("moving motorcyclist", "#d6336c"),
+    256: ("moving on-rails", "#1b3a9e"),
+    257: ("moving bus", "#2a5bd7"),
+    258: ("moving truck", "#5c7cfa"),
+    259: ("moving other vehicle", "#8aa2ff"),
+}
 
 # Ids by SemanticKITTI's spelling of the names.
 LABELS = {name.replace(" ", "-"): label for label, (name, _) in CLASSES.items()}
 
 
 def labels_beside(scan: str | Path) -> Path | None:
-    """The label file of a scan: `000000.label` next to it, or `../labels/000000.label` of `velodyne/000000.bin`."""
+    """The label file of a scan, or None.
+
+    It is `000000.label` next to the scan, or `../labels/000000.label` of `velodyne/000000.bin`.
+    """
     file = Path(scan).with_suffix(".label")
     folder = file.parent.resolve()
-    raw = folder.name == "velodyne" and not (folder / "manifest.json").exists()  # not written by r2flow
-    files = [file, folder.parent / "labels" / file.name][: 1 + raw]
-    return next((path for path in files if path.exists() or path.is_symlink()), None)  # reading a broken link raises
+    files = [file]
+    if folder.name == "velodyne" and not (folder / "manifest.json").exists():  # not r2flow's
+        files.append(folder.parent / "labels" / file.name)
+    # A broken link is taken: reading it raises.
+    return next((path for path in files if path.exists() or path.is_symlink()), None)
 
 
-def read_labels(path: Path, scan: str | Path, points: Points) -> np.ndarray:
+def read_labels(path: Path, scan: str | Path, points: Points) -> ndarray:
     """The semantic id of each of a scan's points, (N,) uint16, without dropped rows.
 
-    A `.label` file has a uint32 per row of the scan's file, class id in the low 16 bits, instance in the high.
+    A `.label` file has a uint32 per row of the scan's file, class id in the low 16 bits, instance
+    in the high.
+
+    Raises:
+        InputError: The file has not one label a row.
     """
-    rows = len(points.xyz) + points.dropped
+    size = 4 * (len(points.xyz) + points.dropped)
     with reading(path, LARGEST_FILE, "file of labels", least=0):
-        size = path.stat().st_size  # checked first: a file of the wrong size is not loaded
-        check(size == 4 * rows, f"it holds {size} bytes; {scan} has {rows} points, which need {4 * rows}: uint32 each.")
-        ids = (np.fromfile(path, dtype="<u4") & 0xFFFF).astype(np.uint16)
+        found = path.stat().st_size  # checked first: a file of the wrong size is not loaded
+        if found != size:
+            raise InputError(
+                f"it holds {found} bytes, not {size}: a uint32 for each point of {scan}."
+            )
+        ids = np.fromfile(path, dtype="<u4").astype(np.uint16)  # the low 16 bits
     return ids if points.kept is None else ids[points.kept]

@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Sequence
+from math import pi
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import check
+from r2flow.errors import InputError
 from r2flow.files import save_array
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.scan_files.points import check_xyz
@@ -17,134 +19,160 @@ from r2flow.lidar.sensors import Convention, Sensor, named_sensor
 from r2flow.lidar.unfolding import unfolded_rows
 
 Projection = Literal["spherical", "unfolding"]
-TIE = 1e-3  # of a pixel: points on an edge, as of coarser images, are in the lower row and in the later column
+# Of a pixel: points on an edge, as of coarser images, are in the lower row and in the later column.
+TIE = 1e-3
+_TIES = {"centre": TIE, "reference": 0.0, "lidargen": 0.0, "lidm": 0.0}  # by convention
 
 
 def project(
-    xyz: np.ndarray,
-    reflectance: np.ndarray | None,
+    xyz: ndarray,
+    reflectance: ndarray | None,
     sensor: Sensor | str,
     projection: Projection = "spherical",
     convention: Convention = "centre",
-    ring: np.ndarray | None = None,
-) -> np.ndarray:
+    ring: ndarray | None = None,
+) -> ndarray:
     """The range image of a scan: every pixel has its nearest return.
 
-    The row is that of the elevation asin(z / r) in `spherical`, and that of the laser in `unfolding`, from `ring` or
-    the order of the points (`unfolded_rows`). The column is floor(W (1 - a / pi) / 2) with azimuth a = atan2(y, x):
-    column 0 begins at +180 degrees and azimuth decreases with w. In `centre` both include 0.001 of a pixel, so that
-    points on an edge are in one pixel whatever their rounding.
+    The row is that of the elevation asin(z / r) in `spherical`, and that of the laser in
+    `unfolding`, from `ring` or the order of the points (`unfolded_rows`). The column is floor(W (1
+    - a / pi) / 2) with azimuth a = atan2(y, x): column 0 begins at +180 degrees and azimuth
+    decreases with w. In `centre` both include 0.001 of a pixel, so that points on an edge are in
+    one pixel whatever their rounding.
 
-    `centre` keeps returns with min_range <= r <= max_range in the field of view. `reference` is the convention of the
-    published R2Flow: elevations outside the view are clamped to the edge rows, and the range limits are applied after
-    the nearest return is chosen, so that a return nearer than min_range empties its pixel. `lidargen` and `lidm` are
-    those of the published LiDARGen and LiDM: azimuth -180 degrees is in the last column, of equal ranges the last in
-    NumPy's order is chosen, and `lidm` applies the limits first, min_range < r < max_range.
+    `centre` keeps returns with min_range <= r <= max_range in the field of view. `reference` is the
+    convention of the published R2Flow: elevations outside the view are clamped to the edge rows,
+    and the range limits are applied after the nearest return is chosen, so that a return nearer
+    than min_range empties its pixel. `lidargen` and `lidm` are those of the published LiDARGen and
+    LiDM: azimuth -180 degrees is in the last column, of equal ranges the last in NumPy's order is
+    chosen, and `lidm` applies the limits first, min_range < r < max_range.
 
     Args:
-        xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. Not finite: a ray without return.
+        xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. Not finite: a ray
+            without return.
         reflectance: (N,), or None.
         sensor: Rows, columns and range limits; or its name or YAML file.
-        ring: Ring number of each point, (N,), from 0 or 1, monotonic in elevation or in the sensor's firing order.
+        ring: Ring number of each point, (N,), from 0 or 1, monotonic in elevation or in the
+            sensor's firing order.
 
     Returns:
         Range in metres and reflectance, (2, H, W) float32; 0 without a return.
 
     Raises:
-        InputError: `xyz` or `reflectance` has another shape, or the scan does not unfold into the sensor's rings.
+        InputError: `xyz` or `reflectance` has another shape, or the scan does not unfold into the
+            sensor's rings.
     """
     sensor = named_sensor(sensor)
     hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
-    shape = (len(xyz),) if reflectance is None else np.shape(reflectance)
-    check(shape == (len(xyz),), f"reflectance must have the shape ({len(xyz)},) or be None, found {shape}.")
-    return scatter(sensor, hit, [r, np.zeros_like(r) if reflectance is None else reflectance[chosen]])
+    strength = np.zeros_like(r) if reflectance is None else reflectance[chosen]
+    return scatter(sensor, hit, [r, strength])
 
 
-def scatter(sensor: Sensor, pixel: np.ndarray, values: Sequence[np.ndarray]) -> np.ndarray:
-    """Scatter C channels of values, (M,) each, to pixels h W + w of an image, (C, H, W) float32; 0 elsewhere."""
+def scatter(sensor: Sensor, pixel: ndarray, values: Sequence[ndarray]) -> ndarray:
+    """Scatter C channels of values, (M,) each, to pixels h W + w of an image of zeros.
+
+    The image is (C, H, W) float32.
+    """
     image = np.zeros((len(values), math.prod(sensor.shape)), dtype=np.float32)
     image[:, pixel] = values
     return image.reshape(-1, *sensor.shape)
 
 
 def project_indices(
-    xyz: np.ndarray,
+    xyz: ndarray,
     sensor: Sensor,
     projection: Projection = "spherical",
     convention: Convention = "centre",
-    ring: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ring: ndarray | None = None,
+) -> tuple[ndarray, ndarray, ndarray]:
     """The return of each pixel, see `project`.
 
-    Pixels with a return, h W + w, ascending; indices of their points in `xyz`; their ranges in metres: (M,) each.
+    Returns:
+        Pixels with a return, h W + w, ascending; indices of their points in `xyz`; their ranges in
+        metres: (M,) each.
     """
-    for name, known, found in (("convention", Convention, convention), ("projection", Projection, projection)):
-        check(found in get_args(known), f"a {name} is {' or '.join(get_args(known))}, found {found!r}.")
+    if projection not in get_args(Projection) or convention not in _TIES:
+        raise InputError(f"there is no projection {projection!r} with convention {convention!r}.")
     xyz = np.asarray(xyz, dtype=np.float32)
     check_xyz(xyz)
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     finite = np.isfinite(r)
     if not finite.all():  # rays without a return: fired in unfolding, but not in any pixel
-        xyz, r = np.where(finite[:, None], xyz, np.float32(0)), np.where(finite, r, np.float32(0))
-    unfolding = projection == "unfolding"
-    row = unfolded_rows(xyz, sensor, convention, ring) if unfolding else _rows(xyz, r, sensor, convention)
+        xyz = np.where(finite[:, None], xyz, np.float32(0))
+        r = np.where(finite, r, np.float32(0))
+    if projection == "unfolding":
+        row = unfolded_rows(xyz, sensor, convention, ring)
+    else:
+        row = _rows(xyz, r, sensor, convention)
     pixel = row * columns
     pixel += _columns(xyz, columns, convention)
     within = (r >= sensor.min_range) & (r <= sensor.max_range)
-    if convention != "centre":
-        if convention == "lidm":
-            finite = within = (r > sensor.min_range) & (r < sensor.max_range)
-        kept = np.flatnonzero(finite)
-        # Points are written from far to near, the nearest last. Under 1 % of KITTI's pixels have two points of equal
-        # range, in millimetres. The reference's choice depends on NumPy's unstable sort, so the same sort is used.
-        order = kept[np.argsort(-r[kept]) if convention == "reference" else np.argsort(r[kept])[::-1]]
-        owner = np.full(rows * columns, -1, dtype=np.int64)
-        owner[pixel[order]] = order
-        hit = np.flatnonzero(owner >= 0)
-        hit = hit[within[owner[hit]]]
-        chosen = owner[hit]
+    pixels = rows * columns
+    if convention == "centre":
+        # Omitted points share an extra pixel after the last: faster than removing them from every
+        # array.
+        pixel[(row < 0) | (row >= rows) | ~within] = pixels
+        hit, chosen = nearest(pixel, r, pixels)
+        return hit, chosen, r[chosen]
+    if convention == "lidm":
+        within = (r > sensor.min_range) & (r < sensor.max_range)
+        finite = within
+    kept = np.flatnonzero(finite)
+    # Points are written from far to near, the nearest last. Under 1 % of KITTI's pixels have two
+    # points of equal range, in millimetres. The reference's choice depends on NumPy's unstable
+    # sort, so the same sort is used.
+    if convention == "reference":
+        order = kept[np.argsort(-r[kept])]
     else:
-        # Omitted points share an extra pixel after the last: faster than removing them from every array.
-        pixel[(row < 0) | (row >= rows) | ~within] = rows * columns
-        hit, chosen = nearest(pixel, r, rows * columns)
-    return hit, chosen, r[chosen]
+        order = kept[np.argsort(r[kept])[::-1]]
+    owner = np.full(pixels, -1)
+    owner[pixel[order]] = order
+    hit = np.flatnonzero(owner >= 0)
+    hit = hit[within[owner[hit]]]
+    return hit, owner[hit], r[owner[hit]]
 
 
-def _rows(xyz: np.ndarray, r: np.ndarray, sensor: Sensor, convention: Convention) -> np.ndarray:
+def _rows(xyz: ndarray, r: ndarray, sensor: Sensor, convention: Convention) -> ndarray:
     """Row of every point's elevation, (N,) int64; outside [0, H) for points outside the view."""
     rows = sensor.shape[0]
     elevation = np.arcsin(xyz[:, 2] / np.maximum(r, np.float32(1e-12)))
     edges = np.deg2rad(sensor.row_edges)
+    top = edges[0]
+    bottom = edges[-1]
     step = np.diff(edges)
-    even, tie = np.allclose(step, step[0], rtol=1e-6), TIE if convention == "centre" else 0.0
-    if even and convention in ("lidargen", "lidm"):  # their order of operations, in float32
-        row = np.floor((1 - (elevation - float(edges[-1])) / float(edges[0] - edges[-1])) * rows).astype(np.int64)
-    elif even:  # an affine map instead of a search
-        place = edges[0] - elevation
-        place /= edges[0] - edges[-1]
-        place *= rows
-        place += tie
-        row = np.floor(place, out=place).astype(np.int64)
-    else:
-        row = np.searchsorted(-edges, tie * float(-step.max()) - elevation, side="right") - 1
-    return row if convention == "centre" else np.clip(row, 0, rows - 1)
+    tie = _TIES[convention]
+    if not np.allclose(step, step[0], rtol=1e-6):
+        shift = tie * float(-step.max()) - elevation
+        row = np.searchsorted(-edges, shift, side="right") - 1
+    elif convention in ("lidargen", "lidm"):  # their order of operations, in float32
+        share = 1 - (elevation - float(bottom)) / float(top - bottom)
+        row = np.floor(share * rows).astype(int)
+    else:  # an affine map instead of a search
+        place = (top - elevation) / (top - bottom) * rows + tie
+        row = np.floor(place).astype(int)
+    return row if convention == "centre" else row.clip(0, rows - 1)
 
 
-def _columns(xyz: np.ndarray, columns: int, convention: Convention) -> np.ndarray:
+def _columns(xyz: ndarray, columns: int, convention: Convention) -> ndarray:
     """Column of every point, (N,) int64."""
-    turn = (1 - np.arctan2(xyz[:, 1], xyz[:, 0]) / np.float32(math.pi)) / 2  # of [0, 1], 1 at exactly -180 degrees
-    column = (turn * np.float32(columns) + np.float32(TIE if convention == "centre" else 0)).astype(np.int64)
+    x, y, _ = xyz.T
+    turn = (1 - np.arctan2(y, x) / np.float32(pi)) / 2  # of [0, 1], 1 at exactly -180 degrees
+    column = (turn * np.float32(columns) + np.float32(_TIES[convention])).astype(int)
     if convention == "reference":
         column[turn == 1] = 0
-    column[column == columns] = 0 if convention == "centre" else columns - 1  # float32 may round the last bin up to W
+    # float32 may round the last bin up to W.
+    column[column == columns] = 0 if convention == "centre" else columns - 1
     return column
 
 
-def nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """The occupied pixels below `pixels`, and the index of the nearest point in each; of equals, the first."""
-    # Positive float32 values order like their bits: with (bits of r, index) in one integer, the nearest point is the
-    # minimum, found in one pass without sorting 120,000 points.
+def nearest(pixel: ndarray, r: ndarray, pixels: int) -> tuple[ndarray, ndarray]:
+    """The occupied pixels below `pixels`, and the index of the nearest point in each.
+
+    Of equally near points it is the first.
+    """
+    # Positive float32 values order like their bits: with (bits of r, index) in one integer, the
+    # nearest point is the minimum, found in one pass without sorting 120,000 points.
     key = r.view(np.uint32).astype(np.uint64)
     key <<= np.uint64(32)
     key |= np.arange(len(r), dtype=np.uint64)
@@ -152,22 +180,26 @@ def nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray, 
     best = np.full(pixels + 1, empty, dtype=np.uint64)
     np.minimum.at(best, pixel, key)
     hit = np.flatnonzero(best[:pixels] != empty)
-    return hit, (best[hit] & np.uint64(2**32 - 1)).astype(np.int64)
+    return hit, (best[hit] & np.uint64(2**32 - 1)).astype(int)
 
 
 def unproject(r: Tensor, rays: Tensor) -> Tensor:
-    """Points along rays, p = r (cos e cos a, cos e sin a, sin e) in metres, (B, 3, H, W): x ahead, y left, z up.
+    """Points along rays, p = r (cos e cos a, cos e sin a, sin e) in metres, (B, 3, H, W).
 
-    Ranges, (B, 1, H, W), are 0 for rays without return; rays are elevation e and azimuth a in radians, (2, H, W).
+    x points ahead, y left, z up.
+    Ranges, (B, 1, H, W), are 0 for rays without return; rays are elevation e and azimuth a in
+    radians, (2, H, W).
     """
     e, a = rays.to(r)
     return r * torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()])
 
 
 def image_to_points(
-    image: np.ndarray, rays: Tensor | np.ndarray | Sensor | str, measured: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """The returns of an image as a point cloud, ring after ring from the top, with azimuth increasing from 0.
+    image: ndarray, rays: Tensor | ndarray | Sensor | str, measured: ndarray | None = None
+) -> tuple[ndarray, ndarray]:
+    """The returns of an image as a point cloud.
+
+    Points are in order of rings from the top, with azimuth increasing from 0.
 
     Args:
         image: Range in metres and reflectance, (2, H, W); reflectance may be missing, (1, H, W).
@@ -177,26 +209,27 @@ def image_to_points(
     Returns:
         Points in metres, (N, 3), and reflectance, (N,), float32; N is the number of returns.
     """
-    rays = torch.as_tensor(rays) if isinstance(rays, Tensor | np.ndarray) else named_sensor(rays).rays()
-    check(image.ndim == 3 and image.shape[1:] == rays.shape[1:],
-          f"the image is {image.shape}, its rays are {tuple(rays.shape)}: give (2 or 1, H, W), and the rays of as many "
-          "pixels.")  # fmt: skip
-    r = torch.from_numpy(np.ascontiguousarray(np.nan_to_num(np.asarray(image[:1]), posinf=0)))[None]
+    if isinstance(rays, Sensor | str):
+        rays = named_sensor(rays).rays()
+    rays = torch.as_tensor(rays)
+    r = torch.from_numpy(np.nan_to_num(image[:1], posinf=0))[None]
     xyz = unproject(r, rays)[0].numpy()
     if measured is not None:
         xyz = np.where(measured.any(axis=0), measured, xyz)
     reflectance = image[1] if len(image) > 1 else np.zeros_like(image[0])
     # By azimuth, not from the middle column: a ring of `reference` rays begins one column later.
-    order = torch.argsort(rays[1, 0] % (2 * math.pi)).cpu().numpy()
-    xyz, reflectance, returned = xyz[..., order], reflectance[..., order], r[0, 0].numpy()[..., order] > 0
-    return np.ascontiguousarray(xyz[:, returned].T), np.ascontiguousarray(reflectance[returned])
+    order = torch.argsort(rays[1, 0] % (2 * pi)).cpu().numpy()
+    returned = r[0, 0].numpy()[:, order] > 0
+    points = xyz[..., order][:, returned].T
+    return np.ascontiguousarray(points), reflectance[:, order][returned]
 
 
-def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]) -> None:
+def write_scan(image: ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]) -> None:
     """Write a range image as `out/NAME.ENDING`: the image in .npy, points in other formats."""
-    for path in (out / f"{name}.{ending}" for ending in endings):
-        if path.suffix == ".npy":
+    xyz, reflectance = image_to_points(image, rays)
+    for ending in endings:
+        path = out / f"{name}.{ending}"
+        if ending == "npy":
             save_array(path, image)
         else:
-            xyz, reflectance = image_to_points(image, rays)
             write_points(path, xyz, reflectance if len(image) > 1 else None)

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 
-# Degrees next to a sector that `r2flow sample` generates and crops. With the demo's 1-RF, the distance of a 90-degree
-# sector from the whole scan in model space is 0.065 without margin, 0.015 with this margin, 0.006 with 45 degrees.
+# Degrees next to a sector that `r2flow sample` generates and crops. With the demo's 1-RF, the
+# distance of a 90-degree sector from the whole scan in model space is 0.065 without margin, 0.015
+# with this margin, 0.006 with 45 degrees.
 MARGIN = 11.25
 
 
@@ -50,22 +51,26 @@ class Region:
         return image
 
     def widened(self, unit: tuple[int, int]) -> "Region":
-        """The smallest region of whole units (rows, columns) of the image that contains this one and its margin."""
-        assert not any(size % step for size, step in zip(self.shape, unit, strict=True)), unit
+        """The smallest region of whole units that contains this one and its margin.
+
+        A unit is (rows, columns) and divides the image.
+        """
+        columns = self.shape[1]
         top, height = _outward(self.top, self.height, unit[0])
         left, width = _outward(self.left - self.margin, self.width + 2 * self.margin, unit[1])
-        if width >= self.shape[1]:  # both ends may lie in one unit
-            left, width = 0, self.shape[1]
-        return Region(self.shape, top, height, left % self.shape[1], width)
+        if width >= columns:  # both ends may lie in one unit
+            return Region(self.shape, top, height, 0, columns)
+        return Region(self.shape, top, height, left % columns, width)
 
     def __str__(self) -> str:
-        last_row, last_column = self.top + self.height - 1, (self.left + self.width - 1) % self.shape[1]
-        return f"rows {self.top}-{last_row}, columns {self.left}-{last_column}"
+        last_row = self.top + self.height - 1
+        return f"rows {self.top}-{last_row}, columns {self.left}-{self.columns[-1]}"
 
 
 def _outward(first: int, count: int, unit: int) -> tuple[int, int]:
     begin = first // unit * unit
-    return begin, -(-(first + count) // unit) * unit - begin
+    end = math.ceil((first + count) / unit) * unit
+    return begin, end - begin
 
 
 def region(
@@ -74,30 +79,44 @@ def region(
     rows: tuple[int, int] | None = None,
     margin: float = 0.0,
 ) -> Region:
-    """The pixels of an azimuth sector and a block of rows of an image of shape (H, W); None for all.
+    """The pixels of an azimuth sector and a block of rows of an image of shape (H, W).
 
-    The sector runs counter-clockwise in degrees: (-45, 45) is the quarter ahead, (135, -135) the quarter behind; ends a
-    full turn apart are the full turn. Pixels partly inside are included, as are both rows, 0 at the top. `margin`
-    degrees on either side are generated and cropped, because a crop changes the generated scan near its edges.
+    None stands for all. Pixels partly inside are included.
+
+    Args:
+        sector: Degrees, counter-clockwise: (-45, 45) is the quarter ahead, (135, -135) the quarter
+            behind; ends a full turn apart are the full turn.
+        rows: First and last, 0 at the top.
+        margin: Degrees on either side that are generated and cropped, because a crop changes the
+            generated scan near its edges.
+
+    Raises:
+        InputError: The rows are not of the image, or the sector is narrower than a column.
     """
     height, width = shape
-    first_row, last_row = rows or (0, height - 1)
-    if not 0 <= first_row <= last_row < height:
-        raise InputError(f"rows must be FIRST-LAST within 0-{height - 1}, found {first_row}-{last_row}.")
-    assert 0 <= margin <= (180 if sector else 0), margin
-    left, count = _columns(width, sector) if sector is not None else (0, width)
-    return Region(shape, first_row, last_row - first_row + 1, left, count, math.ceil(margin / 360 * width))
+    first, last = rows or (0, height - 1)
+    if not 0 <= first <= last < height:
+        raise InputError(f"rows must be FIRST-LAST within 0-{height - 1}, found {first}-{last}.")
+    left = 0
+    count = width
+    if sector is not None:
+        left, count = _columns(width, sector)
+    return Region(shape, first, last - first + 1, left, count, math.ceil(margin / 360 * width))
 
 
 def _columns(width: int, sector: tuple[float, float]) -> tuple[int, int]:
+    """The first column that a sector touches, and their number."""
     begin, end = sector
     turn = 360.0 if end - begin >= 360 else (end - begin) % 360 or 360.0
-    if begin == end or max(abs(begin), abs(end)) > 360 or not turn * width >= 360 * (1 - 1e-9):
+    inside = max(abs(begin), abs(end)) <= 360 and begin != end
+    if not inside or not turn * width >= 360 * (1 - 1e-9):  # also NaN
         raise InputError(
-            f"the sector {begin:.15g},{end:.15g} is narrower than a column, {360 / width:g} degrees, or not "
-            "within -360 to 360 degrees; -180,180 is the full turn."
+            f"the sector {begin:.15g},{end:.15g} is narrower than a column, {360 / width:g} "
+            "degrees, or not within -360 to 360 degrees; -180,180 is the full turn."
         )
     fuzz = 1e-9 * width  # rounding must not add a pixel if the sector ends between two
     left = math.floor((180 - (begin + turn)) / 360 * width + fuzz)
     right = math.ceil((180 - begin) / 360 * width - fuzz)
-    return (0, width) if right - left >= width else (left % width, right - left)
+    if right - left >= width:
+        return 0, width
+    return left % width, right - left

@@ -1,20 +1,21 @@
-"""Sensors: spinning LiDARs, described by their rays, by name or in YAML files, as in conf/sensor/."""
+"""Sensors: spinning LiDARs, described by their rays, by name or in YAML files."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
+from math import inf, pi
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 import yaml
+from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 from r2flow.files import atomic_write, reading
-from r2flow.registry import Registry, UnknownName, check_options, construct, options_of
+from r2flow.registry import Registry, check_options, construct, options_of
 
 Rays = Literal["centre", "reference"]
 Convention = Literal[Rays, "lidargen", "lidm"]
@@ -29,34 +30,45 @@ class Sensor:
 
     name: str
     elevations: tuple[float, ...]  # of each row in degrees, the top row first, strictly decreasing
-    columns: int = 1024  # azimuth bins W of a full turn; column 0 begins at +180 degrees, azimuth decreases with w
+    # Azimuth bins W of a full turn; column 0 begins at +180 degrees, azimuth decreases with w.
+    columns: int = 1024
     min_range: float = 1.45  # valid ranges, in metres
     max_range: float = 80.0
     height: float = 1.73  # typical height of the sensor above the ground in metres
-    #: Row of laser 0, 1, ... in the order of the sensor's packets; None if the order is top-down or bottom-up.
+    # Row of laser 0, 1, ... in the order of the sensor's packets; None: top-down or bottom-up.
     firing: tuple[int, ...] | None = None
-    reflectance_scale: float | None = None  # value of full reflectance in its scan files; None if unknown
+    reflectance_scale: float | None = None  # value of full reflectance in its scan files
 
     def __post_init__(self) -> None:
-        for key in ("elevations",) if self.firing is None else ("elevations", "firing"):  # lists have no hash
-            object.__setattr__(self, key, tuple(np.asarray(getattr(self, key)).tolist()))
-        e, near, far, scale = self.elevations, self.min_range, self.max_range, self.reflectance_scale
-        rows = [*range(len(e))]
-        odd = next((pair for pair in pairwise(e) if not 90 > pair[0] > pair[1] > -90), None if len(e) > 1 else e)
-        for holds, rule, value in (
-            (odd is None, "elevations must be two or more, fall from the top row down, within (-90, 90) degrees", odd),
-            (hasattr(self.columns, "__index__") and self.columns >= 1, "columns: a whole number from 1", self.columns),
-            (len(e) * self.columns <= MOST_PIXELS, f"at most {MOST_PIXELS:,} pixels", f"{len(e)} x {self.columns}"),
-            (0 < near < far < math.inf, "needs 0 < min_range < max_range in metres", f"{near} and {far}"),
-            (0 < self.height < math.inf, "height must be metres above the ground", self.height),
-            (self.firing is None or sorted(self.firing) == rows, "firing must name each row once", self.firing),
-            (scale is None or 0 < scale < math.inf, "reflectance_scale must be a positive number", scale),
-        ):
-            check(holds, f"sensor {self.name!r}: {rule}; found {str(value)[:80]}.")
+        object.__setattr__(self, "elevations", _plain(self.elevations))  # lists have no hash
+        rows = len(self.elevations)
+        order: Sequence[int] = range(rows)
+        if self.firing is not None:
+            object.__setattr__(self, "firing", _plain(self.firing))
+            order = self.firing
+        scale = 1.0 if self.reflectance_scale is None else self.reflectance_scale
+        inside = (90.0, *self.elevations, -90.0)
+        rules = {
+            "elevations must be two or more, from the top row down within (-90, 90) degrees": (
+                rows > 1 and all(upper > lower for upper, lower in pairwise(inside))
+            ),
+            f"columns must be 1 or more, with at most {MOST_PIXELS:,} pixels": (
+                self.columns >= 1 and rows * self.columns <= MOST_PIXELS
+            ),
+            "needs 0 < min_range < max_range in metres": 0 < self.min_range < self.max_range < inf,
+            "height must be metres above the ground": 0 < self.height < inf,
+            "firing must name each row once": sorted(order) == list(range(rows)),
+            "reflectance_scale must be a positive number": 0 < scale < inf,
+        }
+        for rule, holds in rules.items():
+            if not holds:
+                raise InputError(f"sensor {self.name!r}: {rule}.")
 
     def described(self) -> dict[str, Any]:
         """All fields that images depend on, as plain values: all except `reflectance_scale`."""
-        return {key: value for key, value in asdict(self).items() if key != "reflectance_scale"}
+        fields = asdict(self)
+        del fields["reflectance_scale"]
+        return fields
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -64,54 +76,74 @@ class Sensor:
         return len(self.elevations), self.columns
 
     def same_image(self, other: "Sensor") -> bool:
-        """Whether images of the two sensors have the same pixels: one size, elevations within 0.001 degrees."""
-        return self.shape == other.shape and np.allclose(self.elevations, other.elevations, atol=1e-3)
+        """Whether images of both have the same size, and elevations within 0.001 degrees."""
+        return self.shape == other.shape and np.allclose(
+            self.elevations, other.elevations, atol=1e-3
+        )
 
     @property
-    def row_edges(self) -> np.ndarray:
+    def row_edges(self) -> ndarray:
         """Elevations in degrees of the edges of the rows, (H + 1,), decreasing; float64.
 
-        Inner edges are half-way between neighbouring beams; outer edges are as far from their beam as its inner edge.
+        Inner edges are half-way between neighbouring beams; outer edges are as far from their beam
+        as its inner edge.
         """
-        e = np.asarray(self.elevations, dtype=np.float64)
+        e = np.asarray(self.elevations, dtype=float)
         inner = (e[:-1] + e[1:]) / 2
         return np.concatenate([[2 * e[0] - inner[0]], inner, [2 * e[-1] - inner[-1]]])
 
     def rays(self, convention: Rays = "centre") -> Tensor:
         """Elevation e and azimuth a of every pixel in radians, (2, H, W), float32.
 
-        `centre` is the centre of each bin: e is the beam's elevation, a = pi - 2 pi (w + 1/2) / W. `reference` is the
-        upper left corner of the bin, a = pi - 2 pi w / W, an offset of half a bin that published R2Flow weights need.
+        `centre` is the centre of each bin: e is the beam's elevation, a = pi - 2 pi (w + 1/2) / W.
+        `reference` is the upper left corner of the bin, a = pi - 2 pi w / W, an offset of half a
+        bin that published R2Flow weights need.
         """
+        elevation = self.row_edges[:-1]
+        column = np.arange(self.columns, dtype=float)
         if convention == "centre":
-            elevation, shift = np.asarray(self.elevations, dtype=np.float64), 0.5
-        else:
-            check(convention == "reference", f"rays are centre or reference, found {convention!r}.")
-            elevation, shift = self.row_edges[:-1], 0.0
-        azimuth = math.pi * (1 - 2 * (np.arange(self.columns) + shift) / self.columns)  # 0 exactly in the middle
+            elevation = np.asarray(self.elevations, dtype=float)
+            column += 0.5
+        azimuth = pi * (1 - 2 * column / self.columns)  # 0 exactly in the middle
         grid = np.stack(np.meshgrid(np.deg2rad(elevation), azimuth, indexing="ij"))
         return torch.from_numpy(grid.astype(np.float32))
 
-    def resized(self, rows: int | None = None, columns: int | None = None, rays: Rays = "centre") -> "Sensor":
+    def resized(
+        self, rows: int | None = None, columns: int | None = None, rays: Rays = "centre"
+    ) -> "Sensor":
         """The sensor with the same field of view and another number of rows and columns.
 
-        More rows: each beam is the centre of a row, with the others evenly spread between beams. Fewer, or `reference`:
-        row edges are interpolated, so that each new row covers an equal share of the old rows.
+        More rows: each beam is the centre of a row, with the others evenly spread between beams.
+        Fewer, or `reference`: row edges are interpolated, so that each new row covers an equal
+        share of the old rows.
+
+        Raises:
+            InputError: The image would have less than two rows, no column or too many pixels.
         """
         sensor = self if columns is None else replace(self, columns=columns)
-        old = len(self.elevations)
+        e = self.elevations
+        old = len(e)
         if rows is None or rows == old:
             return sensor
-        fits = hasattr(rows, "__index__") and 2 <= rows <= MOST_PIXELS // sensor.columns
-        check(fits, f"sensor {self.name!r}: rows must be whole, over 1, at most {MOST_PIXELS:,} pixels; found {rows}.")
+        most = MOST_PIXELS // sensor.columns
+        if not 2 <= rows <= most:
+            raise InputError(f"sensor {self.name!r}: rows must be 2 to {most:,}, found {rows}.")
         if rows > old and rays == "centre":
-            e, beam = self.elevations, np.arange(-1, old + 1)  # with a step beyond the first and the last beam
-            beams = [min(2 * e[0] - e[1], e[0] / 2 + 45), *e, max(2 * e[-1] - e[-2], e[-1] / 2 - 45)]
-            middle = np.interp(np.arange(rows), (2 * beam + 1) * rows // (2 * old), beams)
+            beam = np.arange(-1, old + 1)  # with a step beyond the first and the last beam
+            above = min(2 * e[0] - e[1], e[0] / 2 + 45)
+            below = max(2 * e[-1] - e[-2], e[-1] / 2 - 45)
+            centre = (2 * beam + 1) * rows // (2 * old)
+            middle = np.interp(np.arange(rows), centre, [above, *e, below])
         else:
-            edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)
+            share = np.linspace(0, old, rows + 1)
+            edges = np.interp(share, np.arange(old + 1), self.row_edges)
             middle = (edges[:-1] + edges[1:]) / 2
-        return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # a row is no longer one laser
+        return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # not one laser each
+
+
+def _plain(values: Sequence[float] | ndarray) -> tuple:
+    """The values of a list or an array as a tuple of Python's numbers."""
+    return tuple(np.asarray(values).tolist())
 
 
 def _beams(top: float, step: float, count: int) -> tuple[float, ...]:
@@ -119,18 +151,25 @@ def _beams(top: float, step: float, count: int) -> tuple[float, ...]:
 
 
 def _halves_in_turn(rows: int) -> tuple[int, ...]:
-    """Firing order of Velodyne's 16 and 32 evenly spaced lasers: lower and upper half alternate, both upwards."""
+    """Firing order of Velodyne's 16 and 32 evenly spaced lasers.
+
+    The lower and the upper half alternate, both upwards.
+    """
     return tuple(np.arange(rows)[::-1].reshape(2, -1).T.ravel().tolist())
 
 
 def _by_laser(elevations: Sequence[float]) -> dict[str, Any]:
-    """Elevations and firing order of a sensor, from the elevations of its lasers in the order of the manual."""
-    order = sorted(range(len(elevations)), key=lambda laser: -elevations[laser])
-    return {"elevations": tuple(elevations[laser] for laser in order), "firing": tuple(np.argsort(order).tolist())}
+    """Elevations and firing order of a sensor, from the elevations of its lasers in order."""
+    order = np.argsort(-np.asarray(elevations), kind="stable")
+    return {
+        "elevations": _plain(np.asarray(elevations)[order]),
+        "firing": _plain(np.argsort(order)),
+    }
 
 
-# Median elevations of the 64 rings of an HDL-64E, measured on unfolded KITTI scans; another car's are within 0.2
-# degrees. Rings are not evenly spaced, which matters for scan unfolding, where each row is a ring.
+# Median elevations of the 64 rings of an HDL-64E, measured on unfolded KITTI scans; another car's
+# are within 0.2 degrees. Rings are not evenly spaced, which matters for scan unfolding, where each
+# row is a ring.
 HDL64E_RINGS = (
     2.45, 2.06, 1.80, 1.34, 1.06, 0.64, 0.37, 0.00, -0.34, -0.74, -1.02,
     -1.35, -1.72, -2.05, -2.37, -2.71, -3.00, -3.36, -3.63, -3.99, -4.28, -4.61,
@@ -147,8 +186,9 @@ VLP32C_LASERS = (
     2.333, -2.667, -3.0, 7.0, 4.667, -2.333, -2.0, 15.0, 10.333, -1.333,
 )  # fmt: skip
 
-# Pandar64, from the correction table of the manufacturer's open driver (Hesai): elevation of channel 1, 2, ..., 64 from
-# the top. Calibration files of single units differ by some hundredths of a degree.
+# Pandar64, from the correction table of the manufacturer's open driver (Hesai): elevation of
+# channel 1, 2, ..., 64 from the top. Calibration files of single units differ by some hundredths of
+# a degree.
 PANDAR64_CHANNELS = (
     14.882, 11.032, 8.059, 5.057, 3.04, 2.028, 1.86, 1.688, 1.522, 1.351, 1.184,
     1.013, 0.846, 0.675, 0.508, 0.337, 0.169, 0.0, -0.169, -0.337, -0.508, -0.675,
@@ -158,24 +198,22 @@ PANDAR64_CHANNELS = (
     -8.059, -9.06, -9.885, -11.032, -12.006, -12.974, -13.93, -18.889, -24.897,
 )  # fmt: skip
 
-# Ranges and beams from the manuals: HDL-32E 63-9113, VLP-16 63-9243, VLP-32C 63-9325 (Velodyne); OS1 datasheet of its
-# first generation, whose 64 beams span +-16.6 degrees and whose 128 span +-22.5 (Ouster); Pandar64 640-en (Hesai).
-# OS1 beams are calibrated per unit and differ by up to half a degree: `r2flow sensor` estimates them from scans.
-# hdl64e is the image of the paper: 64 equal bins between +3 and -25 degrees, 1.45 to 80 m. It has no firing order:
-# packets list the lasers by number, and the calibrated elevations differ between units.
+# Ranges and beams from the manuals: HDL-32E 63-9113, VLP-16 63-9243, VLP-32C 63-9325 (Velodyne);
+# OS1 datasheet of its first generation, whose 64 beams span +-16.6 degrees and whose 128 span
+# +-22.5 (Ouster); Pandar64 640-en (Hesai). OS1 beams are calibrated per unit and differ by up to
+# half a degree: `r2flow sensor` estimates them from scans. hdl64e is the image of the paper: 64
+# equal bins between +3 and -25 degrees, 1.45 to 80 m. It has no firing order: packets list the
+# lasers by number, and the calibrated elevations differ between units.
 SENSORS: Registry[Sensor] = Registry(
     "sensor",
     hdl64e=Sensor("hdl64e", _beams(3 - 7 / 32, 7 / 16, 64)),
     hdl64e_rings=Sensor("hdl64e_rings", HDL64E_RINGS),
     hdl32e=Sensor(
-        "hdl32e",
-        _beams(32 / 3, 4 / 3, 32),
-        min_range=1.0,
-        max_range=100.0,
-        height=1.84,
-        firing=_halves_in_turn(32),
+        "hdl32e", _beams(32 / 3, 4 / 3, 32), 1024, 1.0, 100.0, 1.84, firing=_halves_in_turn(32)
     ),
-    vlp16=Sensor("vlp16", _beams(15.0, 2.0, 16), min_range=0.5, max_range=100.0, firing=_halves_in_turn(16)),
+    vlp16=Sensor(
+        "vlp16", _beams(15.0, 2.0, 16), min_range=0.5, max_range=100.0, firing=_halves_in_turn(16)
+    ),
     vlp32c=Sensor("vlp32c", **_by_laser(VLP32C_LASERS), min_range=0.5, max_range=200.0),
     os1_64=Sensor("os1_64", _beams(16.6, 33.2 / 63, 64), min_range=0.8, max_range=120.0),
     os1_128=Sensor("os1_128", _beams(22.5, 45 / 127, 128), min_range=0.8, max_range=120.0),
@@ -195,66 +233,76 @@ def build_sensor(
     reflectance_scale: float | None = None,
     rays: Rays = "centre",
 ) -> Sensor:
-    """A built-in sensor by name, or a custom sensor by `elevations`, with the given size and limits.
+    """A built-in sensor by name, or a custom sensor by `elevations`, with the given options.
 
-    `rays` are the model's (`Sensor.rays`); with `reference`, more rows than beams divide the view evenly.
+    `rays` are the model's (`Sensor.rays`); with `reference`, rows are even shares of the view.
     """
-    if elevations is not None and name in SENSORS:
-        raise InputError(f"{name!r} is the name of a built-in sensor; give your own sensor another one.")
-    limits = {"min_range": min_range, "max_range": max_range, "height": height, "reflectance_scale": reflectance_scale}
-    try:
-        given = {key: float(value) for key, value in limits.items() if value is not None}
-        sensor = SENSORS[name] if elevations is None else Sensor(name, tuple(e + 0.0 for e in elevations))
-        sensor = sensor if firing is None else replace(sensor, firing=tuple(firing))
-    except (OverflowError, TypeError) as error:  # YAML integers can have any number of digits, lists any values
-        raise InputError(f"sensor {name!r}: elevations, firing and limits must be numbers; {error}.") from None
+    if elevations is None:
+        sensor = SENSORS[name]
+    elif name in SENSORS:
+        raise InputError(f"{name!r} is a built-in sensor; give your own sensor another name.")
+    else:
+        sensor = Sensor(name, tuple(e + 0.0 for e in elevations))  # no -0.0
+    if firing is not None:
+        sensor = replace(sensor, firing=tuple(firing))
+    limits = {
+        "min_range": min_range,
+        "max_range": max_range,
+        "height": height,
+        "reflectance_scale": reflectance_scale,
+    }
+    given = {key: float(value) for key, value in limits.items() if value is not None}
     return replace(sensor.resized(rows, columns, rays), **given)  # type: ignore[arg-type]
 
 
 def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
-    """Read a sensor from a YAML file with the options of `build_sensor`, in another size if given."""
+    """Read a sensor from a YAML file with the options of `build_sensor`, in a size if given."""
     with reading(Path(path), 1 << 20, "sensor's YAML"):  # of a dozen lines
         options = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        named = isinstance(options, dict) and all(isinstance(key, str) for key in options)
-        check(named, "it is not a sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
-        check(options.get("rays", "centre") == "centre", "rays are a model's: give sensor.rays=reference in training.")
-        options |= {key: value for key, value in (("rows", rows), ("columns", columns)) if value is not None}
+        if not isinstance(options, dict):
+            raise InputError("it is not a sensor: give `name: mine`, `elevations: [15.0, ...]`.")
+        if options.get("rays", "centre") != "centre":
+            raise InputError("rays are a model's: give sensor.rays=reference in training.")
+        if rows is not None:
+            options["rows"] = rows
+        if columns is not None:
+            options["columns"] = columns
         return construct(str(path), build_sensor, options)
 
 
 def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
     """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
-    if size is not None and not (isinstance(size, tuple | list) and [type(n) for n in size] == [int, int]):
-        raise InputError(f"a size is (rows, columns), found {size!r}.")
+    rows, columns = size or (None, None)
     if isinstance(sensor, Sensor):
-        return sensor if size is None else sensor.resized(*size)
+        return sensor.resized(rows, columns)
     if str(sensor).lower().endswith(ENDINGS):
-        return read_sensor(sensor, *(size or (None, None)))
-    try:
-        named = build_sensor(**sensor_options(str(sensor)))
-    except UnknownName as error:
-        raise UnknownName(f"{error} Your own is a YAML file: r2flow sensor SCANS --out NAME.yaml") from None
-    return named if size is None else named.resized(*size)
+        return read_sensor(sensor, rows, columns)
+    named = build_sensor(**sensor_options(sensor))
+    return named if size is None else named.resized(rows, columns)
 
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
-    """Write a sensor as a YAML file that begins with a comment, such as the source of the numbers."""
-    options = {key: value for key, value in options_of_sensor(sensor).items() if key == "rows" or value is not None}
-    units = "Elevations in degrees, the top row first, a row each where rows is null; ranges and height in metres."
+    """Write a sensor as a YAML file that begins with a comment, such as the numbers' source."""
+    units = "Elevations in degrees, the top row first; ranges and height in metres."
     with atomic_write(path, "w") as file:
         file.writelines(f"# {line}\n" for line in (*comment.splitlines(), units))
-        yaml.safe_dump(options, file, default_flow_style=None, sort_keys=False, width=100)
+        yaml.safe_dump(
+            options_of_sensor(sensor), file, default_flow_style=None, sort_keys=False, width=100
+        )
 
 
 def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
-    """The keys of `sensor` in a config: the options of `build_sensor`, and rays through the pixels' centres."""
-    options = {key: np.asarray(value).tolist() for key, value in asdict(sensor).items()}  # NumPy's numbers as Python's
-    named = {"rows": len(sensor.elevations), "elevations": None} if sensor.name in SENSORS else {}  # beams by the name
-    return {**options, "rows": None, "rays": "centre", **named}
+    """The keys of `sensor` in a config: the options of `build_sensor`."""
+    fields = asdict(sensor)
+    options = {key: np.asarray(value).tolist() for key, value in fields.items()}  # no NumPy numbers
+    options |= {"rows": None, "rays": "centre"}
+    if sensor.name in SENSORS:  # beams by the name
+        options |= {"rows": len(sensor.elevations), "elevations": None}
+    return options
 
 
 def sensor_options(sensor: Sensor | str | Mapping[str, Any]) -> dict[str, Any]:
-    """Complete options of `build_sensor`, from a sensor, its name, a YAML file, or some of the options.
+    """Complete options of `build_sensor`, from a sensor, its name, a YAML file, or some options.
 
     Raises:
         InputError: an unknown name or option.

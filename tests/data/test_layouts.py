@@ -106,7 +106,7 @@ def test_a_folder_of_recordings_says_which_tool_unpacks_them(tmp_path: Path):
 
 
 def test_notes_beside_scans_are_no_scans(tmp_path: Path):
-    notes = [tmp_path / name for name in ("notes.txt", "poses.csv", "statistics.npz")]
+    notes = [tmp_path / name for name in ("notes.txt", "poses.csv")]
     for note in notes:
         note.write_text("x,y,z\n1,2,3\n")
     assert find_drives("folder", tmp_path)[0].scans == tuple(map(str, notes))

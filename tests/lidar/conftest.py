@@ -7,10 +7,17 @@ from r2flow.lidar.scan_files import Points
 
 
 def assert_points(
-    points: Points, xyz: ArrayLike, reflectance: ArrayLike | None = None, ring: ArrayLike | None = None
+    points: Points,
+    xyz: ArrayLike,
+    reflectance: ArrayLike | None = None,
+    ring: ArrayLike | None = None,
 ) -> None:
     """Bit for bit, in the types that every reader gives."""
-    of = ((points.xyz, xyz, np.float32), (points.reflectance, reflectance, np.float32), (points.ring, ring, np.uint16))
+    of = (
+        (points.xyz, xyz, np.float32),
+        (points.reflectance, reflectance, np.float32),
+        (points.ring, ring, np.uint16),
+    )
     for found, expected, kind in of:
         if expected is None:
             assert found is None

@@ -10,7 +10,13 @@ from r2flow.data.reading import Reading, scaled_reflectance
 from r2flow.data.sources import warn_of_frame, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_beams
-from r2flow.lidar.estimation import estimate_sensor, full_reflectance, is_tilted, nearest_sensor, other_sensor
+from r2flow.lidar.estimation import (
+    estimate_sensor,
+    full_reflectance,
+    is_tilted,
+    nearest_sensor,
+    other_sensor,
+)
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.sensors import HDL64E_RINGS, SENSORS, Sensor
@@ -44,7 +50,9 @@ def scan(sensor: Sensor, how: str, seed: int = 0) -> Points:
     kept = np.flatnonzero(xyz.any(axis=1))
     if how in (RINGS, UNORDERED):
         kept = np.random.default_rng(seed).permutation(kept)
-    return Points(xyz[kept], reflectance[kept], ring[kept].astype(np.uint16) * (how == RINGS))  # 0: as not numbered
+    return Points(
+        xyz[kept], reflectance[kept], ring[kept].astype(np.uint16) * (how == RINGS)
+    )  # 0: as not numbered
 
 
 MINE = Sensor("mine", (21.0, 12.5, 3.0, 2.0, 1.25, -0.5, -4.0, -9.0, -17.5))
@@ -61,7 +69,11 @@ def test_a_sensor_is_found_again(name, how):
     assert found.sensor.columns == 192
     assert found.sensor.height == pytest.approx(HEIGHT, abs=0.01)
     nearest, distance = nearest_sensor(found.beams.elevations)
-    assert nearest is None if name == "mine" else (nearest, distance) == (name, pytest.approx(0, abs=1e-3))
+    assert (
+        nearest is None
+        if name == "mine"
+        else (nearest, distance) == (name, pytest.approx(0, abs=1e-3))
+    )
     assert found.beams.firing == (sensor.firing if how == FIRINGS else None)
 
 
@@ -95,7 +107,10 @@ def test_ring_numbers_by_laser_give_the_firing_order(first):
         (np.arange(101), 100),
         (np.arange(236), 255),
         (np.arange(257), 256),
-        (np.append(np.tile(np.arange(101), 300), [180, 240]), 255),  # a Velodyne's few retroreflectors
+        (
+            np.append(np.tile(np.arange(101), 300), [180, 240]),
+            255,
+        ),  # a Velodyne's few retroreflectors
         (np.arange(301), 300),  # an Ouster's counts of photons
         (np.linspace(0, 3000, 50), 3000),
         (np.linspace(0, 7000, 50), 65535),
@@ -110,24 +125,35 @@ def test_the_scale_of_reflectance_is_estimated(values, scale):
     assert full_reflectance([points]) == scale
     assert full_reflectance([Points(points.xyz)]) is None
     if scale:
-        assert scaled_reflectance("a.bin", points, scale).max() == pytest.approx(min(values.max() / scale, 1))
-    assert scaled_reflectance("a.bin", Points(np.ones((3, 3)), np.float32([0, 0.5, 1])), 255).tolist() == [0, 0.5, 1]
+        assert scaled_reflectance("a.bin", points, scale).max() == pytest.approx(
+            min(values.max() / scale, 1)
+        )
+    assert scaled_reflectance(
+        "a.bin", Points(np.ones((3, 3)), np.float32([0, 0.5, 1])), 255
+    ).tolist() == [0, 0.5, 1]
 
 
 def test_range_limits_include_all_but_stray_returns():
     sensor = SENSORS["vlp16"].resized(columns=1024)
     xyz = scan(sensor, RING_AFTER_RING).xyz
     r = np.linalg.norm(xyz, axis=1)
-    mine = estimate_sensor([Points(np.append(xyz, np.float32([[900, 0, 0]]), 0))]).sensor  # one bad return of 13,000
+    mine = estimate_sensor(
+        [Points(np.append(xyz, np.float32([[900, 0, 0]]), 0))]
+    ).sensor  # one bad return of 13,000
     assert mine.min_range == sensor.min_range < r.min()  # nothing is near in these scans
     assert r.max() <= mine.max_range < r.max() + 1
     assert estimate_sensor([scan(MINE, RING_AFTER_RING)]).sensor.min_range == 0.5
-    assert estimate_sensor([Points(xyz / 20)]).sensor.min_range == math.floor(r.min() / 2) / 10  # 0.3 m
+    assert (
+        estimate_sensor([Points(xyz / 20)]).sensor.min_range == math.floor(r.min() / 2) / 10
+    )  # 0.3 m
 
 
 def test_a_level_beam_is_not_at_minus_zero():
     level = Sensor("level", (4.0, 2.0, -2e-4, -2.0, -4.0), columns=192)
-    assert str(estimate_sensor([scan(level, RINGS)]).sensor.elevations) == "(4.0, 2.0, 0.0, -2.0, -4.0)"
+    assert (
+        str(estimate_sensor([scan(level, RINGS)]).sensor.elevations)
+        == "(4.0, 2.0, 0.0, -2.0, -4.0)"
+    )
 
 
 def test_what_no_sensor_is_estimated_from_is_refused():
@@ -149,10 +175,31 @@ def real(shared, pattern: str, step: int = 1, most: int | None = None) -> list[P
         ("kitti360/**/*.bin", 5, "hdl64e_rings", RING_AFTER_RING, 0.25, 2100),
         ("raw/**/*.bin", 10, "hdl64e_rings", RING_AFTER_RING, 0.25, 2100),
         ("odometry/**/*.bin", 1, "hdl64e_rings", RING_AFTER_RING, 0.25, 2100),
-        ("other_sensors/nuscenes_hdl32e/*.bin", 1, "hdl32e", RINGS, 0.1, 1084),  # 34,688 points of 32 lasers
-        ("other_sensors/rellis_os1_64/*.bin", 1, "os1_64", FIRINGS, 0.5, 2048),  # a unit's beams lie off the design's
+        (
+            "other_sensors/nuscenes_hdl32e/*.bin",
+            1,
+            "hdl32e",
+            RINGS,
+            0.1,
+            1084,
+        ),  # 34,688 points of 32 lasers
+        (
+            "other_sensors/rellis_os1_64/*.bin",
+            1,
+            "os1_64",
+            FIRINGS,
+            0.5,
+            2048,
+        ),  # a unit's beams lie off the design's
         ("other_sensors/rellis_vlp32c/*.bin", 1, "vlp32c", UNORDERED, 0.001, 1800),  # 0.2 degrees
-        ("other_sensors/vlp16/*.pcd", 1, "vlp16", UNORDERED, 0.01, 1809),  # a firing each 55.296 us, 10 turns a second
+        (
+            "other_sensors/vlp16/*.pcd",
+            1,
+            "vlp16",
+            UNORDERED,
+            0.01,
+            1809,
+        ),  # a firing each 55.296 us, 10 turns a second
     ],
 )
 def test_the_beams_of_real_sensors(shared, scans, step, name, order, off, steps):
@@ -186,7 +233,10 @@ def test_every_beam_of_a_real_unit_has_its_own_row(shared):
 def test_the_height_of_simulated_scans_is_found(name):
     """Beams close to the horizon meet more hedges and cars than ground."""
     sensor = SENSORS[name].resized(columns=256)
-    scans = [Points(*image_to_points(simulate(sensor, 3, index).image, sensor.rays())) for index in range(4)]
+    scans = [
+        Points(*image_to_points(simulate(sensor, 3, index).image, sensor.rays()))
+        for index in range(4)
+    ]
     assert estimate_sensor(scans).sensor.height == pytest.approx(sensor.height, abs=0.2)
 
 
@@ -215,7 +265,10 @@ def refuse_wrong_answers(scans: list[Points], true: str) -> None:
     for name, sensor in SIZED.items():
         found = other_sensor(scans, sensor)
         if name.split()[0] == true or {name.split()[0], true} <= HDL64E:
-            assert found is None or (found.name, true) == (None, "os1_64"), (name, found)  # rows between beams
+            assert found is None or (found.name, true) == (None, "os1_64"), (
+                name,
+                found,
+            )  # rows between beams
         else:
             assert found[1] == true.removesuffix("_rings"), (name, found)
 
@@ -241,17 +294,26 @@ def test_real_scans_are_of_their_own_sensor_alone(shared: Path, pattern: str):
 
 def pitched(points: Points, degrees: float) -> Points:
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return Points((points.xyz @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T).astype(np.float32), None, points.ring)
+    return Points(
+        (points.xyz @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T).astype(np.float32),
+        None,
+        points.ring,
+    )
 
 
 @pytest.mark.parametrize("ringed", [True, False])
 def test_two_sensors_in_one_file_are_warned_of(tmp_path: Path, caplog, ringed: bool):
     one, other = (scan(SENSORS["vlp16"].resized(columns=192), RINGS, seed) for seed in range(2))
-    xyz = [one.xyz + np.float32([1, 0, 0]), other.xyz * np.float32([-1, -1, 1]) + np.float32([-2, 0, 0.3])]
+    xyz = [
+        one.xyz + np.float32([1, 0, 0]),
+        other.xyz * np.float32([-1, -1, 1]) + np.float32([-2, 0, 0.3]),
+    ]
     rings = np.concatenate([one.ring, other.ring]) if ringed else None
     write_points(tmp_path / "0.ply", np.concatenate(xyz), ring=rings)
     warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["vlp16"]), tmp_path)
-    assert ("give scans of one sensor, in its own frame" if ringed else "degrees off its beams") in caplog.text
+    assert (
+        "give scans of one sensor, in its own frame" if ringed else "degrees off its beams"
+    ) in caplog.text
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -269,7 +331,9 @@ def test_real_scans_are_tilted_only_in_another_frame(shared: Path):
     for points in real(shared, "*/**/*.bin", step=6):
         quarter = points.xyz[find_beams(points).of_point[0] % 4 == 0]
         noisy = quarter + np.random.default_rng(0).normal(0, 0.02, quarter.shape).astype(np.float32)
-        assert not any(is_tilted([one]) for one in (points, *map(Points, (quarter, noisy, noisy * 1e-30))))
+        assert not any(
+            is_tilted([one]) for one in (points, *map(Points, (quarter, noisy, noisy * 1e-30)))
+        )
         assert is_tilted([pitched(Points(quarter), 5)])
 
 
@@ -277,10 +341,16 @@ def test_a_part_of_the_view_is_enough(shared: Path):
     """A camera's field of view: 82 degrees wide, and of 64 rings the lower 16 cut off."""
     for path in sorted((shared / "real" / "object").rglob("*.bin")):
         points = read_points(path)
-        elevation, azimuth = elevations_of(points.xyz), np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+        elevation, azimuth = (
+            elevations_of(points.xyz),
+            np.arctan2(points.xyz[:, 1], points.xyz[:, 0]),
+        )
         part = points.xyz[(np.abs(azimuth) < np.radians(41)) & (elevation > -15.7)]
         assert len(part) < len(points.xyz) / 4
-        assert [other_sensor([Points(part)], SENSORS[n]) is None for n in ("hdl64e", "vlp16")] == [True, False]
+        assert [other_sensor([Points(part)], SENSORS[n]) is None for n in ("hdl64e", "vlp16")] == [
+            True,
+            False,
+        ]
 
 
 def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
@@ -294,20 +364,31 @@ def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
 
 def test_sensors_of_one_s_own_are_judged_by_their_beams():
     mine = Sensor("mine", tuple(np.linspace(3, -25, 24).tolist()))
-    assert [other_sensor([scan(s, RING_AFTER_RING)], mine) is None for s in (mine, SENSORS["vlp16"])] == [True, False]
+    assert [
+        other_sensor([scan(s, RING_AFTER_RING)], mine) is None for s in (mine, SENSORS["vlp16"])
+    ] == [True, False]
     few = Points(scan(SENSORS["pandar64"], RING_AFTER_RING).xyz[:900])
     assert other_sensor([few], SENSORS["vlp16"]) is None  # a few returns say nothing
     assert nearest_sensor(35 - 4 * np.arange(11.0))[0] is None  # six of these are beams of a VLP-16
-    less = scan(Sensor("less", tuple(np.delete(HDL64E_RINGS, [n for n in range(32, 64) if n % 4]))), RING_AFTER_RING)
+    less = scan(
+        Sensor("less", tuple(np.delete(HDL64E_RINGS, [n for n in range(32, 64) if n % 4]))),
+        RING_AFTER_RING,
+    )
     assert "21 of its 64 rows lie between" in other_sensor([less], SENSORS["hdl64e_rings"]).seen
 
 
 def test_rows_between_the_beams_of_ones_own_sensor_are_no_other_sensors(tmp_path: Path, caplog):
     for beams, rows in ((SENSORS["vlp16"], 32), (SENSORS["vlp16"], 64), (MINE, 27)):
         write_points(tmp_path / "0.ply", scan(beams, RING_AFTER_RING).xyz)
-        warn_of_other_sensor([tmp_path / "0.ply"], Reading(Sensor("my_own", beams.elevations).resized(rows)), tmp_path)
+        warn_of_other_sensor(
+            [tmp_path / "0.ply"],
+            Reading(Sensor("my_own", beams.elevations).resized(rows)),
+            tmp_path,
+        )
         assert not caplog.text
-    warn_of_other_sensor([tmp_path / "0.ply"], Reading(Sensor("my_own", SENSORS["vlp16"].elevations)), tmp_path)
+    warn_of_other_sensor(
+        [tmp_path / "0.ply"], Reading(Sensor("my_own", SENSORS["vlp16"].elevations)), tmp_path
+    )
     assert "give the right one" in caplog.text
 
 
@@ -322,8 +403,15 @@ def without_beams(pattern: str) -> Points:
     else:
         azimuth = np.pi * (1 - 2 * np.random.default_rng(0).random(t.size))
         elevation = np.random.default_rng(1).permutation(0.4 * np.cos(turn * np.sqrt(2) * t))
-    r = np.minimum(np.where(elevation < 0, 1.7 / np.sin(np.maximum(-elevation, 1e-9)), np.inf), 25 / np.cos(elevation))
-    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    r = np.minimum(
+        np.where(elevation < 0, 1.7 / np.sin(np.maximum(-elevation, 1e-9)), np.inf),
+        25 / np.cos(elevation),
+    )
+    direction = [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
     return Points((r * direction).T.astype(np.float32))
 
 
@@ -334,15 +422,21 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
         find_beams(scan)
     write_points(tmp_path / "0.ply", scan.xyz)
     with pytest.raises(InputError, match="lie on no beams"):
-        warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["hdl64e"], within_limits=True), tmp_path)
+        warn_of_other_sensor(
+            [tmp_path / "0.ply"], Reading(SENSORS["hdl64e"], within_limits=True), tmp_path
+        )
     assert all(other_sensor([scan], sensor).hopeless for sensor in SENSORS.values())
-    with pytest.raises(InputError, match="lie on no beams"):  # the number of one of its lasers is no ring
+    with pytest.raises(
+        InputError, match="lie on no beams"
+    ):  # the number of one of its lasers is no ring
         find_beams(Points(scan.xyz, ring=np.arange(len(scan.xyz)) % 6))
 
 
 def test_rings_of_one_elevation_have_a_row_each():
     points = scan(SENSORS["vlp16"].resized(columns=192), RINGS)
-    thrice = [Points(points.xyz, None, np.where(points.ring == 7, 16 + k, points.ring)) for k in range(3)]
+    thrice = [
+        Points(points.xyz, None, np.where(points.ring == 7, 16 + k, points.ring)) for k in range(3)
+    ]
     found = estimate_sensor(thrice).sensor.elevations
     assert len(found) == 18
     np.testing.assert_allclose(found[6:11], [3, 1, 0.999, 0.998, -1], atol=1e-4)

@@ -1,8 +1,8 @@
 """Scans of other formats, written by their own libraries, are the points that were written."""
 
 import resource
-import zipfile
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,9 @@ def same(points, ring=None, intensity=INTENSITY, xyz=F4) -> None:
 
 
 TABLE = np.column_stack([XYZ, INTENSITY])
-WIDE = np.column_stack([np.arange(500), XYZ[:, 2], XYZ[:, 0], XYZ[:, 1], RING, INTENSITY]).astype(np.float32)
+WIDE = np.column_stack([np.arange(500), XYZ[:, 2], XYZ[:, 0], XYZ[:, 1], RING, INTENSITY]).astype(
+    np.float32
+)
 NAMES = ("time", "z", "x", "y", "ring", "intensity")
 
 
@@ -39,13 +41,29 @@ NAMES = ("time", "z", "x", "y", "ring", "intensity")
         {"delimiter": ";", "header": "X;Y;Z;Intensity", "comments": ""},
         {"delimiter": ",", "header": "x [m],y [m],z [m],intensity", "comments": ""},
         {"delimiter": " ", "header": "X Y Z Intensity", "comments": "//"},
-        {"delimiter": ",", "header": '"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","intensity"', "comments": ""},
+        {
+            "delimiter": ",",
+            "header": '"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","intensity"',
+            "comments": "",
+        },
         {"delimiter": " ", "header": "a scan of mine\nof today", "comments": "# "},
         {"delimiter": " ", "header": "here are x y z in metres", "comments": "# "},
         {"delimiter": " ", "header": "500", "comments": ""},
         {"delimiter": ",", "header": "0,1,2,3", "comments": ""},
     ],
-    ids=["spaces", "commas", "tabs", "semi", "units", "names", "VeloView", "comments", "words", "count", "pandas"],
+    ids=[
+        "spaces",
+        "commas",
+        "tabs",
+        "semi",
+        "units",
+        "names",
+        "VeloView",
+        "comments",
+        "words",
+        "count",
+        "pandas",
+    ],
 )
 def test_columns_of_text(tmp_path: Path, ending: str, options: dict):
     path = tmp_path / f"a.{ending}"
@@ -59,63 +77,39 @@ def test_columns_are_named_where_the_file_does_not(tmp_path: Path):
     WIDE.tofile(tmp_path / "a.bin")
     np.save(tmp_path / "a.npy", WIDE.astype(np.float64))
     np.savetxt(tmp_path / "a.txt", WIDE, fmt="%.6g")
-    np.savez(tmp_path / "a.npz", WIDE)
-    for name in ("a.bin", "a.npy", "a.txt", "a.npz"):
+    for name in ("a.bin", "a.npy", "a.txt"):
         same(read_points(tmp_path / name, NAMES), RING)
         same(read_points(tmp_path / name, ("_", "z", "x", "y", "_", "_")), intensity=None)
         for wrong in (("x", "y"), ("x", "y", "z", "x"), ("x", "y", "z", "intensity", "i")):
             with pytest.raises(InputError, match="columns must name x, y and z"):
                 read_points(tmp_path / name, wrong)
-    for name in ("a.npy", "a.txt", "a.npz"):
-        with pytest.raises(InputError, match=r"6 columns without names.*--columns x,y,z,intensity,_,_ "):
+    for name in ("a.npy", "a.txt"):
+        with pytest.raises(InputError, match=r"6 columns, not 4: name all by --columns x,y,z"):
             read_points(tmp_path / name)
-        with pytest.raises(InputError, match=r"6 columns, but 5 were named: x,y,z,_,_"):
+        with pytest.raises(InputError, match=r"6 columns, not 5: name all"):
             read_points(tmp_path / name, ("x", "y", "z", "_", "_"))
 
 
 def test_files_that_name_their_columns_take_no_others(tmp_path: Path):
     np.savetxt(tmp_path / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="")
-    np.savez(tmp_path / "a.npz", x=XYZ[:, 0], y=XYZ[:, 1], z=XYZ[:, 2])
-    for name in ("a.csv", "a.npz"):
-        with pytest.raises(InputError, match="names its columns"):
-            read_points(tmp_path / name, ("x", "y", "z", "intensity"))
+    with pytest.raises(InputError, match="names its columns"):
+        read_points(tmp_path / "a.csv", ("x", "y", "z", "intensity"))
 
 
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-def test_archives_of_numpy(tmp_path: Path, save):
-    path = tmp_path / "a.npz"
-    save(path, points=TABLE.astype(np.float32))
-    same(read_points(path))
-    save(path, xyz=F4, intensity=INTENSITY, ring=RING, pose=np.eye(4))
-    same(read_points(path), RING)
-    save(path, X=XYZ[:, 0], Y=XYZ[:, 1], Z=XYZ[:, 2], Reflectivity=INTENSITY, scan=3)
-    same(read_points(path))
-    save(path, F4)
-    same(read_points(path), intensity=None)
-    fields = np.zeros(500, [("x", "f4"), ("y", "f4"), ("z", "f8"), ("ring", "u1"), ("intensity", "u2")])
-    fields["x"], fields["y"], fields["z"], fields["ring"], fields["intensity"] = *XYZ.T, RING, INTENSITY
-    save(path, cloud=fields)
-    same(read_points(path), RING)
+def test_arrays_with_named_fields(tmp_path: Path):
+    fields = np.zeros(
+        500, [("x", "f4"), ("y", "f4"), ("z", "f8"), ("ring", "u1"), ("intensity", "u2")]
+    )
+    for name, column in zip(
+        ("x", "y", "z", "ring", "intensity"), (*XYZ.T, RING, INTENSITY), strict=True
+    ):
+        fields[name] = column
     np.save(tmp_path / "a.npy", fields)
     same(read_points(tmp_path / "a.npy"), RING)
-
-
-def test_archives_that_hold_no_points_are_refused(tmp_path: Path):
-    path = tmp_path / "a.npz"
-    for arrays, words in (
-        ({"pose": np.eye(4), "stamp": np.zeros(1)}, "no field x, y, z; it has: pose, stamp"),
-        ({"points": np.array([object()])}, "holds objects"),
-        ({"xyz": F4, "intensity": INTENSITY[:9]}, "in the place of"),
-        ({"points": F4[None]}, r"array \(1, 500, 3\)"),
-    ):
-        np.savez(path, **arrays)
+    for array, words in ((np.array([object()]), "objects"), (F4[None], r"array \(1, 500, 3\)")):
+        np.save(tmp_path / "a.npy", array)
         with pytest.raises(InputError, match=words):
-            read_points(path)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("points.npy", bytes(300 << 20))
-    assert path.stat().st_size < 1 << 20
-    with pytest.raises(InputError, match="far more than its own size"):
-        read_points(path)
+            read_points(tmp_path / "a.npy")
 
 
 def test_tables_of_arrow(tmp_path: Path):
@@ -126,18 +120,32 @@ def test_tables_of_arrow(tmp_path: Path):
     bytes_of = {"intensity": INTENSITY.astype(np.uint8), "laser_number": RING.astype(np.uint8)}
     argoverse = {"x": x, "y": y, "z": z, **bytes_of, "offset_ns": np.arange(500, dtype=np.int32)}
     for compression in ("uncompressed", "lz4", "zstd"):
-        feather.write_feather(pyarrow.table(argoverse), tmp_path / "a.feather", compression=compression)
-        same(read_points(tmp_path / "a.feather"), RING, xyz=F4.astype(np.float16).astype(np.float32))
+        feather.write_feather(
+            pyarrow.table(argoverse), tmp_path / "a.feather", compression=compression
+        )
+        same(
+            read_points(tmp_path / "a.feather"), RING, xyz=F4.astype(np.float16).astype(np.float32)
+        )
     table = pyarrow.table(
-        {"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2], "Intensity": INTENSITY, "label": ["car"] * 500}
+        {
+            "x": XYZ[:, 0],
+            "y": XYZ[:, 1],
+            "z": XYZ[:, 2],
+            "Intensity": INTENSITY,
+            "label": ["car"] * 500,
+        }
     )
     for compression in ("none", "snappy"):
-        parquet.write_table(table, tmp_path / "a.parquet", compression=compression, row_group_size=100)
+        parquet.write_table(
+            table, tmp_path / "a.parquet", compression=compression, row_group_size=100
+        )
         same(read_points(tmp_path / "a.parquet"))
     parquet.write_table(pyarrow.table({"x": ["a"], "y": [1.0], "z": [1.0]}), tmp_path / "b.parquet")
     with pytest.raises(InputError, match="in the place of"):
         read_points(tmp_path / "b.parquet")
-    parquet.write_table(pyarrow.table({"points": [[1.0]], "intensity": [1.0]}), tmp_path / "c.parquet")
+    parquet.write_table(
+        pyarrow.table({"points": [[1.0]], "intensity": [1.0]}), tmp_path / "c.parquet"
+    )
     with pytest.raises(InputError, match="no field x, y, z; it has: points, intensity"):
         read_points(tmp_path / "c.parquet")
 
@@ -163,7 +171,9 @@ def test_las(tmp_path: Path, version: str, form: int):
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.feather", "a.parquet"])
-def test_an_extra_that_is_missing_is_one_line_with_the_command(tmp_path: Path, monkeypatch, name: str):
+def test_an_extra_that_is_missing_is_one_line_with_the_command(
+    tmp_path: Path, monkeypatch, name: str
+):
     monkeypatch.setattr("r2flow.errors.find_spec", lambda package: None)
     (tmp_path / name).write_bytes(b"something")
     with pytest.raises(InputError, match=r"python -m pip install 'r2flow\[formats\]'"):
@@ -181,13 +191,17 @@ def test_a_small_file_takes_little_memory(tmp_path: Path):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for place, width in ((96, 4), (100, 4), (105, 2), (243, 4), (247, 8)):
         for value in (2 ** (8 * width - 1) - 1, 1 << 20):
-            path.write_bytes(whole[:place] + (value % 256**width).to_bytes(width, "little") + whole[place + width :])
+            path.write_bytes(
+                whole[:place]
+                + (value % 256**width).to_bytes(width, "little")
+                + whole[place + width :]
+            )
             with suppress(InputError):
                 read_points(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + (100 << 10)
 
 
-@pytest.mark.parametrize("ending", list(ELSEWHERE))
+@pytest.mark.parametrize("ending", [*chain(*ELSEWHERE)])
 def test_what_is_not_read_says_which_tool_converts_it(tmp_path: Path, ending: str):
     path = tmp_path / f"recording{ending}"
     for problem in ("does not exist", ""):
@@ -202,8 +216,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("", "empty"),
         ("# nothing\n", "no line of numbers"),
         ("x,y,z\n", "no line"),
-        *((f"x{mark}y{mark}z\n1,5{mark}-2,5e0{mark}3\n", "decimal commas") for mark in "; "),
-        ("1 2\n3 4\n", "2 columns without names"),
+        ("1 2\n3 4\n", "2 columns, not 3"),
         ("1,2,,4\n" * 3, "NaN"),
         ("x y z\n1 2 3 4\n", "longer than the names"),  # numbers of rows, as of R
         ("time;lat;rgb\n1;2;0,0,255\n", "no field x, y, z; it has: time, lat, rgb"),
@@ -219,21 +232,40 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
 def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):
     """VeloView's numbers of lasers, a sign of degrees in the header, and no numbers in the row of a lost ray."""
     table = zip(XYZ, INTENSITY, RING, strict=True)
-    rows = "\n".join(f"{x:.3f},{y:.3f},{z:.3f},{strength},{ring},0" for (x, y, z), strength, ring in table)
+    rows = "\n".join(
+        f"{x:.3f},{y:.3f},{z:.3f},{strength},{ring},0" for (x, y, z), strength, ring in table
+    )
     head = "Points:0,Points:1,Points:2,intensity,laser_id,azimuth \u00b0\n,,,,3,\n"
     (tmp_path / "a.csv").write_text(head + rows + "\n", encoding="utf-8")
     points = read_points(tmp_path / "a.csv")
     same(points, RING)
     assert points.dropped == 1
-    (tmp_path / "b.csv").write_text("x,y,z,intensity\n" + "".join(f"{x},{y},{z},7,\n" for x, y, z in F4))
+    (tmp_path / "b.csv").write_text(
+        "x,y,z,intensity\n" + "".join(f"{x},{y},{z},7,\n" for x, y, z in F4)
+    )
     same(read_points(tmp_path / "b.csv"), intensity=np.full(500, 7))
-    (tmp_path / "c.csv").write_text("x,y,z,class\n" + "".join(f'"{x}","{y}","{z}","a car"\n' for x, y, z in F4))
+    (tmp_path / "c.csv").write_text(
+        "x,y,z,class\n" + "".join(f'"{x}","{y}","{z}","a car"\n' for x, y, z in F4)
+    )
     same(read_points(tmp_path / "c.csv"), intensity=None)
-    np.savetxt(tmp_path / "d.csv", np.c_[np.arange(500), WIDE], "%.6g", ";", header=f";{';'.join(NAMES)}", comments="")
+    np.savetxt(
+        tmp_path / "d.csv",
+        np.c_[np.arange(500), WIDE],
+        "%.6g",
+        ";",
+        header=f";{';'.join(NAMES)}",
+        comments="",
+    )
     same(read_points(tmp_path / "d.csv"), RING)  # of pandas, a column without a name
-    for head in ("# range,azimuth,elevation,intensity", "x (mm),y (mm),z (mm),intensity", "# x [ft],y [ft],z [ft],i"):
+    for head in (
+        "# range,azimuth,elevation,intensity",
+        "x (mm),y (mm),z (mm),intensity",
+        "# x [ft],y [ft],z [ft],i",
+    ):
         np.savetxt(tmp_path / "e.csv", TABLE, delimiter=",", header=head, comments="")
-        with pytest.raises(InputError, match=r"no field x, y, z; it has: (range, azimuth|x \(mm\)|x \[ft\]), "):
+        with pytest.raises(
+            InputError, match=r"no field x, y, z; it has: (range, azimuth|x \(mm\)|x \[ft\]), "
+        ):
             read_points(tmp_path / "e.csv")
 
 
@@ -242,7 +274,11 @@ def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Pat
     for name, column in zip("xyz", F4.T, strict=True):
         table[name] = column
     sevens = np.full(500, 7)
-    for reflectivity, intensity, read in ((0, 0, 0 * sevens), (INTENSITY, 0, INTENSITY), (INTENSITY, sevens, sevens)):
+    for reflectivity, intensity, read in (
+        (0, 0, 0 * sevens),
+        (INTENSITY, 0, INTENSITY),
+        (INTENSITY, sevens, sevens),
+    ):
         table["reflectivity"], table["intensity"] = reflectivity, intensity
         np.save(tmp_path / "a.npy", table)
         same(read_points(tmp_path / "a.npy"), intensity=read)
@@ -251,7 +287,9 @@ def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Pat
 @pytest.mark.parametrize("kind", ["S3", "(2,)f4", "(1,)f4", "c8"])
 @pytest.mark.parametrize("name", ["x", "intensity", "ring"])
 def test_fields_that_hold_no_numbers_are_refused(tmp_path: Path, name: str, kind: str):
-    table = np.zeros(4, [(one, kind if one == name else "f4") for one in ("x", "y", "z", "intensity", "ring")])
+    table = np.zeros(
+        4, [(one, kind if one == name else "f4") for one in ("x", "y", "z", "intensity", "ring")]
+    )
     np.save(tmp_path / "a.npy", table)
     with pytest.raises(InputError, match="in the place of one number"):
         read_points(tmp_path / "a.npy")
@@ -268,6 +306,8 @@ def test_a_scan_without_a_point_is_one(tmp_path: Path, ending: str):
 @pytest.mark.parametrize("words", ["t x y z intensity", "#time x y z intensity", "intensity y x z"])
 def test_a_comment_with_a_name_for_each_number_names_the_columns(tmp_path: Path, words: str):
     columns = {"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2], "intensity": INTENSITY}
-    table = np.column_stack([columns.get(name, np.full(len(XYZ), 0.5)) for name in words.strip("#").split()])
+    table = np.column_stack(
+        [columns.get(name, np.full(len(XYZ), 0.5)) for name in words.strip("#").split()]
+    )
     np.savetxt(tmp_path / "a.txt", table, fmt="%.3f", header=words)
     same(read_points(tmp_path / "a.txt"))

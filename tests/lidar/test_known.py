@@ -27,7 +27,9 @@ def test_a_ray_is_never_empty_because_it_was_not_measured():
     measured = torch.tensor([[1, 1], [0, 1]])  # of any type
     with pytest.raises(InputError, match=r"measured is \(1, 2\), images \(1, 2, 2, 2\)"):
         ray_states(images, measured[:1])  # which would be repeated
-    assert ray_states(images, measured).tolist() == [[[Ray.RETURN, Ray.EMPTY], [Ray.UNKNOWN, Ray.EMPTY]]]
+    assert ray_states(images, measured).tolist() == [
+        [[Ray.RETURN, Ray.EMPTY], [Ray.UNKNOWN, Ray.EMPTY]]
+    ]
     assert ray_states(images).tolist() == [[[1, 2], [2, 2]]]  # numbers that callers store
 
 
@@ -38,10 +40,14 @@ def test_masks_measure_what_they_say():
     rows = parse_mask("random:0.5")(WHOLE, draws())
     assert rows.all(1).sum() == rows.any(1).sum() == 8
     assert parse_mask("points:0.1")(WHOLE, draws()).sum() == round(0.1 * math.prod(SHAPE))
-    measured = np.isin(np.arange(16), range(1, 16, 3))[:, None] & WHOLE  # five beams, in rows 1, 4, 7, 10 and 13
+    measured = (
+        np.isin(np.arange(16), range(1, 16, 3))[:, None] & WHOLE
+    )  # five beams, in rows 1, 4, 7, 10 and 13
     assert np.flatnonzero(parse_mask("rows:2")(measured, draws()).all(1)).tolist() == [1, 7, 13]
     assert (parse_mask("random:0.4")(measured, draws()) & measured).any(1).sum() == 2
-    assert np.flatnonzero(~parse_mask("sector:-45,45")(WHOLE, draws()).any(0)).tolist() == [*range(24, 40)]  # ahead
+    assert np.flatnonzero(~parse_mask("sector:-45,45")(WHOLE, draws()).any(0)).tolist() == [
+        *range(24, 40)
+    ]  # ahead
     assert parse_mask("rows:4+sector:-45,45")(WHOLE, draws()).sum() == 4 * 48
 
 
@@ -55,7 +61,9 @@ def test_what_is_no_mask_is_one_line(text):
 
 def test_a_mask_from_a_file_has_the_size_of_the_scans(tmp_path):
     np.save(tmp_path / "mask.npy", np.eye(16, 64, dtype=np.uint8))
-    assert (parse_mask(str(tmp_path / "mask.npy"))(WHOLE, draws()) == np.eye(16, 64, dtype=bool)).all()
+    assert (
+        parse_mask(str(tmp_path / "mask.npy"))(WHOLE, draws()) == np.eye(16, 64, dtype=bool)
+    ).all()
     with pytest.raises(InputError, match="16, 64"):
         parse_mask(str((tmp_path / "mask.npy").rename(tmp_path / "mask.NPY")))(WHOLE[:8], draws())
     for other in (np.full((16, 64), 0.5), np.ones((1, 2, 2), bool), np.full((2, 2), None)):
@@ -72,9 +80,19 @@ def test_interpolation_keeps_what_is_measured_and_fills_the_rest(rule):
     assert (found[:, measured] == image[:, measured]).all()
     assert ((found[0] > 0) == (image[0] > 0)).mean() > 0.9
     assert np.allclose(found[1][found[0] > 0], 0.3)
-    assert not interpolated(image, np.zeros(SHAPE, dtype=bool), rule).any()  # nothing is guessed from nothing
+    assert not interpolated(
+        image, np.zeros(SHAPE, dtype=bool), rule
+    ).any()  # nothing is guessed from nothing
     line = np.float32([4, 0, 0, 0, 0, 0, 8]).reshape(1, 7, 1)  # in its middle a ray came back empty
-    assert (interpolated(line, np.c_[:7] % 3 == 0, rule)[0, :, 0] > 0).tolist() == [1, 1, 0, 0, 0, 1, 1]
+    assert (interpolated(line, np.c_[:7] % 3 == 0, rule)[0, :, 0] > 0).tolist() == [
+        1,
+        1,
+        0,
+        0,
+        0,
+        1,
+        1,
+    ]
 
 
 @pytest.mark.parametrize("rule", ["linear", "inverse"])
@@ -97,7 +115,9 @@ def test_interpolation_follows_columns_and_then_the_ring(rule):
         expected[0, inner] = 1 / expected[0, inner]
     found = interpolated(image, measured, rule)
     assert np.allclose(found[:, inner], expected[:, inner], rtol=1e-5, atol=1e-5)
-    assert (found[:, : rows[0]] == found[:, rows[:1]]).all()  # rows beyond the known ones are the nearest one's
+    assert (
+        found[:, : rows[0]] == found[:, rows[:1]]
+    ).all()  # rows beyond the known ones are the nearest one's
     assert (found[:, rows[-1] :] == found[:, rows[-1:]]).all()
 
 
@@ -116,7 +136,9 @@ def by_search(returned: np.ndarray, steps: np.ndarray, ring: bool) -> np.ndarray
         (down < 0) & (abs(aside) <= -down), (down > 0) & (aside**2 <= down**2),
         (aside < 0) & (abs(down) <= -aside), (aside > 0) & (down**2 <= aside**2),
     )  # fmt: skip
-    return np.stack([np.where(inside, apart, np.inf).min(-1, initial=np.inf) for inside in quarters])
+    return np.stack(
+        [np.where(inside, apart, np.inf).min(-1, initial=np.inf) for inside in quarters]
+    )
 
 
 @pytest.mark.parametrize("ring", [True, False])
@@ -126,7 +148,11 @@ def test_the_nearest_return_of_each_quarter_is_that_of_a_search(share, ring):
     found = nearest_returns(returned, STEPS, ring)
     apart = torch.linalg.vector_norm(found * STEPS.T[None, :, :, None, None], dim=1)
     for image in range(2):
-        assert np.allclose(apart[:, image], by_search(returned[image].numpy(), STEPS[image].numpy(), ring), rtol=1e-5)
+        assert np.allclose(
+            apart[:, image],
+            by_search(returned[image].numpy(), STEPS[image].numpy(), ring),
+            rtol=1e-5,
+        )
     # Offsets lead to returns, on the side that is asked for.
     there = found.isfinite().all(1)
     down, aside = torch.where(there[:, None], found, 0).long().unbind(1)

@@ -10,14 +10,18 @@ from r2flow.lidar.sensors import SENSORS
 SENSOR = SENSORS["hdl64e"].resized(16, 72)  # columns of 5 degrees
 
 
-@pytest.mark.parametrize("sector", [(-45, 45), (135, -135), (0, 90), (-178, 20), (170, 190), (-190, -170), (-90, 89.9)])
+@pytest.mark.parametrize(
+    "sector", [(-45, 45), (135, -135), (0, 90), (-178, 20), (170, 190), (-190, -170), (-90, 89.9)]
+)
 def test_the_columns_are_those_that_the_sector_touches_from_left_to_right(sector):
     columns = region(SENSOR.shape, sector).columns
     assert (columns.diff() % 72 == 1).all()  # through the seam
     begin, width = sector[0], (sector[1] - sector[0]) % 360
     for column in range(72):
         # by the definition of a column: it spans the azimuths 180 - 5 w down to 175 - 5 w
-        touched = any((180 - 5 * (column + share / 100) - begin) % 360 < width for share in range(1, 100))
+        touched = any(
+            (180 - 5 * (column + share / 100) - begin) % 360 < width for share in range(1, 100)
+        )
         assert (column in columns) == touched
 
 
@@ -29,7 +33,9 @@ def test_rounding_goes_outward_to_whole_units():
     assert outer.widened((4, 8)) == outer
     nearly_all = Region((16, 72), 0, 16, 4, 70).widened((4, 8))
     assert (nearly_all.left, nearly_all.width, nearly_all.share) == (0, 72, 1)
-    assert region((16, 360), (-74, -50)) == Region((16, 360), 0, 16, 230, 24)  # 180 + 50 and 180 + 74, whole columns
+    assert region((16, 360), (-74, -50)) == Region(
+        (16, 360), 0, 16, 230, 24
+    )  # 180 + 50 and 180 + 74, whole columns
 
 
 def test_the_whole_image_keeps_its_order():

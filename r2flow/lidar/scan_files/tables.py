@@ -1,196 +1,158 @@
-"""Readers of columns: rows of floats, NumPy's .npy and .npz, text, Arrow tables and LAS."""
+"""Readers of columns: rows of floats, NumPy's .npy, text, Arrow tables and LAS."""
 
 import io
-import math
 import re
-import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
 
 import numpy as np
+from numpy import ndarray
 
-from r2flow.errors import check, require
+from r2flow.errors import InputError, require
 from r2flow.lidar.scan_files.clouds import Table
-from r2flow.lidar.scan_files.points import MOST_COLUMNS, ROLES, find_roles
+from r2flow.lidar.scan_files.points import ROLES, find_roles
 
-TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar", "scan", "data", "arr_0")
+_NUMBER = re.compile(r"(^|[;,\s])[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)
+_UNIT = re.compile(r"\s*[\[(](?!([cmk]m|ft)\b).*")  # other units than metres stay: not a known name
 
 
-def read_rows(path: Path, columns: Sequence[str] | None) -> list[np.ndarray]:
+def read_rows(path: Path, columns: Sequence[str] | None) -> list[ndarray]:
     """Rows of little-endian float32: as many as `columns`, or 4 of KITTI."""
-    content = path.read_bytes()
-    head = content[:64]
-    text = (head and all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head)) or head.startswith(b"\x93NUMPY")
-    check(not text, f"it is not rows of float32: it begins with {head[:16]!r}, as text or another format.")
-    width = 4 if columns is None else len(columns)
-    rows, rest = divmod(len(content), 4 * width)
-    known = {4: "the 4 of KITTI (.bin)", 5: "the 5 of nuScenes: give --columns x,y,z,intensity,ring"}
-    other = next((f", but of {words}" for count, words in known.items() if len(content) % (4 * count) == 0), "")
-    check(rest == 0, f"it is not made of rows of {width} float32{other}: {rest} bytes are left. Is it cut short?")
-    table = np.frombuffer(content, "<f4").reshape(rows, width)
-    for every in (2, 3, 4) if columns is None and rows >= 1000 else ():  # 8 to 16 floats a point, as in PCL's memory
-        parts = table[every * np.random.default_rng(0).integers(rows // every, size=500) + np.c_[:every]]
-        below = [(part[:, :2] < 0).any(axis=1).mean() or (part == 0).all() for part in parts]  # lost rays are zeros
-        names = ",".join([*"xyz", *"_" * (len(np.unique(parts[0, :, 3])) == 1), "intensity", *"_" * 16][: 4 * every])
-        check(all(below[1:]) or below[0] < 0.3, f"a point seems to be of {4 * every} floats: give --columns {names}.")
-    return list(table.T)
+    width = len(columns or "xyzi")
+    rest = path.stat().st_size % (4 * width)
+    if rest:
+        raise InputError(
+            f"it is not made of rows of {width} float32: {rest} bytes are left. Is it cut short, "
+            "or of other columns (--columns x,y,z,intensity,ring)?"
+        )
+    values = np.fromfile(path, "<f4")
+    if values[:1].tobytes() == np.lib.format.MAGIC_PREFIX[:4]:
+        raise InputError("it is a .npy file: rename it.")
+    return list(values.reshape(-1, width).T)
+
+
+def read_array(path: Path) -> ndarray:
+    """The array of numbers in a .npy, without unpickling or allocating what a header declares."""
+    with np.errstate(over="raise"):
+        mapped = np.lib.format.open_memmap(path, mode="r")
+    if mapped.offset + mapped.nbytes != path.stat().st_size:
+        raise InputError(f"it is longer than its header declares: {mapped.shape}. Is it damaged?")
+    return np.array(mapped)
 
 
 def read_npy(path: Path) -> Table:
     """An array (N, 3) or wider, or with named fields."""
-    with path.open("rb") as file:
-        return _columns_of(read_array(file, path.stat().st_size))
+    array = read_array(path)
+    if array.dtype.names is not None:
+        return list(array.dtype.names), [array[name] for name in array.dtype.names]
+    if array.ndim != 2:
+        raise InputError(
+            f"it holds an array {array.shape}, not points: these are (N, 3) or (N, 4)."
+        )
+    return None, list(array.T)
 
 
-def read_npz(path: Path) -> Table:
-    """An archive with an array of points, by a usual name or as its only member, and further columns; or of columns."""
-    with zipfile.ZipFile(path) as archive:
-        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        check_unpacked(path, sum(info.file_size for info in members.values()))
-        lower = {name.lower(): name for name in members}
-        alone = next(iter(members)) if len(members) == 1 else None
-        usual = () if {"x", "y", "z"} <= lower.keys() else TABLES
-        table = next((lower[name] for name in usual if name in lower), alone)
-        others = [name for name in _named(members) if name != table]
-        arrays = {}
-        for name in [*([table] if table else []), *others]:
-            with archive.open(members[name]) as file:
-                arrays[name] = read_array(file, members[name].file_size)
-    if table is None:
-        return others if len(others) > 2 else list(members), list(arrays.values())  # fewer: refused, with all names
-    names, fields = _columns_of(arrays.pop(table))
-    if names is None and others:
-        names = list(usual_names(len(fields), None))
-    return [*names, *others] if names else None, [*fields, *arrays.values()]
+def read_text(path: Path) -> Table:
+    """A point per line, separated by commas, semicolons, tabs or spaces.
+
+    Names stand in the first line, or in the comment before it.
+    """
+    text = path.read_text("utf-8-sig", "replace").replace('"', "")
+    lines = [line.strip(" \r") for line in text.split("\n") if line.strip()]
+    rows = [line for line in lines if line[0] not in "#/"]
+    if rows and rows[0] in (str(len(rows) - 1), "0,1,2", "0,1,2,3"):  # the count; pandas' names
+        del rows[0]
+    head = next((line for line in reversed(lines) if line[0] in "#/"), "")
+    in_comment = not rows or _NUMBER.search(rows[0]) is not None
+    if not in_comment:
+        head = rows.pop(0)
+    if not rows:
+        raise InputError("it holds no line of numbers.")
+    separator = next((mark for mark in ";\t," if mark in rows[-1]), None)
+    words = head.lstrip("#/ ").split(separator)  # CloudCompare writes names after //, NumPy after #
+    names = [_UNIT.sub("", word.strip()) for word in words]
+    try:
+        table = np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2)
+    except ValueError:
+        if separator is None:
+            raise
+        # Slower; empty values, as of rays without return, and words become NaN.
+        table = np.genfromtxt(rows, delimiter=separator, comments=None, ndmin=2)  # type: ignore[call-overload]
+    width = table.shape[1]
+    if in_comment and (len(words) != width or not _named(names)):
+        return None, list(table.T)
+    if len(words) < width and not np.isnan(table[:, -1]).all():
+        raise InputError("rows are longer than the names.")
+    return names, list(table.T)
 
 
-def _named(names: Iterable[str]) -> list[str]:
+def _named(names: Sequence[str]) -> list[str]:
     """The names that are columns of points."""
     roles = {alias for aliases in ROLES.values() for alias in aliases}
     return [name for name in names if name.lower().removeprefix("scalar_") in roles]
 
 
-def read_array(file: IO[bytes], size: int) -> np.ndarray:
-    """The array of numbers in an open .npy of `size` bytes, read without unpickling or allocating more than that."""
-    version = np.lib.format.read_magic(file)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran_order, dtype = header(file)
-    check(not dtype.hasobject, "it holds objects, not numbers.")
-    declared, present = math.prod(shape) * dtype.itemsize, size - file.tell()
-    check(declared == present, f"it declares the shape {shape} of {dtype}, but {present} bytes follow. Is it damaged?")
-    return np.frombuffer(file.read(), dtype).reshape(shape, order="F" if fortran_order else "C")
-
-
-def _columns_of(array: np.ndarray) -> Table:
-    if array.dtype.names is not None:
-        return list(array.dtype.names), [array[name] for name in array.dtype.names]
-    check(
-        array.ndim == 2 and array.dtype.kind in "fiu" and array.shape[1] <= MOST_COLUMNS,
-        f"it holds an array {array.shape} of {array.dtype}, not points: these are (N, 3) or (N, 4), x y z reflectance.",
-    )
-    return None, list(array.T)
-
-
-def read_text(path: Path) -> Table:
-    """A point per line, separated by commas, semicolons, tabs or spaces; names in the first line or a comment."""
-    text = path.read_text("utf-8-sig", "replace").replace('"', "")
-    lines = [line.strip(" \r") for line in text.split("\n") if line.strip()]
-    rows = [line for line in lines if line[0] not in "#/"]
-    if rows[:1] in ([str(len(rows) - 1)], ["0,1,2"], ["0,1,2,3"]):  # the number of points; pandas' names
-        del rows[0]
-    check(rows, "it holds no line of numbers.")
-    apart = next((mark for mark in ";\t," if mark in rows[-1]), None)
-    decimal = r"\d,\d+(e[-+]?\d+)? +-?\d+,\d" if apart == "," else r"(^|[;\t] *)-?\d+,\d+ *($|[;\te])"
-    check("." in rows[-1] or not re.search(decimal, rows[-1], re.I), "it has decimal commas: write decimal points.")
-
-    def words(line: str) -> list[str]:
-        return [re.sub(r"\s*[\[(](?!([cmk]m|ft)\b).*", "", word.strip()) for word in line.lstrip("#/ ").split(apart)]
-
-    names: list[str] | None
-    if not any(map(_is_number, words(rows[0]))):
-        names, rows = words(rows[0]), rows[1:]
-        check(rows, "it holds no line of numbers.")
-    else:  # CloudCompare writes names after //, NumPy after #
-        width, comments = len(words(rows[0])), [words(line) for line in lines if line[0] in "#/"]
-        names = next((line for line in comments if len(line) == width and _named(line)), None)
-    try:
-        table = np.loadtxt(rows, delimiter=apart, comments=None, ndmin=2)
-    except ValueError:
-        if apart is None:
-            raise
-        # Slower; empty values, as of rays without return, and words become NaN.
-        table = np.genfromtxt(rows, delimiter=apart, comments=None, ndmin=2)  # type: ignore[call-overload]
-    check(not names or len(names) >= len(table.T) or np.isnan(table[:, -1]).all(), "rows are longer than the names.")
-    return names, list(table.T)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
 def read_arrow(path: Path) -> Table:
     """A Feather or Parquet table: Argoverse 2's lidar."""
     require(str(path), "formats", "pyarrow")
-    import pyarrow
-    from pyarrow import feather, parquet
+    from pyarrow import dataset
 
-    if path.name.lower().endswith(".parquet"):
-        file = parquet.ParquetFile(path)
-        check_unpacked(path, 8 * file.metadata.num_rows)  # run-length encoded values take no bytes
-        find_roles(file.schema_arrow.names)  # refuses a table with all of its names
-        table = file.read(_named(file.schema_arrow.names))
-    else:
-        with pyarrow.memory_map(str(path)) as source:
-            find_roles(names := pyarrow.ipc.open_file(source).schema.names)
-        table = feather.read_table(path, _named(names), memory_map=False)
+    stored = dataset.dataset(path, format=path.suffix.lower().removeprefix("."))
+    find_roles(stored.schema.names)
+    rows = stored.count_rows()
+    if 8 * rows > 100 * path.stat().st_size + (1 << 20):  # run-length encoded values take no bytes
+        raise InputError(f"it declares {rows:,} rows, far more than its size. Is it damaged?")
+    table = stored.to_table(columns=_named(stored.schema.names))
     table.validate(full=True)
     return table.column_names, [column.to_numpy() for column in table.columns]
 
 
 def read_las(path: Path) -> Table:
-    """LAS, read with laspy: scaled x, y, z in the sensor's frame, intensity if measured, extra fields."""
+    """LAS, read with laspy: scaled x, y, z, intensity if measured, and extra fields."""
     require(str(path), "formats", "laspy")
     import laspy
 
     content = path.read_bytes()
-    records = 54 * int.from_bytes(content[100:104], "little")
-    records += 60 * int.from_bytes(content[243:247], "little") if content[24:26] == b"\x01\x04" else 0
-    check(content[:4] == b"LASF" and records <= len(content), "it is not a LAS file, or its header is damaged.")
-    # Read from memory, which limits the size: laspy allocates what a header declares.
+    records = 54 * int.from_bytes(
+        content[100:104], "little"
+    )  # laspy allocates what a header declares
+    if content[24:26] == b"\x01\x04":
+        records += 60 * int.from_bytes(content[243:247], "little")
+    if records > len(content):
+        raise InputError("its header is damaged.")
     with laspy.open(io.BytesIO(content), laz_backend=(), read_evlrs=False) as reader:
         header = reader.header
-        check_unpacked(path, header.point_count * header.point_format.size)
-        check(not header.are_points_compressed, "its points are compressed: uncompress them by laszip.")
+        if header.point_count * header.point_format.size > len(content):
+            raise InputError(
+                f"it is too small for the {header.point_count} points that it declares."
+            )
         points = reader.read()
-    check(len(points.points) == header.point_count, f"it declares {header.point_count} points. Is it whole?")
-    extra = [name for name in points.point_format.dimension_names if name not in ("X", "Y", "Z")]
-    extra = [name for name in extra if name != "intensity" or np.asarray(points[name]).any()]
-    names = ["x", "y", "z", *extra]
+    names = ["x", "y", "z", *points.point_format.extra_dimension_names]
+    if np.any(points["intensity"]):  # a field of every file, which few fill
+        names.append("intensity")
     return names, [np.asarray(points[name]) for name in names]
 
 
 READERS = {
-    ".npy": read_npy, ".npz": read_npz, **dict.fromkeys((".csv", ".xyz", ".txt"), read_text),
-    **dict.fromkeys((".feather", ".parquet"), read_arrow), ".las": read_las,
-}  # fmt: skip
-
-
-def check_unpacked(path: Path, size: int) -> None:
-    """Refuse a compressed file that declares far more bytes than its size allows."""
-    most = 100 * path.stat().st_size + (1 << 20)  # bytes: points do not pack as well
-    check(0 <= size <= most, f"it unpacks to {size:,} bytes, far more than its own size. Is it damaged?")
+    ".npy": read_npy,
+    ".csv": read_text,
+    ".xyz": read_text,
+    ".txt": read_text,
+    ".feather": read_arrow,
+    ".parquet": read_arrow,
+    ".las": read_las,
+}
 
 
 def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
-    """Names of the columns of a file without names: `columns`, else x, y, z and, for four columns, reflectance."""
-    if columns is not None:
-        check(len(columns) == width, f"it has {width} columns, but {len(columns)} were named: {','.join(columns)}.")
-        return columns
-    example = ",".join(["x", "y", "z", "intensity", *("_" * width)][:width])
-    check(2 < width < 5, f"{width} columns without names: give --columns {example} (data.reading.columns=[{example}]).")
-    return ("x", "y", "z", "reflectance")[:width]
+    """Names of the columns of a file without names.
+
+    They are `columns`, else x, y, z and, for four columns, reflectance.
+    """
+    names = columns or ("x", "y", "z", "reflectance")[: max(width, 3)]
+    if len(names) != width:
+        raise InputError(
+            f"it has {width} columns, not {len(names)}: name all by --columns x,y,z,intensity,_,_ "
+            "(data.reading.columns=[x,y,z,intensity,_,_])."
+        )
+    return names
