@@ -141,9 +141,9 @@ def describe_gradients(module: torch.nn.Module) -> str:
 def describe_batch(trainer: L.Trainer) -> str:
     """Describe the images and scans of the current step, on all devices and in all accumulated batches."""
     sampler = getattr(trainer.train_dataloader, "sampler", None)
-    if not isinstance(sampler, RunSampler):
+    size = getattr(trainer.datamodule, "batch_size", None)  # type: ignore[attr-defined]
+    if not isinstance(sampler, RunSampler) or size is None:
         return "images unknown to the loader"
-    size = trainer.datamodule.batch_size  # type: ignore[attr-defined]
     images = range(trainer.global_step * size, (trainer.global_step + 1) * size)
     scans = ", ".join(str(sampler.order[k]) for k in images[:16]) + (", ..." if len(images) > 16 else "")
     return f"images k = {images[0]} to {images[-1]}, scans {scans}"

@@ -2,11 +2,13 @@
 
 import difflib
 import inspect
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import is_dataclass
 from functools import cache, partial
 from importlib.resources import files
 from pkgutil import resolve_name
-from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, TypeVar
+from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, TypeVar, get_args
 
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
@@ -165,15 +167,24 @@ def check_options(
     """
     if not isinstance(options, Mapping):
         raise InputError(f"{what} must be a group of keys, found {options!r}.")
-    try:
+    with _in_one_line(what, constructor, options, given):
         return _schema(constructor, given).validate_python(dict(options))
-    except ValidationError as error:
-        raise InputError(f"{what}: {_first_problem(error, _by_keyword(constructor, given))}") from None
 
 
 def construct(what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any) -> T:
     """Call a constructor with `args` and a config's options, which are checked; None: its defaults."""
-    return constructor(*args, **check_options(what, constructor, options or {}, given=len(args)))
+    checked = check_options(what, constructor, options or {}, given=len(args))
+    with _in_one_line(what, constructor, checked, len(args)):  # the constructor of an `options_class` checks too
+        return constructor(*args, **checked)
+
+
+@contextmanager
+def _in_one_line(what: str, constructor: Callable[..., Any], options: Any, given: int) -> Iterator[None]:
+    """Turn a ValidationError into an InputError about `what`."""
+    try:
+        yield
+    except ValidationError as error:
+        raise InputError(f"{what}: {_first_problem(error, options, constructor, given)}") from None
 
 
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
@@ -202,8 +213,9 @@ def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[dict[str
         annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
         fields[name] = Required[annotation] if parameter.default is parameter.empty else NotRequired[annotation]
     config = ConfigDict(STRICT, extra="allow") if _takes_any(constructor) else STRICT
-    options: Any = TypedDict("options", fields)  # type: ignore[misc]
-    return TypeAdapter(with_config(config)(options))
+    typed_dict: Any = TypedDict  # of fields that are known now alone
+    schema: Any = with_config(config)(typed_dict("options", fields))
+    return TypeAdapter(schema)
 
 
 def _takes_any(constructor: Callable[..., Any]) -> bool:
@@ -212,13 +224,34 @@ def _takes_any(constructor: Callable[..., Any]) -> bool:
     return inspect.Parameter.VAR_KEYWORD in kinds and not inspect.isclass(constructor)
 
 
-def _first_problem(error: ValidationError, known: Collection[str]) -> str:
+def _first_problem(error: ValidationError, options: Any, constructor: Callable[..., Any], given: int) -> str:
     """The first problem of a validation in one line, without the names of a union's members."""
     problem = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in problem["loc"][:1])
-    if problem["type"] == "extra_forbidden":
-        return f"no option '{key}'; it has {', '.join(known) or 'none'}.{did_you_mean(key, list(known))}"
-    if problem["type"] == "missing":
-        return f"needs the option '{key}'."
+    if isinstance(own := problem.get("ctx", {}).get("error"), InputError):  # of a nested class
+        return str(own)
+    *path, last = problem["loc"] or ("",)
+    if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = _keys_below(constructor, given, path)
+        hint = did_you_mean(str(last), known)
+        return f"no option '{'.'.join(map(str, [*path, last]))}'; it has {', '.join(known) or 'none'}.{hint}"
+    if problem["type"] in ("missing", "missing_argument"):
+        return f"needs the option '{'.'.join(map(str, [*path, last]))}'."
+    keys: list[str] = []
+    for part in problem["loc"]:  # the rest are members of a union
+        inside = part in options if isinstance(options, Mapping) else isinstance(part, int)
+        if not inside:
+            break
+        keys.append(str(part))
+        options = options[part]
     words = problem["msg"].removeprefix("Value error, ")
-    return f"{key}: {words[:1].lower()}{words[1:]}, found {problem['input']!r}."
+    return f"{'.'.join(keys)}: {words[:1].lower()}{words[1:]}, found {problem['input']!r}."
+
+
+def _keys_below(constructor: Callable[..., Any], given: int, path: Sequence[int | str]) -> list[str]:
+    """The options of a constructor, or of an `options_class` that is the annotation of one of them."""
+    parameters = _by_keyword(constructor, given)
+    for part in path:
+        annotation = parameters[str(part)].annotation if part in parameters else None
+        members = [annotation, *get_args(annotation)]
+        parameters = next((_by_keyword(one) for one in members if is_dataclass(one) and isinstance(one, type)), {})
+    return list(parameters)

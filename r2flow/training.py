@@ -33,7 +33,7 @@ from r2flow.callbacks.loggers import LOGGERS, LearningRates, log_config, log_fig
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.options import PAIRS, SIMULATED
+from r2flow.data.options import PAIRS, SIMULATED, DataOptions
 from r2flow.errors import InputError, check_folder, one_line
 from r2flow.model.checkpoint import MODEL, checkpoints_of, config_of, step_of
 from r2flow.model.lineage import Parent, find_parent, model_options
@@ -57,6 +57,7 @@ EXPECTED_WARNINGS = (
     ".*isinstance.treespec, LeafSpec.*",
     "You passed in a .val_dataloader. but have no .validation_step.*",
     "Be aware that when using .ckpt_path.*",  # a callback's options may change
+    ".*your dataloader is not resumable.*",  # it resumes by the trainer's step
 )
 
 # Errors of gloo and NCCL after a peer process has ended.
@@ -156,7 +157,9 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
         options["encoding"] = data.encoding.described()
         options |= {"parent": parent, "sampler": run.sampler, "few": run.few, "seed": run.seed}
         stage: Stage = construct(f"stage '{run.stage['name']}'", stage_class, {**stage_options, **options})
-        _check_pair(run, stage, data, asked)
+        if stage.hparams["backbone"] is None and any(key_of(text).partition(".")[0] == "backbone" for text in asked):
+            raise InputError(f"stage={run.stage['name']} has its own network: leave the backbone out.")
+        stage.check_data(data)
         data.adopt(stage.item_format)
         trainer = _build_trainer(run, stage)
         complete = config_of(stage.hparams, data.hparams, run.stage["name"])
@@ -182,7 +185,7 @@ def _given(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | Non
     for group in ("backbone", "sensor", "encoding"):
         if group not in keys:
             own = {key.split(".")[1] for key in keys if key.startswith(f"{group}.")}
-            given[group] = {key: config[group][key] for key in own} or None
+            given[group] = {key: value for key, value in (config[group] or {}).items() if key in own} or None
     return given
 
 
@@ -191,44 +194,36 @@ def _build_data(
 ) -> ScanDataModule:
     """The DataModule of a config, for the model's sensor and encoding."""
     data = dict(run.data)
-    theirs = (parent.config.get("data") or {}).get("reading") if parent else None
+    chosen = construct("data", DataOptions, data)
+    of_simulated = all(part.get("name") == SIMULATED for part in chosen.parts or [data])
+    drawer = parent
     if data["name"] == PAIRS:
+        if parent is None:
+            raise InputError("data=pairs are drawn by a trained run: give stage.parent=RUN.")
+        drawer = find_parent(chosen.pairs.of) if chosen.pairs.of else parent
+    theirs = (drawer.config.get("data") or {}).get("reading") if drawer else None
+    if data["name"] == PAIRS:
+        for key, value in chosen.chosen.items():
+            given = {"data.reading", f"data.reading.{key}"} & {key_of(text) for text in asked}
+            if given and value != (theirs or {}).get(key):
+                raise InputError(f"data.reading.{key} is that of the flow that draws the pairs: leave it out.")
         data["reading"] = theirs
-    elif theirs and data["name"] != SIMULATED:
-        own = {key: value for key, value in (data.get("reading") or {}).items() if value is not None}
-        data["reading"] = {"projection": theirs["projection"], "convention": theirs["convention"], **own}
+    elif theirs and not of_simulated:  # the rays of simulated scans are given
+        data["reading"] = {"projection": theirs["projection"], "convention": theirs["convention"], **chosen.chosen}
     encoding = dict(options["encoding"])
+    if parent is None:
+        encoding["reflectance"] = run.encoding.get("reflectance", True)  # `auto` looks at the scans
     if "encoding.levels" not in map(key_of, asked):
         encoding["levels"] = None  # those of the scans, else of the parent
     module = ScanDataModule(**data, sensor=options["sensor"], encoding=encoding, seed=run.seed)
     if module.encoding.levels is None:
-        module.encoding.levels = options["encoding"]["levels"]
+        module.encoding.levels = options["encoding"].get("levels")
     if module.pairs is not None:
-        if parent is None:
-            raise InputError("data=pairs are drawn by a trained run: give stage.parent=RUN.")
-        drawer = find_parent(module.pairs.of) if module.pairs.of else parent
         for group in ("sensor", "encoding"):
             if drawer is not parent and drawer.config[group] != parent.config[group]:
                 raise InputError(f"data.pairs.of={module.pairs.of} has another {group} than {parent.path}.")
         module.drawn_by(drawer.record())
     return module
-
-
-def _check_pair(run: RunConfig, stage: Stage, data: ScanDataModule, asked: Sequence[str]) -> None:
-    """Refuse a stage and data that do not fit each other."""
-    name = run.stage["name"]
-    if stage.needs_pairs and data.pairs is None:
-        raise InputError(f"stage={name} learns from pairs: give data=pairs, not {run.data['name']}.")
-    if data.pairs is not None and not stage.takes_pairs:
-        raise InputError(f"stage={name} learns from scans, not data=pairs; give stage=reflow.")
-    if stage.hparams["backbone"] is None and any(key_of(text).partition(".")[0] == "backbone" for text in asked):
-        raise InputError(f"stage={name} has its own network: leave the backbone out.")
-    if data.augment.roll and stage.generator.learns_directions:
-        raise InputError(
-            "data.augment.roll makes all directions alike, but backbone.position=learnable (the paper's APE) learns "
-            "one vector per direction; give backbone.position=none, whose attention sees only differences in azimuth, "
-            "or leave roll out."
-        )
 
 
 def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
@@ -315,7 +310,7 @@ def fit(run: Run) -> Result:
 def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     first = run.trainer.is_global_zero
     last = open_run(run.folder, run.config, locked=first)
-    if last is not None and has_ended(run.folder):
+    if last is not None and has_ended(run.folder, last):
         if first:
             parent = as_override("stage.parent", run.folder)
             print(f"finished before, at step {step_of(last)}; to learn more: {parent} name=OTHER")
@@ -331,7 +326,8 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
             run.trainer.validate(run.stage, run.data, verbose=False)  # what the end of the run is compared with
         run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
     except (MisconfigurationException, ValueError) as error:  # as of limit_val_batches, with few scans
-        if isinstance(error, InputError) or "trainer" not in str(error).lower():
+        lightnings = isinstance(error, MisconfigurationException) or "trainer" in str(error).lower()
+        if isinstance(error, InputError) or not lightnings:
             raise
         raise InputError(f"trainer: {one_line(str(error))}") from None
     except RuntimeError as error:

@@ -107,24 +107,29 @@ def test_missing_files_and_other_torch_files(tmp_path: Path):
     with pytest.raises(InputError, match="holds no checkpoint"):
         load_checkpoint(tmp_path)
     torch.save({"weight": torch.zeros(3)}, tmp_path / "weights.pt")
-    with pytest.raises(InputError, match=r"neither 'config' and 'state_dict' \(ours\) nor .* found 'weight'"):
+    with pytest.raises(InputError, match=r"neither 'hyper_parameters' and 'r2flow' .* found 'weight'"):
         load_checkpoint(tmp_path / "weights.pt")
 
 
 @pytest.mark.parametrize(
     "changed",
     [
-        *({"config": value} for value in (None, [], "x", {}, {**CONFIG, "sensor": "x"}, {**CONFIG, "backbone": None})),
-        *({"config": {**CONFIG, "data": value}} for value in (5, "x")),
+        *({"hyper_parameters": value} for value in (None, [], "x", {})),
+        *({"hyper_parameters": {"sensor": "x"}}, {"hyper_parameters": {"backbone": None}}),
+        *({"datamodule_hyper_parameters": value} for value in (5, "x")),
         *({"state_dict": value} for value in (None, {"generator.backbone.x": 3}, {1: torch.zeros(1)}, {})),
         *({"global_step": value} for value in ("abc", None, math.inf, math.nan)),
-        *({"sampler": value} for value in ([1], "x", {"steps": {}})),
+        *({"r2flow": value} for value in (None, [], "x", {})),
+        *({"r2flow": {"sampler": value}} for value in ([1], "x", {"steps": {}})),
     ],
 )
 def test_entries_of_another_kind_are_refused_in_one_line(saved, changed: dict):
-    """As {config, state_dict} of another program has them."""
+    """As checkpoints of other modules and programs have them."""
     path, _ = saved
-    torch.save({**torch.load(path, weights_only=True), **changed}, path)
+    content = torch.load(path, weights_only=True)
+    for key, value in changed.items():
+        content[key] = {**content[key], **value} if isinstance(value, dict) and value and key in ("hyper_parameters", "r2flow") else value
+    torch.save(content, path)
     with refused(path):
         load_checkpoint(path)
 
@@ -145,9 +150,10 @@ def test_weights_that_are_no_plain_numbers_are_refused(saved, kind):
 
 def test_weights_that_do_not_fit_name_the_first(saved):
     path, averaged = saved
+    content = torch.load(path, weights_only=True)
     (name, _), *others = averaged.items()
     for changed, problem in (({**averaged, name: torch.zeros(3)}, "has shape"), (dict(others), "1 names missing")):
-        AtomicCheckpointIO().save_checkpoint({"state_dict": changed, "config": CONFIG}, path)
+        torch.save({**content, "state_dict": changed}, path)
         with pytest.raises(InputError, match=problem):
             load_checkpoint(path)
 

@@ -1,24 +1,25 @@
 """The generator `FlowMap`: jumps of a network of two times, and the stage that learns them."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
-from r2flow.runs.lineage import Parent, generator_of
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import FlowDataset
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairStore, make_pairs
-from r2flow.data.resolving import resolve
 from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import FlowMap, RectifiedFlow, build_generator
+from r2flow.model.lineage import Parent, model_options
 from r2flow.noise import Draws, standard_normal
 from r2flow.samplers import build_sampler
-from r2flow.stages import build_stage
+from r2flow.stages import STAGES
 from r2flow.stages.flow_map import LearnFlowMap
+from r2flow.stages.rectify import Reflow
 from tests.fields import CONFIG, Field
 from tests.test_sampling import network
 
@@ -85,8 +86,8 @@ def test_a_flow_that_goes_on_from_a_map_has_its_velocity():
                                              ("distill", "rectified_flow"), ("flow_map", "flow_map"),
                                              ("transfer", "transfer_flow")])  # fmt: skip
 def test_what_a_stage_makes_of_a_map(stage, made):
-    of_map = Parent({"generator": {"name": "flow_map"}}, Path("x"))
-    assert generator_of({"stage": {"name": stage}}, of_map) == {"name": made}
+    of_map = Parent({**CONFIG, "generator": {"name": "flow_map"}}, Path("x"))
+    assert model_options({}, of_map, STAGES[stage].generator_name)["generator"] == {"name": made}
 
 
 @pytest.mark.parametrize(("steps", "grid"), [(1, "uniform"), (4, "power:2"), (3, (0.0, 0.2, 0.7, 1.0))])
@@ -145,17 +146,23 @@ def test_the_own_grid_of_renoise_is_late():
 
 
 def test_a_run_notes_the_sampler_for_few():
-    config = {"stage": {"name": "flow_map"}, "data": DATA, "seed": 0}
-    assert build_stage({**config, "few": {"name": "renoise"}}, flow_map()).generator.few == build_sampler("renoise")
+    assert stage(few={"name": "renoise"}).generator.few == build_sampler("renoise")
     with pytest.raises(InputError, match="renoize"):
-        build_stage({**config, "few": {"name": "renoize"}}, flow_map())
+        stage(few={"name": "renoize"})
 
 
-DATA = {"name": "pairs", "batch_size": 4}
+def data_of(name: str, **options) -> ScanDataModule:
+    return ScanDataModule(name, CONFIG["sensor"], batch_size=4, **options)
 
 
-def stage(data: dict = DATA, generator: RectifiedFlow | None = None, **options) -> LearnFlowMap:
-    return build_stage({"stage": {"name": "flow_map", **options}, "data": data, "seed": 0}, generator or flow_map())
+def stage(data: str = "pairs", **options) -> LearnFlowMap:
+    """The stage in a trainer at step 30 of 60."""
+    found = LearnFlowMap(**{"generator": flow_map(), **options})
+    found._trainer = SimpleNamespace(
+        datamodule=data_of(data), accumulate_grad_batches=1, global_step=30, estimated_stepping_batches=60
+    )
+    found.setup("fit")
+    return found
 
 
 def batch_of(**further) -> dict[str, torch.Tensor]:
@@ -190,8 +197,6 @@ def test_a_flow_map_learns_a_map_that_it_can_know(objective, monkeypatch):
     torch.manual_seed(0)
     monkeypatch.setattr(LearnFlowMap, "log", lambda *_, **__: None)
     learned = stage(objective=objective)
-    monkeypatch.setattr(LearnFlowMap, "trainer", type("Trainer", (), {"max_steps": 60, "global_step": 30}))
-    monkeypatch.setattr(LearnFlowMap, "global_step", 30, raising=False)
     optimizer = torch.optim.AdamW(learned.parameters(), 1e-2)
     learned.train()
     losses = []
@@ -209,10 +214,9 @@ def test_a_flow_map_learns_a_map_that_it_can_know(objective, monkeypatch):
 @pytest.mark.parametrize(("name", "regressed"), [("pairs", True), ("simulated", False)])
 def test_the_jump_from_noise_to_scan_is_regressed_on_pairs_alone(monkeypatch, name, regressed):
     """Of scans drawn independently of the noise it would become the mean of all scans."""
-    learned = stage({**DATA, "name": name} if name == "pairs" else {"name": name, "batch_size": 4})
+    learned = stage(name)
     learned.jumps = lambda u: (torch.zeros(4), torch.ones(4))  # type: ignore[assignment]
-    learned._trainer = type("Trainer", (), {"max_steps": 2, "global_step": 2})()
-    monkeypatch.setattr(LearnFlowMap, "global_step", 2, raising=False)
+    learned.trainer.global_step = 60
     aims: list[torch.Tensor] = []
     learned.loss = lambda found, target: aims.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
     batch = batch_of()
@@ -239,26 +243,27 @@ def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps
 
 def test_scans_beside_pairs_are_for_straight_lines(parent):
     scans = {"name": "simulated", "scenes": 4}
-    assert stage({**DATA, "scans": scans}, objective="straight").objective is not None
+    data = data_of("pairs", scans=scans)
+    stage(objective="straight").check_data(data)
     with pytest.raises(InputError, match=r"leave data\.scans out, or give stage\.objective=straight"):
-        stage({**DATA, "scans": scans})
+        stage().check_data(data)
     with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
-        build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent)
+        Reflow(generator=parent).check_data(data)
     with pytest.raises(InputError, match=r"data\.scans needs the name of a data set"):
-        resolve({"name": "pairs", "scans": {"scenes": 4}})
+        data_of("pairs", scans={"scenes": 4})
 
 
 def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path: Path):
     flow = flow_map()
     keys = {"name": "pairs", "root": str(tmp_path), "batch_size": 4, "scans": {"name": "simulated", "scenes": 5}}
     pairs = {"sampler": {"name": "adams3", "steps": 1}, "num": 10, "batch_size": 2, "parent": "a"}
-    data = ScanDataModule(flow.space.sensor, flow.space.encoding, 3, pairs=pairs, **keys)
+    data = ScanDataModule(sensor=flow.space.sensor, encoding=flow.space.encoding, seed=3, pairs=pairs, **keys)
     make_pairs(data.pair_store, Field(lambda t, x: x, flow.noise_shape))
     data.setup()
     data._ready()
     assert data.fingerprint().startswith("10 pairs, ")
     assert "; 5 of 5 scans, " in data.fingerprint()
-    held = [scan["x_1"] for scan in (FlowDataset(data.scans, data.encoding, 3, "beside")[0, i] for i in range(5))]
+    held = [scan["x_1"] for scan in (FlowDataset(data.scans, data.format, 3, "beside")[0, i] for i in range(5))]
     dataset = data._dataset(data.training_source, "training")
     once, again = ([dataset[k, k % 9] for k in range(10)] for _ in range(2))
     for first, second in zip(once, again, strict=True):
@@ -270,13 +275,13 @@ def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path
 
 
 def test_a_stage_of_jumps_says_what_it_lacks(parent):
-    with pytest.raises(InputError, match=r"leave stage\.time out"):
+    with pytest.raises(InputError, match="leave time out"):
         stage(time={"name": "uniform"})
     with pytest.raises(InputError, match="'step'"):
         stage(jumps={"step": [1]})
     with pytest.raises(InputError, match="learns a FlowMap"):
         stage(generator=parent)
-    assert stage({"name": "simulated", "batch_size": 4}).objective is not None
+    assert stage("simulated").on_pairs is False
 
 
 def test_a_map_is_drawn_on_the_grid_that_it_learned():

@@ -1,20 +1,26 @@
 """What a run takes over from the flow that it starts from."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit
 
-from r2flow.data.resolving import resolve
+from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.options import DataOptions
+from r2flow.data.resolving import plan_data
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
+from r2flow.model.lineage import Parent, find_parent
+from r2flow.runs.composing import compose
 from r2flow.store import Store
+from r2flow.training import check
 from tests.conftest import CONFIG as BOTH
-from tests.conftest import write_checkpoint
+from tests.conftest import SENSOR, write_checkpoint
 
-CONFIG = {**BOTH, "encoding": {"format": "logscale", "reflectance": False}}
+ENCODING = {"format": "logscale", "reflectance": False, "limits": "closed", "levels": None}
+CONFIG = {**BOTH, "encoding": ENCODING, "backbone": {**BOTH["backbone"], "position": "none"}}
 
 
 @pytest.fixture
@@ -23,17 +29,17 @@ def parent(tmp_path: Path) -> Path:
 
 
 def child(parent: Path, reflectance) -> dict:
-    encoding = {"format": "logscale", "reflectance": reflectance, "limits": "open"}  # not in the parent
-    return {**CONFIG, "encoding": encoding, "stage": {"name": "rectify", "init": str(parent)}}
+    return {**CONFIG, "encoding": {**ENCODING, "reflectance": reflectance}, "stage": {"name": "rectify", "parent": str(parent)}}
 
 
-def completed(config: dict, asked: list[str]) -> dict:
-    return inherit(config, asked, find_parent(config["stage"]["init"]))
+def completed(config: dict, asked: list[str], parent: Parent | None = None) -> dict:
+    return check({**compose(["trainer.accelerator=cpu"]), **config}, asked, parent)
 
 
 @pytest.mark.parametrize("asked", [[], ["encoding"], ["encoding.reflectance"]])
 def test_auto_is_what_the_parent_is(parent: Path, asked: list[str]):
-    assert completed(child(parent, "auto"), asked)["encoding"] == {"format": "logscale", "reflectance": False}
+    found = completed(child(parent, "auto"), asked)["encoding"]
+    assert found == {**ENCODING, "levels": 100.0}  # of the simulated scans
 
 
 def test_a_channel_that_the_parent_lacks_is_refused(parent: Path):
@@ -62,7 +68,7 @@ def test_a_sensor_is_the_parents_unless_another_is_asked_for(parent: Path, asked
 
 def test_pairs_are_images_of_the_parents_sensor(parent: Path):
     pairs = {"name": "pairs", "root": None, "pairs": {}}
-    config = {**sized(child(parent, False), 16, 128), "data": pairs, "stage": {"name": "reflow", "init": str(parent)}}
+    config = {**sized(child(parent, False), 16, 128), "data": pairs, "stage": {"name": "reflow", "parent": str(parent)}}
     assert completed(config, [])["sensor"]["rows"] == 8
     with pytest.raises(InputError, match="sensor.rows is 16 here, but 8 in"):
         completed(config, ["sensor.rows=16"])
@@ -71,16 +77,16 @@ def test_pairs_are_images_of_the_parents_sensor(parent: Path):
 def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
     def on_pairs_of(flow: Path | None) -> dict:
         data = {"name": "pairs", "root": None, "pairs": {"of": flow and str(flow)}}
-        return completed({**child(parent, False), "data": data, "stage": {"name": "reflow", "init": str(parent)}}, [])
+        return completed({**child(parent, False), "data": data, "stage": {"name": "reflow", "parent": str(parent)}}, [])
 
-    other = write_checkpoint(tmp_path / "other" / "flow.ckpt", CONFIG)
+    other = write_checkpoint(tmp_path / "other" / "flow.ckpt", {**CONFIG, "seed": 1})
     config = on_pairs_of(other)
-    assert config["data"]["pairs"]["parent"] == weights_hash(load_checkpoint(other)) != config["parent"]["weights"]
+    its_own = config["stage"]["parent"]
+    assert config["data"]["pairs"]["parent"] == weights_hash(load_checkpoint(other)) != its_own["weights"]
     assert Path(config["data"]["root"]).parent == other.parent
-    assert drawn_by(config) == str(other)
     own = on_pairs_of(None)
-    assert own["data"]["pairs"]["parent"] == own["parent"]["weights"]
-    assert drawn_by(own) == str(parent)
+    assert own["data"]["pairs"]["parent"] == own["stage"]["parent"]["weights"] == its_own["weights"]
+    assert Path(own["data"]["root"]).parent == Path(its_own["path"]).parent == parent.parent
     with pytest.raises(InputError, match=r"data\.pairs\.of=.*taller\.ckpt has another sensor than .*parent\.ckpt"):
         on_pairs_of(write_checkpoint(tmp_path / "taller.ckpt", sized(CONFIG, 16, 64)))
 
@@ -110,8 +116,7 @@ def test_weights_that_belong_to_a_place_do_not_move():
         ours.start_from(theirs)
 
 
-def reading_in(data, root: str | None = None, of_sensor: float | None = 0.012):
-    return resolve({**data, "root": root}, of_sensor)
+SENSOR_012 = replace(SENSOR, reflectance_scale=0.012)
 
 
 @pytest.mark.parametrize(
@@ -131,34 +136,41 @@ def test_full_reflectance_is_what_was_given_else_the_sensors_and_one_in_what_r2f
     Store(tmp_path / "drawn", "samples", {}).begin()
     (tmp_path / "scans").mkdir()
     (tmp_path / "scans" / "manifest.json").write_text('{"version": 1}')  # of a data set
-    data = {"name": name, "reading": {"reflectance_scale": given}}
-    assert reading_in(data, str(tmp_path / root))["reading"]["reflectance_scale"] == expected
+    data = DataOptions(name, str(tmp_path / root), reading={"reflectance_scale": given})
+    (one,) = plan_data(data, SENSOR_012).sets
+    assert one.reading.reflectance_scale == expected
 
 
 def test_each_set_of_scans_says_its_whole_reading():
     part = {"name": "folder", "root": "a"}
     other = {"name": "folder", "root": "b", "reading": {"reflectance_scale": 2.0}}
     data = {"name": "mixed", "parts": [part, other], "validation": {"data": part, "scans": 4}}
-    found = reading_in({**data, "reading": {"convention": "reference", "columns": None}})
+    reading = {"convention": "reference", "columns": None}
+    found = ScanDataModule(**data, reading=reading, sensor=SENSOR_012).described()
     scales = [one["reading"]["reflectance_scale"] for one in (*found["parts"], found["validation"]["data"])]
     assert scales == [0.012, 2.0, 0.012]
-    whole = {"projection", "convention", "reflectance_scale", "columns", "on_bad_scan"}
-    for one in (found, *found["parts"], found["validation"]["data"]):
-        assert set(one["reading"]) == whole
-        assert one["reading"]["convention"] == "reference"
-    assert reading_in(found) == found  # a run that is resumed says the same
-    pairs = {"name": "pairs", "scans": part, "reading": {"projection": "unfolding", "reflectance_scale": 2.0}}
-    scans = reading_in(pairs)["scans"]["reading"]
-    assert (scans["projection"], scans["reflectance_scale"]) == ("unfolding", 0.012)
+    for one in (*found["parts"], found["validation"]["data"]):
+        whole = {"projection": "spherical", "convention": "reference", "columns": None, "on_bad_scan": "error"}
+        assert one["reading"] == {**whole, "reflectance_scale": one["reading"]["reflectance_scale"]}
+    assert ScanDataModule(**found).described() == found  # a run that is resumed says the same
+    reading = {"projection": "unfolding", "reflectance_scale": 2.0}
+    scans = plan_data(DataOptions("pairs", scans=part, reading=reading), SENSOR_012).scans.reading
+    assert (scans.projection, scans.reflectance_scale) == ("unfolding", 0.012)
+
+
+def parent_of(reading: dict, path: Path) -> Parent:
+    there = find_parent(path)
+    return replace(there, config={**there.config, "data": {"name": "folder", "reading": reading}})
 
 
 def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):
-    there = Parent({**CONFIG, "data": {"reading": {"projection": "unfolding", "convention": "reference"}}}, parent)
+    there = parent_of({"projection": "unfolding", "convention": "reference"}, parent)
     config = {**child(parent, False), "data": {"name": "folder", "root": "scans"}}
 
     def found(**data) -> tuple[str, str]:
-        reading = inherit({**config, "data": {**config["data"], **data}}, [], there)["data"]["reading"]
-        return reading["projection"], reading["convention"]
+        found = completed({**config, "data": {**config["data"], **data}}, [], there)["data"]
+        for one in found["parts"] or [found]:
+            return one["reading"]["projection"], one["reading"]["convention"]
 
     assert found() == ("unfolding", "reference")
     assert found(reading={"projection": "spherical"}) == ("spherical", "reference")
@@ -170,8 +182,8 @@ def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Pa
 def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):
     read = {"projection": "unfolding", "convention": "reference", "reflectance_scale": 255.0}
     data = {"name": "pairs", "root": None, "pairs": {}, "reading": {**dict.fromkeys(read), "projection": "spherical"}}
-    config = {**child(parent, False), "data": data}
-    there = Parent({**CONFIG, "data": {"reading": read}}, parent)
-    assert {key: inherit(config, [], there)["data"]["reading"][key] for key in read} == read
-    with pytest.raises(InputError, match=r"data\.reading\.projection"):
-        inherit(config, ["data.reading.projection"], there)
+    config = {**child(parent, False), "data": data, "stage": {"name": "reflow", "parent": str(parent)}}
+    there = parent_of(read, parent)
+    assert {key: completed(config, [], there)["data"]["reading"][key] for key in read} == read
+    with pytest.raises(InputError, match=r"data\.reading\.projection is that of the flow that draws the pairs"):
+        completed(config, ["data.reading.projection"], there)

@@ -10,19 +10,19 @@ import torch
 
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
-from r2flow.runs.folder import RESUMED, check_run, contradictions, open_run, read_config, run_lock
+from r2flow.runs.folder import RESUMED, check_run, contradictions, has_ended, open_run, read_config, run_lock
 from tests.conftest import small_disk
 
-CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10}}
+CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10, "max_epochs": -1}}
 
 
 def changed(**new) -> dict:
     return CONFIG | {key: {**CONFIG.get(key, {}), **one} if isinstance(one, dict) else one for key, one in new.items()}
 
 
-def checkpoint(run: Path, step: int, lacking: str = "") -> Path:
+def checkpoint(run: Path, step: int, lacking: str = "", **notes: int) -> Path:
     path = run / "checkpoints" / f"step-{step:08d}.ckpt"
-    content = {**dict.fromkeys(RESUMED), "global_step": step, "state_dict": {"weights": torch.zeros(100)}}
+    content = {**dict.fromkeys(RESUMED), "global_step": step, "r2flow": notes, "state_dict": {"weights": torch.zeros(100)}}
     content.pop(lacking, None)
     AtomicCheckpointIO().save_checkpoint(content, path)
     return path
@@ -43,9 +43,24 @@ def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert read_config(tmp_path) == changed(trainer={"devices": 4})  # what runs now, and not what was refused
     with pytest.raises(InputError, match=r"max_steps=10 there, 9 here\. Give the same .* to resume it, or name="):
         check_run(tmp_path, changed(trainer={"max_steps": 9}))  # of a link, which has a stage.parent of its own
-    for lacking in ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step"):
+    for lacking in ("hyper_parameters", "r2flow", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step"):
         checkpoint(tmp_path, 6, lacking)
         assert open_run(tmp_path, CONFIG) == newest
+
+
+def test_the_parent_may_move_and_must_have_the_same_weights():
+    def from_parent(path: str, weights: str) -> dict:
+        return changed(stage={"parent": {"path": path, "weights": weights, "pairs": f"{path}/pairs"}})
+
+    assert contradictions(from_parent("a", "1f"), from_parent("moved", "1f")) == []
+    assert contradictions(from_parent("a", "1f"), from_parent("a", "2e")) == ["stage.parent.weights=1f there, 2e here"]
+
+
+def test_a_run_of_epochs_ends_at_the_step_that_its_checkpoint_notes(tmp_path: Path):
+    open_run(tmp_path, changed(trainer={"max_steps": -1, "max_epochs": 2}))
+    for step, ended in ((5, False), (6, True)):
+        checkpoint(tmp_path, step, total_steps=6)
+        assert has_ended(tmp_path) == ended
 
 
 def test_a_finished_run_keeps_its_sampler(tmp_path: Path):

@@ -21,7 +21,7 @@ from r2flow.backbones.layers import (
 )
 from r2flow.registry import Bound, Count, Portion, Positive
 
-TimeChannels = Annotated[int, Bound("of at least 4 that is even", lambda n: n >= 4 and n % 2 == 0)]
+TimeChannels = Annotated[int, Bound("even and at least 4", lambda n: n >= 4 and n % 2 == 0)]
 
 
 class RingConv2d(nn.Conv2d):

@@ -64,6 +64,7 @@ def pairs(
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import PairStore, default_folder, make_pairs
     from r2flow.model.lineage import find_parent
+    from r2flow.registry import construct
 
     where = choose_device(device)
     if where == "cuda":  # SLURM may expose one GPU per task
@@ -73,16 +74,17 @@ def pairs(
     assert parent.checkpoint is not None
     flow = parent.checkpoint
     record = parent.record()
-    chosen = PairOptions(
-        sampler={"name": "adams3", **how.given},
-        precision=precision,
-        num=num,
-        batch_size=batch_size,
-        shard_mib=shard_mib,
-        seed=seed,
-        parent=record["weights"],
-        first=record["first_pair"],
-    )
+    options = {
+        "sampler": {"name": "adams3", **how.given},
+        "precision": precision,
+        "num": num,
+        "batch_size": batch_size,
+        "shard_mib": shard_mib,
+        "seed": seed,
+        "parent": record["weights"],
+        "first": record["first_pair"],
+    }
+    chosen = construct("pairs", PairOptions, options)
     folder = out or default_folder(flow.path)
     store = PairStore(folder, chosen, flow.encoding.shape, flow.generator.noise_shape)
     make_pairs(store, flow.generator.to(where), wait=False)

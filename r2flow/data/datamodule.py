@@ -62,7 +62,7 @@ class ScanDataModule(L.LightningDataModule):
         **options: Any,
     ) -> None:
         super().__init__()
-        self.options = DataOptions(**check_options("data", DataOptions, {"name": name, **options}))
+        self.options = construct("data", DataOptions, {"name": name, **options})
         self.seed = seed
         self.batch_size = self.options.batch_size
         self._sensor_options = sensor_options(sensor)

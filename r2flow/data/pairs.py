@@ -153,7 +153,7 @@ def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.n
     return {
         "evaluations": end.evaluations.cpu().numpy().astype(np.int32),
         "x_1": x_1,
-        "usable": end.converged.cpu().numpy() & np.isfinite(x_1).all((1, 2, 3)),
+        "usable": end.converged.cpu().numpy() & np.isfinite(x_1).reshape(len(x_1), -1).all(1),
     }
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from r2flow.data.opening import SOURCES, Described
+from r2flow.data.opening import SOURCES, Described, Layout, Prepared
 from r2flow.data.options import (
     MIXED,
     PAIRS,
@@ -17,7 +17,7 @@ from r2flow.data.options import (
 )
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
-from r2flow.registry import check_options
+from r2flow.registry import construct
 
 # Options that a kind of scans would ignore.
 IGNORED = dict.fromkeys((SIMULATED, PAIRS, MIXED), ("split", "drives")) | {SIMULATED: ("root", "split", "drives")}
@@ -41,6 +41,9 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
         InputError: an unknown data set or option, or one that would be ignored.
     """
     _refuse_ignored("data", options.name, options)
+    if options.name in SOURCES and isinstance(SOURCES[options.name], Layout | Prepared):
+        if options.scenes != DataOptions.scenes:
+            raise InputError("scans in files are no simulated scenes: leave data.scenes out.")
     usual = {key: value for key, value in options.chosen.items() if key in ("projection", "convention")}
     sets: list[PartOptions] = []
     if options.name == MIXED:
@@ -55,7 +58,7 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
         held_out = _held_out(options, options.validation.data, sensor)
     scans = None
     if options.scans is not None:
-        scans = _complete(_checked_set("data.scans", SourceOptions, options.scans), usual, sensor)
+        scans = _complete(_checked_set("data.scans", SourceOptions, options.scans, options), usual, sensor)
     return DataPlan(tuple(sets), held_out, scans)
 
 
@@ -80,7 +83,7 @@ def _parts(run: DataOptions, sensor: Sensor) -> list[PartOptions]:
         part = {"scenes": run.scenes, **given}
         if part.get("sensor") is not None:
             part["sensor"] = sensor_options(part["sensor"])
-        parts.append(_complete(_checked_set(f"data.parts[{number}]", PartOptions, part), run.chosen, sensor))
+        parts.append(_complete(_checked_set(f"data.parts[{number}]", PartOptions, part, run), run.chosen, sensor))
     if len({part.weight is None for part in parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
     return parts
@@ -92,18 +95,21 @@ def _held_out(run: DataOptions, other: Mapping[str, Any], sensor: Sensor) -> Sou
     if held["name"] != run.name:  # other files, with other columns and scale
         usual = {key: value for key, value in usual.items() if key not in ("columns", "reflectance_scale")}
         held["root"] = other.get("root")
-    return _complete(_checked_set("data.validation.data", SourceOptions, held), usual, sensor)
+    return _complete(_checked_set("data.validation.data", SourceOptions, held, run), usual, sensor)
 
 
-def _checked_set(what: str, kind: type[SourceOptions], options: Mapping[str, Any]) -> Any:
+def _checked_set(what: str, kind: type[SourceOptions], options: Mapping[str, Any], run: DataOptions) -> Any:
     """One set of scans. Refuses a data set with a standard split of which no part is named."""
-    source = kind(**check_options(what, kind, options))
-    if source.name in (MIXED, PAIRS):
-        raise InputError(f"{what} needs the name of a data set, found {source.name!r}.")
+    source = construct(what, kind, options)
+    if options.get("name") in (None, MIXED, PAIRS):
+        raise InputError(f"{what} needs the name of a data set, found {options.get('name')!r}.")
     splits = ", ".join(SOURCES[source.name].splits)
     if splits and "split" not in options:
         raise InputError(f"{what}: {source.name} has a standard split: give split, one of {splits}, or null for all.")
     _refuse_ignored(what, source.name, source)
+    of_files = isinstance(SOURCES[source.name], Layout | Prepared)
+    if of_files and options.get("scenes") not in (None, run.scenes):
+        raise InputError(f"{what}.scenes does nothing for {source.name} scans: leave it out.")
     return source
 
 

@@ -125,11 +125,9 @@ class Encoding:
         self,
         sensor: Sensor,
         format: str = "logscale",
-        reflectance: Annotated[
-            bool, Bound("(auto is decided by a run, from its scans)", lambda b: True)
-        ] = True,
+        reflectance: bool = True,
         limits: Literal["closed", "open"] = "closed",
-        levels: Annotated[float, Bound("that is whole and above 0", lambda n: n > 0 and n % 1 == 0)]
+        levels: Annotated[float, Bound("whole and above 0", lambda n: n > 0 and n % 1 == 0)]
         | None = None,
     ) -> None:
         self.sensor = sensor

@@ -103,14 +103,15 @@ def model_options(
             "sensor": _changed(theirs["sensor"], sensor, sensor_options),
             "encoding": _changed(theirs["encoding"], encoding, encoding_options),
         }
+        if options["encoding"]["reflectance"] == AUTO:
+            options["encoding"] = {**options["encoding"], "reflectance": theirs["encoding"]["reflectance"]}
         free: dict[str, tuple[str, ...]] = {"backbone": FREE_BACKBONE, "encoding": ("levels",)}
         if on_pairs:
             free["sensor"] = ("reflectance_scale",)
         for group, keys in free.items():
             _refuse_other(group, options[group], theirs[group], keys, parent.path)
     if options["encoding"]["reflectance"] == AUTO:
-        reflectance = theirs.get("encoding", {}).get("reflectance", True)
-        options["encoding"] = {**options["encoding"], "reflectance": reflectance}
+        options["encoding"] = {**options["encoding"], "reflectance": True}
     return {**options, "generator": generator}
 
 

@@ -12,7 +12,6 @@ from r2flow.errors import InputError, naming
 from r2flow.model.checkpoint import FOLDER
 from r2flow.model.lineage import Parent
 from r2flow.runs.composing import compose
-from r2flow.runs.folder import has_ended
 from r2flow.signals import LATER, Stopped
 from r2flow.stages import STAGES
 from r2flow.training import build, check, fit
@@ -45,6 +44,8 @@ def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], confi
         for key, value in flatten(settings):
             if (key, value) != ("experiment", None):
                 own.append(override("stage" if key == "stage.name" else key, value))  # a choice, with its own options
+        if any(key_of(text) == "plugins" for text in own):
+            raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")
         begins = dict(flatten(difference)).keys() & {"experiment", "parent", "stage.parent"}  # a mistyped link does not
         if parent not in (None, *(link.name for link in links)) or (links and not begins):
             raise InputError(f"chain.{name} starts from {parent or 'nothing'}; give parent=EARLIER or an experiment.")
@@ -59,18 +60,16 @@ def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], confi
         on_pairs = config["data"]["name"] == "pairs" or STAGES[config["stage"]["name"]].needs_pairs
         concerning = ("all", "pairs" if on_pairs else "scans")
         overrides = [text for text in given if rule(key_of(text)).links in concerning] + alone
+        sets = [text for text in (*own, *overrides) if key_of(text) == "data"]
+        if sets and not re.fullmatch("data='?simulated'?", sets[-1]):  # other scans have no scenes, or their own
+            own = [text for text in own if key_of(text) != "data.scenes"]
         run_dir = Path(folder, name)
         links.append(Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent))
     return links
 
 
 def train_links(links: Sequence[Link], folders: Sequence[str] = ()) -> int:
-    """Train the links that are not finished, in this process; the exit code is 0 or, if one was stopped, 75.
-
-    All links are built before the first one is trained, so that errors are reported early.
-    """
-    if not all(has_ended(link.run_dir) for link in links):
-        _check_links(links, folders)
+    """Train the links that are not finished, in this process; the exit code is 0 or, if one was stopped, 75."""
     for number, link in enumerate(links, 1):
         print(f"[{number}/{len(links)}] {link.name}: {link.run_dir}", flush=True)
         try:
@@ -84,7 +83,8 @@ def train_links(links: Sequence[Link], folders: Sequence[str] = ()) -> int:
     return 0
 
 
-def _check_links(links: Sequence[Link], folders: Sequence[str]) -> None:
+def check_links(links: Sequence[Link], folders: Sequence[str] = ()) -> None:
+    """Build all links before the first one is trained, so that errors are reported early."""
     configs: dict[str, Any] = {}
     for link in links:
         parent = None

@@ -55,10 +55,10 @@ def read_config(run: str | Path) -> dict[str, Any] | None:
     return dict(config) or None
 
 
-def has_ended(run: str | Path) -> bool:
-    """Whether a run's last checkpoint is that of its last step."""
+def has_ended(run: str | Path, last: Path | None = None) -> bool:
+    """Whether a run's last checkpoint, or the one given, is that of its last step."""
     config = read_config(run)
-    last = next(iter(checkpoints_of(run)), None)
+    last = last or next(iter(checkpoints_of(run)), None)
     if config is None or last is None:
         return False
     options = config["trainer"]
@@ -79,7 +79,7 @@ def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) ->
     if old is not None and last is not None:
         _refuse_another_config(run, old, config)
         samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]
-        if samplers and has_ended(run):
+        if samplers and has_ended(run, last):
             raise InputError(
                 f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the setting, and draw with "
                 f"another sampler by r2flow sample {run} --sampler NAME --steps N."

@@ -164,20 +164,22 @@ def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
 
 
 def _chain(settings: dict[str, Any], given: Sequence[str], folders: Sequence[str]) -> int:
-    from r2flow.runs.chain import links_of, train_links
+    from r2flow.runs.chain import check_links, links_of, train_links
     from r2flow.runs.folder import has_ended
 
     if settings["trainer"]["fast_dev_run"]:
         raise InputError("a chain's links start from earlier runs, and trainer.fast_dev_run leaves none.")
     folder = Path(settings["run_dir"])
     links = links_of(settings["chain"], folder, given, folders)
+    finished = all(has_ended(link.run_dir) for link in links)
+    if not finished:
+        check_links(links, folders)
     if settings["preview"]:  # scans of a trained model, while the chain trains
         _draw_preview(settings["preview"], folder / "preview")
     out = folder / "report"
-    finished = out.is_dir() and all(has_ended(link.run_dir) for link in links)
     if code := train_links(links, folders):
         return code
-    if finished:
+    if finished and out.is_dir():
         print(f"report: finished before, {out / 'compare.md'}")
     elif int(os.environ.get("LOCAL_RANK", "0")) == 0:
         from r2flow.reports.compare import report_chain

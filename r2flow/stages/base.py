@@ -12,6 +12,7 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import ItemFormat
 from r2flow.errors import InputError, naming
 from r2flow.flow.times import golden_sequence
@@ -70,6 +71,7 @@ class Stage(L.LightningModule):
     generator_name: ClassVar[str | None] = None  # generator to train; None: the parent's, or a rectified flow
     needs_pairs: ClassVar[bool] = False  # whether it trains on pairs of x_0 and x_1
     takes_pairs: ClassVar[bool] = False  # whether it can
+    takes_scans: ClassVar[bool] = False  # whether it can on scans next to pairs
     needs_parent: ClassVar[bool] = False  # whether it must start from another run
     several_sensors: ClassVar[bool] = False  # whether the parts of a mixture may be scans of different sensors
     anneals: ClassVar[bool] = True  # whether the learning rate decays to 0 at the last step
@@ -102,9 +104,8 @@ class Stage(L.LightningModule):
         else:
             given = {"backbone": backbone, "sensor": sensor, "encoding": encoding, "generator": generator}
             options = model_options(given, source, self.generator_name, self.needs_pairs)
-            with torch.random.fork_rng(devices=[]):
-                seed_torch(seed, "weights")
-                self.generator = build_generator(options)
+            seed_torch(seed, "weights")  # also of networks that a subclass adds
+            self.generator = build_generator(options)
         if not isinstance(self.generator, self.learns):
             learned, found = self.learns.__name__, type(self.generator).__name__
             raise InputError(f"{type(self).__name__} learns a {learned}, found a {found}: give another stage.")
@@ -155,7 +156,8 @@ class Stage(L.LightningModule):
         data = getattr(self.trainer, "datamodule", None)
         if data is not None and hasattr(data, "batch_size"):
             return int(data.batch_size)
-        self.trainer.fit_loop.setup_data()
+        if self.trainer.train_dataloader is None:  # as `estimated_stepping_batches` does
+            self.trainer.fit_loop.setup_data()
         loader: Any = self.trainer.train_dataloader
         return loader.batch_size * self.trainer.world_size * self.trainer.accumulate_grad_batches
 
@@ -181,6 +183,29 @@ class Stage(L.LightningModule):
             batch["u"] = torch.rand(len(x_1), device=x_1.device)
             batch["k"] = torch.randint(2**31, (len(x_1),), device=x_1.device)
         return batch
+
+    def check_data(self, data: ScanDataModule) -> None:
+        """Refuse data that this stage cannot learn from."""
+        from r2flow.stages import STAGES  # the registry of the classes of this module
+
+        name = STAGES.name_of(type(self)) or type(self).__name__
+        if self.needs_pairs and data.pairs is None:
+            raise InputError(f"stage={name} learns from pairs: give data=pairs, not {data.options.name}.")
+        if data.pairs is not None and not self.takes_pairs:
+            raise InputError(f"stage={name} learns from scans, not data=pairs; give stage=reflow.")
+        if data.plan.scans is not None and not self.takes_scans:
+            raise InputError(f"stage={name} learns from pairs alone: leave data.scans out.")
+        if data.augment.roll and self.generator.learns_directions:
+            raise InputError(
+                "data.augment.roll makes all directions alike, but backbone.position=learnable (the paper's APE) "
+                "learns one vector per direction; give backbone.position=none, whose attention sees only differences "
+                "in azimuth, or leave roll out."
+            )
+
+    def setup(self, stage: str) -> None:
+        data = self.trainer.datamodule
+        if stage == "fit" and isinstance(data, ScanDataModule):
+            self.check_data(data)
 
     def on_train_start(self) -> None:
         if any(COMPILED in name for name, _ in self.generator.named_parameters()):

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, straight
 from r2flow.flow.path import expand_time, interpolate
@@ -33,6 +34,7 @@ class LearnFlowMap(Reflow):
     generator: FlowMap
     generator_name = "flow_map"
     needs_pairs = False
+    takes_scans = True
     default_time: ClassVar[Options] = {"name": "uniform"}
 
     def __init__(
@@ -54,9 +56,13 @@ class LearnFlowMap(Reflow):
         self.generator.run_by(Jump(grid=self.jumps.grid))
 
     def setup(self, stage: str) -> None:
+        super().setup(stage)
         data = getattr(self.trainer, "datamodule", None)
         self.on_pairs = getattr(data, "pairs", None) is not None
-        if getattr(data, "scans", None) is not None and self.objective is not straight:
+
+    def check_data(self, data: ScanDataModule) -> None:
+        super().check_data(data)
+        if data.plan.scans is not None and self.objective is not straight:
             raise InputError(
                 f"objective={self.hparams['objective']} learns jumps from velocities of pairs, which are not those of "
                 "scans: leave data.scans out, or give stage.objective=straight."

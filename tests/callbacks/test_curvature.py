@@ -44,7 +44,7 @@ class Stage(L.LightningModule):
         super().__init__()
         self.velocity = Shrinking(0.0)
         self.generator = Field(self.velocity, SPACE.shape, SPACE)
-        self.warmup_steps = 0
+        self.save_hyperparameters({"seed": 7})
         self.draws = []
 
     def training_step(self, batch, batch_idx):
@@ -83,7 +83,7 @@ def exact(a: float, n: int) -> tuple[float, float]:
 
 
 def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
-    fit(tmp_path, [EMA(decay=0.5, every=1, warmup_steps=0), Curvature(seed=7, every=2, num=2, steps=4)], steps=3)
+    fit(tmp_path, [EMA(decay=0.5, every=1, warmup_steps=0), Curvature(every=2, num=2, steps=4)], steps=3)
     curves = read_curves(tmp_path, ("curvature/s", "curvature/bend", "train/loss"))
     assert curves["curvature/s"][0].tolist() == [2, 3]  # every second step, and the last
     assert curves["train/loss"][0].tolist() == [1, 2, 3]
@@ -95,7 +95,7 @@ def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
 
 def test_training_does_not_notice(tmp_path):
     plain = fit(tmp_path / "plain", [])
-    measured = fit(tmp_path / "measured", [Curvature(seed=0, every=2)])
+    measured = fit(tmp_path / "measured", [Curvature(every=2)])
     assert plain.draws == measured.draws  # torch's generator stands where it stood
     assert torch.equal(plain.velocity.a, measured.velocity.a)
 
@@ -108,7 +108,7 @@ def test_a_resumed_run_does_not_look_again_at_the_step_that_it_goes_on_from():
             looked.append(trainer.global_step)
 
     looked: list[int] = []
-    trainer = SimpleNamespace(global_step=4, max_steps=8, is_global_zero=True, callbacks=[])
+    trainer = SimpleNamespace(global_step=4, estimated_stepping_batches=8, is_global_zero=True, callbacks=[])
     counted, module = Counted(every=2), nn.Module()
     counted.on_train_start(trainer, module)
     for trainer.global_step in (4, 5, 5, 6, 6):
@@ -120,9 +120,9 @@ def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_pat
     sheets = []
     real = pictures.contact_sheet
     monkeypatch.setattr("r2flow.callbacks.periodic.contact_sheet", lambda *given: sheets.append(given) or real(*given))
-    callbacks = [EMA(decay=0.5, every=1, warmup_steps=0), SamplePictures(tmp_path / "p", 7, every=2, num=2, steps=4)]
+    callbacks = [EMA(decay=0.5, every=1, warmup_steps=0), SamplePictures(every=2, num=2, steps=4)]
     fit(tmp_path, callbacks, steps=3, logger=TensorBoardLogger(tmp_path, name="tensorboard", version=""))
-    assert sorted(path.name for path in (tmp_path / "p").iterdir()) == ["step-00000002.png", "step-00000003.png"]
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == ["step-00000002.png", "step-00000003.png"]
     noise = torch.stack([standard_normal(SPACE.shape, 7, "evaluation", i) for i in range(2)])
     for a, (images, _, titles) in zip(AVERAGES, sheets, strict=True):
         expected = SPACE.decode(noise * (1 - a / 4) ** 4).numpy()  # Euler's path
@@ -133,9 +133,9 @@ def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_pat
 
 
 def test_a_picture_that_is_there_is_kept_and_none_may_be_asked_for(tmp_path):
-    (tmp_path / "p").mkdir()
-    (tmp_path / "p" / "step-00000002.png").write_bytes(b"kept")
-    fit(tmp_path, [SamplePictures(tmp_path / "p", 0, every=2, num=1, steps=1)], steps=2)
-    assert (tmp_path / "p" / "step-00000002.png").read_bytes() == b"kept"
-    fit(tmp_path, [SamplePictures(tmp_path / "none", 0, every=0)], steps=2)
-    assert not (tmp_path / "none").exists()
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "step-00000002.png").write_bytes(b"kept")
+    fit(tmp_path, [SamplePictures(every=2, num=1, steps=1)], steps=2)
+    assert (tmp_path / "pictures" / "step-00000002.png").read_bytes() == b"kept"
+    fit(tmp_path / "none", [SamplePictures(every=0)], steps=2)
+    assert not (tmp_path / "none" / "pictures").exists()

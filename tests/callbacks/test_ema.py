@@ -23,7 +23,6 @@ class Scripted(L.LightningModule):
         self.weight = nn.Parameter(torch.zeros(()))
         self.values = values
         self.automatic_optimization = False
-        self.warmup_steps = 0
 
     def training_step(self, batch, batch_idx):
         self.optimizers().step()

@@ -12,7 +12,7 @@ from r2flow import noise
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.ema import EMA
 from r2flow.callbacks.guard import Guard
-from r2flow.data.loader import Permutations, RunLoader, RunSampler
+from r2flow.data.loader import Permutations, RunSampler
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
 from tests.conftest import quiet_trainer, refused
@@ -28,7 +28,6 @@ class Line(L.LightningModule):
         torch.manual_seed(0)
         self.inner = nn.Linear(1, 4)
         self.outer = nn.Linear(4, 1)
-        self.warmup_steps = 0
 
     def training_step(self, batch, batch_idx):
         x, offset = batch
@@ -56,7 +55,7 @@ def fit(module: L.LightningModule, loader, tmp_path, *callbacks: L.Callback, **o
 def test_a_skipped_step_is_as_if_it_had_never_been(tmp_path, value: float, offset: float):
     # AdamW at a constant rate counts its own steps: without the broken one the same weights come out. An infinite
     # offset makes the loss infinite and leaves its gradient finite.
-    skipped, without, guard = Line(), Line(), Guard(tmp_path)
+    skipped, without, guard = Line(), Line(), Guard()
     fit(skipped, batches(1.0, 2.0, value, -1.0, 0.5, offset={2: offset}), tmp_path, guard)
     fit(without, batches(1.0, 2.0, -1.0, 0.5), tmp_path)
     torch.testing.assert_close(skipped.state_dict(), without.state_dict(), rtol=0, atol=0)
@@ -64,15 +63,15 @@ def test_a_skipped_step_is_as_if_it_had_never_been(tmp_path, value: float, offse
 
 
 def test_only_steps_in_a_row_end_a_run(tmp_path):
-    guard = Guard(tmp_path, skips=3)
+    guard = Guard(skips=3)
     fit(Line(), batches(1.0, NAN, NAN, 1.0, NAN, NAN, 1.0), tmp_path, guard)
     assert guard.total == 4
     with pytest.raises(InputError, match="stopped at step 4: 3 steps in a row were skipped"):
-        fit(Line(), batches(1.0, NAN, NAN, NAN, 1.0), tmp_path, Guard(tmp_path, skips=3))
+        fit(Line(), batches(1.0, NAN, NAN, NAN, 1.0), tmp_path, Guard(skips=3))
 
 
 def test_the_count_survives_a_resumption(tmp_path):
-    guard = Guard(tmp_path)
+    guard = Guard()
     guard.load_state_dict({"in_a_row": 9, "total": 9})
     assert guard.state_dict() == {"in_a_row": 9, "total": 9}
     with pytest.raises(InputError, match="10 steps in a row"):
@@ -85,11 +84,21 @@ class Numbered(Dataset):
     def __init__(self, broken: set[int]) -> None:
         self.broken = broken
 
-    def __len__(self) -> int:
-        return 6
-
     def __getitem__(self, key: tuple[int, int]):
         return torch.tensor([NAN if key[1] in self.broken else 1.0]), torch.tensor(0.0)
+
+
+class Batches(L.LightningDataModule):
+    """Steps of 4 images, in parts of 2."""
+
+    batch_size = 4
+
+    def __init__(self, broken: set[int]) -> None:
+        super().__init__()
+        self.dataset = Numbered(broken)
+
+    def train_dataloader(self) -> DataLoader:
+        return DataLoader(self.dataset, batch_size=2, sampler=RunSampler(Permutations(6, 0), 40))
 
 
 def test_the_line_names_everything_needed_to_look_further(tmp_path):
@@ -97,7 +106,7 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "step-00000001.ckpt").touch()
     order = [int(s) for epoch in range(2) for s in noise.generator(0, "shuffle", epoch).permutation(6)]
-    loader = RunLoader(Numbered({order[5]} - set(order[:4])), batch_sampler=RunSampler(Permutations(6, 0), 2, 40))
+    data = Batches({order[5]} - set(order[:4]))
     with refused(
         "stopped at step 2: the step was skipped",
         "Loss nan",
@@ -106,7 +115,9 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
         "images k = 4 to 7, scans " + ", ".join(map(str, order[4:8])),
         f"last good checkpoint is {tmp_path}/checkpoints/step-00000001.ckpt",
     ):
-        fit(Line(), loader, tmp_path, Guard(tmp_path, skips=1), accumulate_grad_batches=2)
+        fit(Line(), data, tmp_path, Guard(skips=1), accumulate_grad_batches=2)
+    with refused("stopped at step 2: the step was skipped", "images unknown to the loader"):
+        fit(Line(), data.train_dataloader(), tmp_path, Guard(skips=1), accumulate_grad_batches=2)
 
 
 def half(scale: float) -> MixedPrecision:
@@ -116,7 +127,7 @@ def half(scale: float) -> MixedPrecision:
 
 def test_a_loss_scale_that_finds_its_place_is_no_defect(tmp_path):
     # Half precision ends at 65504 < 2^16: gradients of size one overflow until the scale is well below that.
-    plugin, guard = half(2.0**20), Guard(tmp_path)
+    plugin, guard = half(2.0**20), Guard()
     fit(Line(), batches(*[1.0] * 20), tmp_path, guard, plugins=[plugin])
     assert plugin.scaler.get_scale() < 2.0**17
     assert (guard.total, guard.in_a_row) == (0, 0)
@@ -124,13 +135,13 @@ def test_a_loss_scale_that_finds_its_place_is_no_defect(tmp_path):
 
 def test_a_loss_scale_that_finds_no_place_ends_the_run(tmp_path):
     with pytest.raises(InputError, match=r"3 steps in a row were .* 0 in the run.* loss scale 262144"):
-        fit(Line(), batches(*[1.0] * 20), tmp_path, Guard(tmp_path, skips=3), plugins=[half(2.0**20)])
+        fit(Line(), batches(*[1.0] * 20), tmp_path, Guard(skips=3), plugins=[half(2.0**20)])
     with pytest.raises(InputError, match=r"the step was skipped .* loss scale 1.04858e\+06"):
-        fit(Line(), batches(1.0), tmp_path, Guard(tmp_path, lowest_scale=2.0**21), plugins=[half(2.0**20)])
+        fit(Line(), batches(1.0), tmp_path, Guard(lowest_scale=2.0**21), plugins=[half(2.0**20)])
 
 
 def test_a_loss_that_is_no_number_is_a_defect_whatever_the_scale(tmp_path):
-    guard = Guard(tmp_path)
+    guard = Guard()
     fit(Line(), batches(NAN, *[1.0] * 9), tmp_path, guard, plugins=[half(2.0**20)])
     assert guard.total == 1  # and not the steps behind it, which lower the scale
 
@@ -142,7 +153,7 @@ def test_broken_weights_are_never_written(tmp_path, averaged: bool):
             module.inner.bias.data[0] = NAN
         trainer.save_checkpoint(tmp_path / f"checkpoints/step-{trainer.global_step:08d}.ckpt")
 
-    callbacks = [EMA(every=1)] * averaged + [Guard(tmp_path), LambdaCallback(on_train_batch_end=spoil)]
+    callbacks = [EMA(every=1)] * averaged + [Guard(), LambdaCallback(on_train_batch_end=spoil)]
     stopped = "stopped at step 3: the weights are no longer finite (inner.bias first, 1 of 4)"
     with refused(stopped, "step-00000002.ckpt, from which the same command resumes"):
         fit(Line(), batches(*[1.0] * 9), tmp_path, *callbacks)
@@ -170,7 +181,7 @@ class TwoLosses(Line):
 
 
 def test_of_two_optimizers_the_one_with_broken_gradients_skips_its_step(tmp_path):
-    module, guard = TwoLosses(), Guard(tmp_path)
+    module, guard = TwoLosses(), Guard()
     before = {name: p.detach().clone() for name, p in module.named_parameters()}
     fit(module, batches(-1.0), tmp_path, guard)
     changed = {name for name, p in module.named_parameters() if not torch.equal(p, before[name])}
@@ -180,7 +191,7 @@ def test_of_two_optimizers_the_one_with_broken_gradients_skips_its_step(tmp_path
 
 def test_the_other_optimizer_s_steps_do_not_end_a_row(tmp_path):
     with pytest.raises(InputError, match="3 steps in a row were skipped"):
-        fit(TwoLosses(), batches(1.0, -1.0, -1.0, -1.0, -1.0), tmp_path, Guard(tmp_path, skips=3))
-    guard = Guard(tmp_path, skips=3)
+        fit(TwoLosses(), batches(1.0, -1.0, -1.0, -1.0, -1.0), tmp_path, Guard(skips=3))
+    guard = Guard(skips=3)
     fit(TwoLosses(), batches(-1.0, -1.0, 1.0, -1.0, -1.0), tmp_path, guard)
     assert (guard.total, guard.in_a_row) == (4, 2)

@@ -3,7 +3,6 @@ import sys
 
 import lightning as L
 import pytest
-from lightning.pytorch.callbacks import EarlyStopping, GradientAccumulationScheduler
 
 from r2flow.callbacks import CALLBACKS, Stopping, build_callbacks
 from r2flow.errors import InputError
@@ -18,19 +17,18 @@ def test_a_second_copy_is_refused(monkeypatch):
     assert "callbacks" not in sys.modules
 
 
-@pytest.mark.parametrize(
-    ("callback", "option", "message"),
-    [
-        # The loader reads the number of parts once: images would repeat, in batches of another size.
-        (GradientAccumulationScheduler, "scheduling={0: 1, 2: 2}", r"give trainer\.accumulate_grad_batches"),
-        (EarlyStopping, "monitor=val/loss", r"runs end at trainer\.max_steps"),
-        (lambda some: [L.Callback()] * some, "some=2", r"theirs must make a Lightning callback, found \["),
-    ],
-)
-def test_callbacks_that_a_run_does_not_support_are_refused(monkeypatch, callback, option: str, message: str):
-    monkeypatch.setitem(CALLBACKS._entries, "theirs", callback)
-    with pytest.raises(InputError, match=message):
-        build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", f"+callbacks.theirs.{option}"]))
+def test_what_is_no_callback_is_refused_and_a_plug_in_comes_before_what_saves_its_state(monkeypatch):
+    config = compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.theirs.some=2"])
+    monkeypatch.setitem(CALLBACKS._entries, "theirs", lambda some: [L.Callback()] * some)
+    with pytest.raises(InputError, match=r"theirs must make a Lightning callback, found \["):
+        build_callbacks(config["callbacks"])
     monkeypatch.setitem(CALLBACKS._entries, "theirs", L.Callback)
-    *_, theirs, _, last = build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.theirs={}"]))
+    *_, theirs, last = build_callbacks({**config["callbacks"], "theirs": {}})
     assert (type(theirs), type(last)) == (L.Callback, Stopping)  # which saves their state after the step
+
+
+@pytest.mark.parametrize("key", ["ema", "theirs"])
+def test_callbacks_that_are_unknown_or_contradict_each_other_are_refused(key: str):
+    config = compose(["data=simulated", "backbone=hdit_tiny"])["callbacks"]
+    with pytest.raises(InputError, match="one average of its weights|no callback named 'theirs'"):
+        build_callbacks({**config, "half_life_ema": {}, key: {}})

@@ -8,8 +8,9 @@ import torch
 
 from r2flow import noise
 from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.options import SourceOptions
 from r2flow.data.prepared import PreparedScans
-from r2flow.data.resolving import reflectance_levels, resolve_reflectance
+from r2flow.data.resolving import reflectance_levels
 from r2flow.data.sources import InMemory, ScanFiles
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
@@ -21,7 +22,7 @@ SENSOR = SENSORS["hdl64e"].resized(16, 64)
 
 
 def module(encoding: Encoding | None = None, **options) -> ScanDataModule:
-    data = ScanDataModule(SENSOR, encoding or Encoding(SENSOR), 0, **options)
+    data = ScanDataModule(sensor=SENSOR, encoding=encoding or Encoding(SENSOR), **options)
     data.read()
     return data
 
@@ -103,24 +104,25 @@ def mixture(part) -> dict:
     ("options", "word"),
     [
         ({"batch_size": 0}, "batch_size"),
-        ({"validation": {"shar": 0.1}}, r"no option 'shar'.*Did you mean 'share'"),
+        ({"validation": {"shar": 0.1}}, r"no option 'validation.shar'.*Did you mean 'share'"),
         ({"name": "kitti_360"}, "data.root=FOLDER"),
         ({**FOLDER, "split": "train"}, "no standard split"),
         ({**FOLDER, "parts": [FOLDER]}, "data.parts needs data=mixed"),
-        ({**FOLDER, "reading": {"on_bad_scan": "ignore"}}, "on_bad_scan"),
+        ({**FOLDER, "reading": {"on_bad_scan": "ignore"}}, "reading.on_bad_scan: .*found 'ignore'"),
         ({"name": "pairs", "root": "x", "scans": DRIVES}, r"data\.scans: kitti_360 has a standard split: give split"),
         ({"name": "pairs", "root": "x", "scans": {**DRIVES, "split": None}}, "x is not a folder"),
         ({"name": "mixed"}, "data=mixed needs its parts"),
         (mixture({"root": "x"}), r"data.parts\[0\] needs the name"),
-        (mixture({"name": "folder", "rot": "x"}), r"data.parts\[0\] has no option 'rot'.*Did you mean 'root'"),
+        (mixture({"name": "folder", "rot": "x"}), r"data.parts\[0\]: no option 'rot'.*Did you mean 'root'"),
         (mixture(DRIVES), "has a standard split: give split, one of train, test, or null"),
         (mixture({**FOLDER, "weight": 1}), "every part a weight"),
         (mixture({"name": "simulated", "sensor": {"name": "vlp"}}), "no sensor named .vlp"),
-        (mixture({**FOLDER, "weight": 0}), "weight must be a finite number above 0 or null, found 0"),
-        (mixture({**FOLDER, "scenes": 7}), r"no simulated scenes: leave data.parts\[0\].scenes out"),
-        ({"validation": {"data": {"name": "simulated", "root": 512, "drives": [1]}}}, "data.root, .*data.drives out"),
-        (mixture("folder"), "a list, each a group of keys"),
-        (mixture({"name": "simulated", "scenes": 2**31}), "scenes must be a whole number from 1 to 10,000,000"),
+        (mixture({**FOLDER, "weight": 0}), "weight: input should be greater than 0, found 0"),
+        (mixture({**FOLDER, "scenes": 7}), r"data.parts\[0\].scenes does nothing for folder scans"),
+        ({"validation": {"data": {"name": "simulated", "drives": [1]}}}, "data.drives does nothing for simulated"),
+        ({"validation": {"data": {"name": "simulated", "root": 512}}}, "data.root does nothing for simulated"),
+        (mixture("folder"), "parts.0: input should be a valid dictionary, found 'folder'"),
+        (mixture({"name": "simulated", "scenes": 2**31}), "scenes: input should be less than or equal to 10000000"),
     ],
 )
 def test_what_cannot_be_is_refused(options: dict, word: str):
@@ -162,13 +164,18 @@ def test_validation_is_never_augmented_nor_drawn_anew_and_ranks_share_it(numbere
     options = {"name": "folder", "root": str(numbered), "validation": {"share": 0.5}}
     plain = next(iter(module(**options).val_dataloader()))
     data = module(**options, augment={"flip": True, "roll": True})
-    data.seed, data.further = 5, lambda x, sensor, draws: {"drawn": torch.tensor(draws.integers(2**40))}
+    data.seed = 5
+    data.item_format = data.format._replace(further=lambda x, _, draws: {"drawn": torch.tensor(draws.integers(2**40))})
     augmented = next(iter(data.val_dataloader()))
     assert torch.equal(plain["x_1"], augmented["x_1"])
     assert augmented["drawn"].tolist() == [noise.generator(0, "condition", k).integers(2**40) for k in range(6)]
     for ranks, seen in ((1, [0, 1, 2, 3, 4, 5]), (4, [1]), (6, [1]), (7, [0, 1, 2, 3, 4, 5])):  # two are left over
         data.trainer = SimpleNamespace(global_rank=1 % ranks, world_size=ranks)
         assert [k for batch in data.val_dataloader() for k in batch["k"].tolist()] == seen
+
+
+def learns_reflectance(wanted: bool | str, **options) -> bool:
+    return ScanDataModule(sensor=SENSOR, encoding={"reflectance": wanted}, **options).encoding.reflectance
 
 
 class TestReflectance:
@@ -178,23 +185,23 @@ class TestReflectance:
         root = tmp_path / "other"
         write_points(root / "scan.ply", np.array([[10, 0, -1]], np.float32))
         parts = [{"name": "folder", "root": str(numbered)}, {"name": "folder", "root": str(root)}]
-        assert not resolve_reflectance("auto", {"name": "mixed", "parts": parts})
+        assert not learns_reflectance("auto", name="mixed", parts=parts)
         held = {"validation": {"data": {"name": "folder", "root": str(root)}}}
-        assert not resolve_reflectance("auto", {"name": "folder", "root": str(numbered), **held})
+        assert not learns_reflectance("auto", name="folder", root=str(numbered), **held)
 
     def test_a_bad_first_scan_is_passed_over_where_bad_scans_are(self, numbered: Path):
         (numbered / "000000.bin").write_bytes(b"")
         data = {"name": "folder", "root": str(numbered)}
-        assert resolve_reflectance("auto", {**data, "reading": {"on_bad_scan": "skip"}})
+        assert learns_reflectance("auto", **data, reading={"on_bad_scan": "skip"})
         with pytest.raises(InputError, match=r"000000.bin: it holds no points.* data.reading.on_bad_scan=skip"):
-            resolve_reflectance("auto", data)
+            learns_reflectance("auto", **data)
 
     def test_what_is_said_is_not_asked(self):
         nowhere = {"name": "folder", "root": "/nowhere"}
-        assert resolve_reflectance(True, nowhere)
-        assert not resolve_reflectance(False, nowhere)
-        with pytest.raises(InputError, match=r"must be true, false or auto, found 'maybe'"):
-            resolve_reflectance("maybe", nowhere)
+        assert learns_reflectance(True, **nowhere)
+        assert not learns_reflectance(False, **nowhere)
+        with pytest.raises(InputError, match="reflectance: input should be a valid boolean.* found 'maybe'"):
+            learns_reflectance("maybe", **nowhere)
 
 
 @pytest.fixture
@@ -212,11 +219,11 @@ class TestPrepared:
         assert isinstance(prepared.training_source.parts[0], PreparedScans)  # mapped, not copied
 
     def test_samples_get_the_levels_that_sets_share(self, prepared_360: Path, numbered: Path):
-        prepared, simulated = {"name": "prepared", "root": str(prepared_360), "split": None}, {"name": "simulated"}
-        assert reflectance_levels(prepared) == 256  # as prepare found them
-        assert reflectance_levels(simulated) == 100
-        assert reflectance_levels({"name": "mixed", "parts": [prepared, simulated]}) is None
-        assert reflectance_levels({"name": "folder", "root": str(numbered)}) is None
+        prepared, simulated = SourceOptions("prepared", str(prepared_360)), SourceOptions()
+        assert reflectance_levels([prepared]) == 256  # as prepare found them
+        assert reflectance_levels([simulated]) == 100
+        assert reflectance_levels([prepared, simulated]) is None
+        assert reflectance_levels([SourceOptions("folder", str(numbered))]) is None
 
     def test_they_mix_with_others(self, prepared_360: Path, numbered: Path):
         parts = [{"name": "prepared", "root": str(prepared_360), "split": "train"},

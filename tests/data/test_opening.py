@@ -11,11 +11,11 @@ import torch
 import r2flow
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive, Layout, SourceKind
+from r2flow.data.loader import ItemFormat
 from r2flow.data.opening import SOURCES, open_scans, own_reading, reading_for
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairStore, make_pairs
 from r2flow.data.reading import Reading
-from r2flow.data.resolving import resolve_reflectance
 from r2flow.data.sources import InMemory, made_here
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
@@ -31,6 +31,10 @@ from tests.simulator.test_folder import write_folder
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
 READING = Reading(SENSOR)
+
+
+def learns_reflectance(name: str, root: str) -> bool:
+    return ScanDataModule(name, SENSOR, {"reflectance": "auto"}, root=root).encoding.reflectance
 
 
 def write_image(path: Path, number: int, channels: int = 2, size: tuple[int, int] = (8, 32)) -> Path:
@@ -166,7 +170,7 @@ class TestReflectance:
             write_points(tmp_path / "0.ply", np.array([[10, 0, -1]], np.float32))
         else:
             write_scan(tmp_path / "0.bin", 1, reflectance=0.5 if case == "some" else 0.0)
-        assert resolve_reflectance("auto", {"name": "folder", "root": str(tmp_path)}) == expected
+        assert learns_reflectance("folder", root=str(tmp_path)) == expected
         for on_bad_scan in ("error", "empty", "skip"):
             scans = open_scans(tmp_path, Reading(SENSOR, on_bad_scan=on_bad_scan))
             assert scans.about["reflectance"] == expected
@@ -212,9 +216,9 @@ def test_a_function_that_finds_drives_and_one_line_are_a_data_set(tmp_path: Path
     for number in range(9):
         write_scan(tmp_path / f"week-{1 + number // 3}" / f"{number}.bin", number)
     assert numbers(open_scans(f"weeks:{tmp_path}", READING, "test").source) == [6, 7, 8]
-    assert resolve_reflectance("auto", {"name": "weeks", "root": str(tmp_path)})
+    assert learns_reflectance("weeks", root=str(tmp_path))
     held = {"data": {"name": "weeks", "root": str(tmp_path), "split": "test"}}
-    data = ScanDataModule(SENSOR, Encoding(SENSOR), 0, name="weeks", root=str(tmp_path), split="train", validation=held)
+    data = ScanDataModule("weeks", SENSOR, root=str(tmp_path), split="train", validation=held)
     data.setup()
     assert [len(data.training_source), len(data.validation_source)] == [6, 3]
     prepare_folder(tmp_path, tmp_path / "shards", SENSOR, "weeks")
@@ -245,13 +249,13 @@ def test_scans_that_are_no_files_are_a_kind_of_their_own(r2flow):
     assert [tuple(batch.shape) for batch in scans.batches([0, 2], 1)] == [(1, 1, 8, 32)] * 2
     assert torch.equal(scans[1:], torch.stack([scans[1], scans[2]]))
     assert scans.identity is None  # nobody knows what decides them: no statistics of them are kept
-    assert not resolve_reflectance("auto", {"name": "walls", "root": "5"})
+    assert not learns_reflectance("walls", root="5")
     assert "kid_handcrafted_range" in r2flow("evaluate", "walls:5", "walls:4", "--size", "8x32", "--workers", 0).said
-    data = ScanDataModule(SENSOR, Encoding(SENSOR, reflectance=False), 0, name="walls", root=10, batch_size=2)
+    data = ScanDataModule("walls", SENSOR, Encoding(SENSOR, reflectance=False), root=10, batch_size=2)
     assert [batch["x_1"].shape for batch in data.val_dataloader()] == [(1, 1, 8, 32)]
     assert data.names == [f"wall at {i} m" for i in range(2, 12)]
     sensors = SENSOR, replace(SENSOR, max_range=9000)
-    data, far = (ScanDataModule(s, Encoding(s, reflectance=False), 0, name="walls", root=5000) for s in sensors)
+    data, far = (ScanDataModule("walls", s, Encoding(s, reflectance=False), root=5000) for s in sensors)
     assert next(iter(far.val_dataloader()))["x_1"].isfinite().all()  # walls of 4,752 to 5,001 m
     with pytest.raises(InputError, match=r"wall at \d+ m: its median range is .* millimetres\? Give metres"):
         next(iter(data.val_dataloader()))
@@ -259,9 +263,9 @@ def test_scans_that_are_no_files_are_a_kind_of_their_own(r2flow):
 
 @pytest.mark.parametrize("shape", [None, (5,)])
 def test_noise_has_the_shape_that_the_module_is_told(numbered: Path, shape):
-    data = ScanDataModule(
-        SENSOR, Encoding(SENSOR), 7, shape, name="folder", root=str(numbered), validation={"share": 0.25}
-    )
+    data = ScanDataModule("folder", SENSOR, seed=7, root=str(numbered), validation={"share": 0.25})
+    if shape:
+        data.adopt(ItemFormat(data.encoding, shape))
     (batch,) = data.val_dataloader()
     assert set(batch) == {"x_1", "x_0", "u", "k"}
     assert batch["x_1"].shape == (3, 2, 8, 32)

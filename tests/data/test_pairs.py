@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from r2flow.runs.lineage import find_parent, pairs_of
 
 from r2flow.cli.train import pairs
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairStore, default_folder, make_pairs
 from r2flow.errors import InputError
+from r2flow.model.lineage import find_parent
 from r2flow.models import find_model
 from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler
@@ -223,8 +224,11 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
         assert words in said
     parent = find_parent(path)
-    chosen = PairOptions(**pairs_of(parent, {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}))
-    assert len(PairStore(folder, chosen, parent.checkpoint.encoding.shape).usable()) == 10
+    options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
+    data = ScanDataModule("pairs", parent.checkpoint.sensor, pairs=options)
+    data.drawn_by(parent.record())
+    assert data.pair_store.folder == folder
+    assert len(data.pair_store.usable()) == 10
     assert "pairs/s" not in r2flow("pairs", path, *QUICK).said  # nothing was left to make
 
 

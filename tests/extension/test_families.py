@@ -58,7 +58,7 @@ def test_info_names_the_family(trained: tuple[Family, Path]):
     assert (about["config"]["backbone"] is None) == (family is GAN)  # which has a network of its own kind
     assert about["config"]["plugins"] == [str(FAMILIES / f"{family.file}.py")]
     if family is GAN:  # options of its stage, without a file of theirs: as given, as it says, as of every stage
-        assert [about["config"]["stage"][key] for key in ("width", "learning_rate", "init")] == [16, 2e-3, None]
+        assert [about["config"]["stage"][key] for key in ("width", "learning_rate", "parent")] == [16, 2e-3, None]
 
 
 def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
@@ -103,7 +103,7 @@ CANNOT = {
     "report solvers": (["RUN", "-o", "OUT"], "report solvers needs the velocity of a flow"),
     "export": (["RUN", "-o", "OUT.onnx", "--steps", "4"], "only rectified flows and flow maps can be exported"),
     "pairs": (["RUN"], "a reflow pair needs the velocity of a flow from noise; a ToyGenerator"),
-    "sample": (["RUN", "--steps", "4", "-o", "OUT"], "has no option 'steps'"),
+    "sample": (["RUN", "--steps", "4", "-o", "OUT"], "no option 'steps'"),
 }  # fmt: skip
 
 

@@ -13,9 +13,10 @@ from r2flow.flow.solvers import solve
 from r2flow.generators import USUAL
 from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler
-from r2flow.stages import STAGES, build_stage
+from r2flow.stages import STAGES
 from r2flow.stages.base import learning_rate_factor
 from r2flow.stages.rectify import Distill, Rectify, Reflow
+from r2flow.training import build, compose
 from tests.fields import Field
 
 
@@ -67,7 +68,7 @@ def fitted(stage: Rectify, batch: Callable[[int], dict[str, torch.Tensor]], step
 
 def test_an_untrained_stage_has_the_loss_of_predicting_nothing():
     # v = 0: the loss is E|x_1 - x_0|^2 / d = M^2 + S^2 + 1.
-    stage = Rectify(affine())
+    stage = Rectify(generator=affine())
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     x_0 = torch.stack([standard_normal((1, 32, 32), 0, "training", k) for k in range(64)])
     x_1 = M + S * torch.stack([standard_normal((1, 32, 32), 0, "evaluation", k) for k in range(64)])
@@ -79,7 +80,7 @@ def test_an_untrained_stage_has_the_loss_of_predicting_nothing():
 def test_a_loss_gives_a_value_a_scan(monkeypatch, wrong):
     monkeypatch.setitem(LOSSES._entries, "wrong", lambda v_t, u_t: wrong((v_t - u_t).square().flatten(1).mean(1)))
     with pytest.raises(InputError, match=r"one value a scan, \(256,\), found"):
-        Rectify(affine(), loss="wrong").training_step(pairs(0), 0)
+        Rectify(generator=affine(), loss="wrong").training_step(pairs(0), 0)
 
 
 X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
@@ -89,7 +90,7 @@ X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
     ("stage", "options", "steps"), [(Reflow, {}, 1), *((Distill, {"steps": k}, k) for k in (1, 4))]
 )
 def test_a_reflowed_gaussian_takes_one_step_and_a_distilled_one_its_own_number(stage, options: dict, steps: int):
-    end = solve(fitted(stage(affine(), **options), pairs, 1200).generator.velocity, X_0, steps=steps).x.detach()
+    end = solve(fitted(stage(generator=affine(), **options), pairs, 1200).generator.velocity, X_0, steps=steps).x.detach()
     torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
 
 
@@ -102,7 +103,7 @@ def test_distillation_trains_at_the_times_of_its_steps_alone(k: int, grid: str):
             seen.update(t.tolist())
             return super().forward(t, x)
 
-    stage = Distill(affine(Spy()), steps=k, grid=grid)
+    stage = Distill(generator=affine(Spy()), steps=k, grid=grid)
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     stage.training_step(pairs(0), 0)
     assert seen == ({i / k for i in range(k)} if grid == "uniform" else {0, 7 / 16, 12 / 16, 15 / 16})
@@ -111,7 +112,7 @@ def test_distillation_trains_at_the_times_of_its_steps_alone(k: int, grid: str):
 
 
 def test_the_paper_s_loss_and_times_are_the_defaults():
-    stage = Reflow(affine())
+    stage = Reflow(generator=affine())
     # Most of the U-shaped density lies at the ends: e^(4t) + e^(4(1 - t)) puts 2 e^2 sinh(1) / (e^4 - 1) = 0.324 inside
     # (1/4, 3/4), where a uniform one has 0.5.
     t = stage.time(torch.linspace(0, 1, 20001)[:-1])
@@ -126,20 +127,21 @@ def test_the_paper_s_loss_and_times_are_the_defaults():
     ("options", "message"),
     [
         *(({"name": name, "learning_rat": 1.0}, r"Did you mean 'learning_rate'\?") for name in STAGES),
-        ({"name": "distill", "steps": 0}, "steps must be a whole number of at least 1"),
-        ({"name": "distill", "steps": 2, "time": {"name": "uniform"}}, "leave stage.time out"),
+        ({"name": "distill", "steps": 0}, "stage 'distill': steps: input should be greater than or equal to 1, found 0"),
+        ({"name": "distill", "steps": 2, "time": {"name": "uniform"}}, "leave time out"),
     ],
 )
 def test_what_cannot_be_is_refused(options, message):
     with pytest.raises(InputError, match=message):
-        STAGES.build(options, affine())
+        STAGES.build({**options, "generator": affine()})
 
 
 @pytest.mark.parametrize(("stage", "data"), [("reflow", "simulated"), ("distill", "folder"), ("rectify", "pairs")])
-def test_stage_and_data_belong_together(stage: str, data: str):
-    config = {"stage": {"name": stage}, "data": {"name": data, "batch_size": 4}, "seed": 0}
+def test_stage_and_data_belong_together(stage: str, data: str, saved):
+    given = [f"stage={stage}", f"data={data}", f"stage.parent={saved[0]}", "data.root=x" * (data == "folder")]
+    config = compose([one for one in given if one])
     with pytest.raises(InputError, match=f"stage={stage} learns from"):
-        build_stage(config, affine())
+        build(config)
 
 
 def test_a_straightened_generator_is_drawn_without_fresh_noise():
@@ -148,12 +150,11 @@ def test_a_straightened_generator_is_drawn_without_fresh_noise():
     for before, after in ((build_sampler("sde"), USUAL), (build_sampler("renoise"), USUAL), (own, own)):
         flow = affine()
         flow.sampler = before
-        assert Reflow(flow).generator.sampler == after
+        assert Reflow(generator=flow).generator.sampler == after
 
 
 def test_a_distilled_flow_keeps_the_steps_that_it_learns():
-    config = {"stage": {"name": "distill", "steps": 2}, "data": {"batch_size": 4, "name": "pairs"}, "seed": 0}
-    assert build_stage({**config, "sampler": {"steps": 2}}, affine()).generator.sampler.steps == 2
+    assert Distill(generator=affine(), steps=2, sampler={"steps": 2}).generator.sampler.steps == 2
     for other in ({"steps": 8}, {"name": "adams3"}):
         with pytest.raises(InputError, match=r"distilled for euler, 2 steps alone"):
-            build_stage({**config, "sampler": other}, affine())
+            Distill(generator=affine(), steps=2, sampler=other)

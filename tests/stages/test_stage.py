@@ -10,6 +10,7 @@ from torch.utils.data import DataLoader
 
 from r2flow.errors import InputError
 from r2flow.generators import Generated, Generator
+from r2flow.samplers import FixedSteps
 from r2flow.stages import Stage
 from r2flow.stages.base import SingleLoss
 from r2flow.stages.muon import Muon, is_hidden_matrix, orthogonalised
@@ -23,6 +24,7 @@ class Linear(Generator):
     def __init__(self) -> None:
         nn.Module.__init__(self)
         self.layer = nn.Linear(4, 1)
+        self.run_by(FixedSteps())
 
     def forward(self, noise, condition=None, **options):
         return Generated.after(self.layer(noise), 1)
@@ -31,7 +33,7 @@ class Linear(Generator):
 class Automatic(Stage):
     def __init__(self) -> None:
         torch.manual_seed(0)
-        super().__init__(Linear(), learning_rate=0.1, warmup_images=16)
+        super().__init__(generator=Linear(), learning_rate=0.1, warmup_images=2)
         self.rates: list[float] = []
         self.other = nn.Linear(4, 1)
 
@@ -69,10 +71,14 @@ def test_steps_of_its_own_are_clipped_scheduled_and_counted_as_lightning_s(tmp_p
     for a, b in zip(automatic.generator.parameters(), manual.generator.parameters(), strict=True):
         assert torch.equal(a, b)
     assert manual.rates == automatic.rates
-    assert automatic.rates[:2] == pytest.approx([0.05, 0.1])  # a warm-up of 16 images is one of two steps
+    assert automatic.rates[:2] == pytest.approx([0.05, 0.1])  # a warm-up of two images is one of two steps
     assert not torch.equal(manual.other.weight, Manual().other.weight)
     stage = type("Own", (Automatic,), {"training_step": lambda self, batch, _: self.other(batch).square().sum()})()
     assert not torch.equal(fitted(stage, tmp_path).other.weight, Automatic().other.weight)
+
+
+def batch_of(loss: float) -> dict[str, object]:
+    return {"x_1": torch.zeros(1), "x_0": torch.zeros(1), "u": loss, "k": 0}
 
 
 class Given(SingleLoss):
@@ -82,20 +88,20 @@ class Given(SingleLoss):
 
 def test_the_logged_loss_is_the_mean_over_the_parts_of_a_step(tmp_path):
     trainer = quiet_trainer(tmp_path, max_steps=2, accumulate_grad_batches=2)
-    trainer.fit(Given(Linear()), DataLoader([{"u": loss} for loss in (1.0, 2.0, 4.0, 8.0)]))
+    trainer.fit(Given(generator=Linear()), DataLoader([batch_of(loss) for loss in (1.0, 2.0, 4.0, 8.0)]))
     assert trainer.callback_metrics["train/loss"] == (4 + 8) / 2
 
 
 @pytest.mark.parametrize("loss", [None, 1.0, torch.ones(()), torch.ones(2, requires_grad=True)])
 def test_a_loss_without_a_gradient_or_of_many_numbers_is_refused(loss):
-    stage = type("Wrong", (Given,), {"regression_loss": lambda *_: loss})(Linear())
+    stage = type("Wrong", (Given,), {"regression_loss": lambda *_: loss})(generator=Linear())
     with pytest.raises(InputError, match="regression_loss of a Wrong must be one number with a gradient"):
-        stage.training_step({"u": torch.zeros(2)}, 0)
+        stage.training_step(batch_of(0.0), 0)
 
 
 class Slope(Stage):
     def __init__(self, slope: float) -> None:
-        super().__init__(Linear(), warmup_images=0)
+        super().__init__(generator=Linear(), warmup_images=0)
         self.automatic_optimization, self.gradient_clip_val, self.slope = False, CLIP, slope
 
     def configure_optimizers(self):

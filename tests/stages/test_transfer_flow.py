@@ -21,7 +21,8 @@ from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.samplers.maps import Transport
 from r2flow.simulator import simulate
-from r2flow.stages import build_stage
+from r2flow.stages.flow_map import LearnFlowMap
+from r2flow.stages.rectify import Rectify, Reflow
 from r2flow.stages.transfer import Tasks, Transfer, coarser
 from tests import fields
 from tests.conftest import tiny_options
@@ -301,17 +302,13 @@ def test_a_part_of_a_scan_and_what_is_known_of_it_depend_on_the_image_alone(flow
         assert often(flow.space, torch.zeros(2, *shape), sensor, rng)["x_1"].shape == (2, 4, 16)
 
 
-def stage(**changed) -> Transfer:
-    config = {**CONFIG, "data": {"name": "simulated", "batch_size": 4}, "seed": 0, "stage": {"name": "transfer"}}
-    return build_stage({**config, **changed}, built(nought=True))
-
-
 def test_what_it_learns_from_lowers_the_loss(scans, monkeypatch):
-    learner = stage()
+    learner = Transfer(generator=built(nought=True))
     learner.log = lambda *_, **__: None
     x_1 = learner.generator.space.encoding.encode(scans)
     sensor = learner.generator.space.sensor
-    one = [learner.further(x, sensor, noise.generator(0, "condition", k)) for k, x in enumerate(x_1)]
+    further = learner.item_format.further
+    one = [further(x, sensor, noise.generator(0, "condition", k)) for k, x in enumerate(x_1)]
     batch = {name: torch.stack([part[name] for part in one]) for name in one[0]}
     batch |= {"x_0": torch.randn(x_1.shape), "k": torch.arange(3)}
     u, by = torch.tensor([0.2, 0.6, 0.9]), torch.optim.Adam(learner.parameters(), 1e-2)
@@ -338,12 +335,12 @@ def test_what_it_learns_from_lowers_the_loss(scans, monkeypatch):
 
 
 def test_a_batch_has_crops_of_several_sensors():
-    learner = stage(stage={"name": "transfer", "tasks": {"halved": 0}})
+    learner = Transfer(generator=built(nought=True), tasks={"halved": 0})
     space = learner.generator.space
     parts = [{"name": "simulated", "scenes": 4},
              {"name": "simulated", "scenes": 4, "sensor": {"name": "vlp16", "columns": 64}}]  # fmt: skip
-    data = ScanDataModule(space.sensor, space.encoding, 0, name="mixed", parts=parts, validation={"share": 0.5})
-    data.further = learner.further
+    data = ScanDataModule("mixed", space.sensor, space.encoding, parts=parts, validation={"share": 0.5})
+    data.adopt(learner.item_format)
     data.setup()
     [batch] = data.val_dataloader()
     assert batch["x_1"].shape == (4, 2, 8, 32)
@@ -364,22 +361,22 @@ def test_a_batch_has_crops_of_several_sensors():
 
 
 @pytest.mark.parametrize(
-    ("name", "width", "word"),
-    [("rectify", 64, "one sensor"), ("flow_map", 64, "one sensor"), ("transfer", 16, "crops of 8 x 32")],
+    ("stage", "width", "word"),
+    [(Rectify, 64, "one sensor"), (LearnFlowMap, 64, "one sensor"), (Transfer, 16, "crops of 8x32")],
 )
-def test_a_part_of_another_sensor_that_cannot_be_learned_from_is_refused(name, width, word):
+def test_a_part_of_another_sensor_that_cannot_be_learned_from_is_refused(stage, width, word):
     part = {"name": "simulated", "scenes": 4}
-    data = {"name": "mixed", "batch_size": 4, "parts": [part, {**part, "sensor": {"name": "vlp16", "columns": width}}]}
-    flow_map = {**CONFIG, "backbone": tiny_options("hdit"), "generator": {"name": "flow_map"}}
-    generator = built() if name == "transfer" else build_generator(flow_map)
+    parts = [part, {**part, "sensor": {"name": "vlp16", "columns": width}}]
+    data = ScanDataModule("mixed", CONFIG["sensor"], parts=parts)
+    backbone = CONFIG["backbone"] if stage is Transfer else tiny_options("hdit")
     with pytest.raises(InputError, match=word):
-        build_stage({**CONFIG, "data": data, "seed": 0, "stage": {"name": name}}, generator)
+        data.adopt(stage(backbone, CONFIG["sensor"]).item_format)
 
 
-@pytest.mark.parametrize("other", ["rectify", "reflow"])
+@pytest.mark.parametrize("other", [Rectify, Reflow])
 def test_a_stage_that_tells_nothing_refuses_it(other):
     with pytest.raises(InputError, match=r"stage=transfer"):
-        stage(stage={"name": other})
+        other(generator=built(nought=True))
 
 
 def test_it_draws_nothing_from_noise_alone_and_needs_a_backbone_for_any_size(flow):

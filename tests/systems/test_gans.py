@@ -163,8 +163,8 @@ def test_rules_of_training(shared: Path):
         half_life_decay(step, ema["batch_size"], 1000 * ema["ema_kimg"], ema["rampup"]) for step in ema["iteration"]
     ]
     torch.testing.assert_close(torch.tensor(found, dtype=torch.float64), ema["decay"], rtol=1e-6, atol=0)
-    callback = HalfLifeEMA(batch_size=32)
-    callback._step = 6250
+    callback = HalfLifeEMA()
+    callback.batch_size, callback._step = 32, 6250
     assert callback._decay() == pytest.approx(0.5 ** (32 / 10_000))
     for who, every in (("generator", 0), ("discriminator", 16)):
         rate, betas = lazy_adam(0.002, (0.0, 0.99), every)

@@ -18,7 +18,6 @@ from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.completion import completing
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
-from r2flow.stages import build_stage
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import (
     PREDICTIONS,
@@ -29,7 +28,7 @@ from r2flow.systems.diffusion.process import (
     step,
     walk,
 )
-from r2flow.systems.diffusion.schedules import DISCRETE, SCHEDULES, Cosine
+from r2flow.systems.diffusion.stage import LearnDiffusion
 from tests.reference import assert_near, assert_norms, assert_published, backbone_of, load_case
 
 CONFIG: dict[str, Any] = {
@@ -90,10 +89,9 @@ def test_the_stage_s_loss_is_the_formula_s_or_on_demand_the_published(shared):
             "name": "efficient_unet", "base_channels": cfg["base_channels"], "num_residual_blocks": 1,
             "channel_multiplier": cfg["channel_multiplier"], "num_heads": cfg["attn_num_heads"],
         },
-        "data": {"name": "simulated", "batch_size": 3}, "seed": 0,
     }  # fmt: skip
     for paired, key in ((True, "loss_paired"), (False, "loss")):
-        stage = build_stage({**config, "stage": {"name": "diffusion", "paired": paired}}, build_generator(config))
+        stage = LearnDiffusion(generator=build_generator(config), paired=paired)
         stage.generator.backbone.load_state_dict(case["state_dict"])  # type: ignore[union-attr]
         x_1 = given["inputs"]["x_0"].clone().requires_grad_()
         batch = {"x_1": x_1, "x_0": given["inputs"]["noise"]}
@@ -291,11 +289,10 @@ def test_a_scan_is_completed_with_a_diffusion_as_with_any_flow(exact):
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
     flow = build_generator({**CONFIG, "generator": {"name": "rectified_flow"}})
-    stage = {"data": {"name": "simulated", "batch_size": 2}, "seed": 0, "stage": {"name": "diffusion"}}
     with pytest.raises(InputError, match=r"tells v\(t, x\), and this one learns eps\(z, log-SNR\)"):
         exact.start_from(flow)
     with pytest.raises(InputError, match="learns a Diffusion"):
-        build_stage({**CONFIG, **stage}, flow)
+        LearnDiffusion(generator=flow)
 
 
 @pytest.mark.parametrize("farthest", [5.0, 15.0, 20.0])

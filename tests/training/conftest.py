@@ -87,8 +87,8 @@ def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
     return done
 
 
-def link_in_process(command: Sequence[str]) -> int:
-    """In place of `r2flow.runs.chain.run_process`: a link without a process of its own."""
+def job_in_process(command: Sequence[str]) -> int:
+    """In place of `r2flow.runs.launch.run_process`: a job of a sweep without a process of its own."""
     overrides = command[len(COMMAND) :]
     try:
         return 0 if fit(build(compose(overrides), overrides)).finished else LATER
@@ -98,9 +98,9 @@ def link_in_process(command: Sequence[str]) -> int:
 
 
 def run_train(cwd: Path, scans: Path, *overrides: str, check: bool = True, flags: tuple[str, ...] = ()) -> Done:
-    """The tiny run, a chain's links and a sweep's jobs too in this process."""
+    """The tiny run, a sweep's jobs too in this process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("r2flow.runs.chain.run_process", link_in_process)
+        patch.setattr("r2flow.runs.launch.run_process", job_in_process)
         return in_process(cwd, [*flags, *tiny(scans, *overrides)], check)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import lightning as L
 
-from r2flow.callbacks import CALLBACKS, Entry, Stopping
+from r2flow.callbacks import CALLBACKS, Stopping
 
 
 class Hold(L.Callback):
@@ -32,4 +32,4 @@ class Hold(L.Callback):
             time.sleep(0.01)
 
 
-CALLBACKS.add("hold", Entry(Hold))
+CALLBACKS.add("hold", Hold)

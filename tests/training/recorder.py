@@ -14,7 +14,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from r2flow.callbacks import CALLBACKS, Entry
+from r2flow.callbacks import CALLBACKS
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.ema import averaged_weights
 from r2flow.cli import main
@@ -64,7 +64,7 @@ def item_broken(self, key):
 
 AtomicCheckpointIO.save_checkpoint = save_recorded
 FlowDataset.__getitem__ = item_broken
-CALLBACKS.add("recorder", Entry(Recorder))
+CALLBACKS.add("recorder", Recorder)
 
 if __name__ == "__main__":
     main("train", command=[__file__])

@@ -12,9 +12,11 @@ import yaml
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
 from r2flow.reports.compare import report_chain
-from r2flow.runs.chain import Link, is_finished, links_of
+from r2flow.runs.chain import links_of
+from r2flow.runs.folder import has_ended
 from r2flow.runs.composing import compose
-from r2flow.training import build
+from r2flow.signals import LATER
+from r2flow.training import Result, Run, build
 from tests.conftest import CONFIG, write_checkpoint
 from tests.training.conftest import TINY, hold_at, in_process, let_go, run_train, start, tiny, wait_for
 
@@ -22,6 +24,7 @@ HELD = Path("held")  # in the folder that a chain is started from
 CHAIN = ["experiment=demo", "preview=null", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8",
          "data.pairs.batch_size=4", "trainer.max_steps=8", "samples.num=0", *hold_at(6, HELD)]  # fmt: skip
 LINKS = ("rf1", "rf2", "td2")
+STOPPED = Result({}, None, Path(), 0, finished=False)  # of `fit`
 
 
 def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -29,7 +32,7 @@ def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatc
     monkeypatch.setattr("r2flow.models.find_model", {"street": model}.__getitem__)
     picture = tmp_path / "runs" / "demo" / "preview" / "samples.png"
     drawn: list[int] = []
-    monkeypatch.setattr("r2flow.runs.chain.run_process", lambda _: drawn.append(picture.stat().st_mtime_ns) or 2)
+    monkeypatch.setattr("r2flow.runs.chain.fit", lambda _: drawn.append(picture.stat().st_mtime_ns) or STOPPED)
     for _ in range(2):
         done = in_process(tmp_path, ["experiment=demo", "trainer.accelerator=cpu"], check=False)
         assert "preview: scans of the model street in runs/demo/preview/samples.png" in done.stdout
@@ -77,8 +80,8 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
     assert said.rstrip().endswith("Open runs/demo/report/steps.png first.")
     first, second, third = (load_checkpoint(run / link) for link in LINKS)
     assert [flow.config["stage"]["name"] for flow in (first, second, third)] == ["rectify", "reflow", "distill"]
-    assert second.config["parent"]["weights"] == weights_hash(first)
-    assert third.config["parent"]["weights"] == weights_hash(second)
+    assert second.config["stage"]["parent"]["weights"] == weights_hash(first)
+    assert third.config["stage"]["parent"]["weights"] == weights_hash(second)
     assert second.config["backbone"] == first.config["backbone"]
     assert [(f.generator.sampler.steps, f.generator.fixed) for f in (first, third)] == [(2, False), (2, True)]
     # The noise that 2-TD learns from is none of that which 2-RF has learned from.
@@ -88,7 +91,7 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
 def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):
     run = Path(shutil.copytree(chained[0], tmp_path / "runs" / "it's"))
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")}
-    assert run_train(tmp_path, scans, *CHAIN, 'name="it\'s"').stdout.count(": finished before") == 4  # the report too
+    assert run_train(tmp_path, scans, *CHAIN, 'name="it\'s"').stdout.count("finished before") == 4  # the report too
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")} == before
 
 
@@ -105,7 +108,8 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(cha
     assert process.returncode == 143, said
     assert "stopped at step 6; the same command resumes from the last checkpoint" in said
     assert "the chain stopped in td2; the same command resumes there" in said
-    assert not any(path.exists() for path in (run / "td2" / "link.json", run / "report"))
+    assert not has_ended(run / "td2")
+    assert not (run / "report").exists()
     let_go(tmp_path / HELD)
     run_train(tmp_path, scans, *CHAIN)
     assert_alike(chained[0], run)
@@ -114,7 +118,7 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(cha
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["experiment=reflow"], "stage=reflow starts from a trained run: give stage.parent=RUN"),
+        (["experiment=reflow"], "data=pairs are drawn by a trained run: give stage.parent=RUN"),
         (["experiment=reflow", "stage.parent=RF1", "sensor=vlp16"], "the sensor is the parent's"),
         (["experiment=reflow", "stage.parent=RF1", "data.augment.flip=true"], "data.augment changes scans"),
         (["experiment=reflow", "stage.parent=RF1"], "holds other pairs"),
@@ -167,7 +171,7 @@ OF_SCANS = ("data.augment.flip=true", "data.a_key_of_tomorrow=1", "data.validati
 def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone():
     chain = {
         "rf1": {"experiment": None, "trainer": {"max_steps": 5}},
-        "rf2": {"experiment": "reflow", "init": "rf1", "stage": {"loss": "mse"}},
+        "rf2": {"experiment": "reflow", "parent": "rf1", "stage": {"loss": "mse"}},
     }
     given = ["experiment=demo", "name=x", "chain.rf1.trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3",
              *OF_SCANS, "data.pairs.num=9", *ALL_LINKS, "backbone.depths=[1]", "+chain.rf2.seed=2"]  # fmt: skip
@@ -182,26 +186,27 @@ def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone()
     )  # fmt: skip
 
 
-def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(tmp_path, monkeypatch):
-    ran: list[list[str]] = []
-    monkeypatch.setattr("r2flow.runs.chain.run_process", lambda command: ran.append(command) or 2)
-    command = ["experiment=r2flow", "data.root=/nowhere", "data.augment.flip=true", "trainer.accelerator=cpu"]
-    assert in_process(tmp_path, command, check=False).returncode == 2
+def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(kitti_360, tmp_path, monkeypatch):
+    ran: list[Run] = []
+    monkeypatch.setattr("r2flow.runs.chain.fit", lambda run: ran.append(run) or STOPPED)
+    command = ["experiment=r2flow", f"data.root={kitti_360}", "data.augment.flip=true", "trainer.accelerator=cpu"]
+    assert in_process(tmp_path, command, check=False).returncode == LATER
     (first,) = ran  # the later ones have been built, and are not refused for the flip
-    assert {"data.augment.flip=true", "experiment=r2flow_1rf"} <= set(first)
-    assert list(tmp_path.iterdir()) == []
+    assert first.data.augment.flip
+    assert first.config["trainer"] == {**compose(["experiment=r2flow_1rf"])["trainer"], "accelerator": "cpu", "default_root_dir": "runs/r2flow/rf1"}
+    assert [path.name for path in tmp_path.iterdir()] == ["data_3d_raw"]  # no runs
 
 
 def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path, tmp_path: Path, monkeypatch):
-    ran: list[list[str]] = []
-    monkeypatch.setattr("r2flow.runs.chain.run_process", lambda command: ran.append(command) or 2)
+    ran: list[Run] = []
+    monkeypatch.setattr("r2flow.runs.chain.fit", lambda run: ran.append(run) or STOPPED)
     command = ["experiment=r2flow", "size=small", "data=folder", f"data.root={scans}", "trainer.accelerator=cpu"]
     assert "chain.rf1: scans in files are no" in in_process(tmp_path, [*command, "data.scenes=5"], check=False).refusal
     in_process(tmp_path, command, check=False)
     assert len(ran) == 1  # of both
     (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=simulated"])
     assert link.overrides[:2] == ("data.scenes=9", "data=simulated")
-    more = {"more": {"init": "rf1", "data": {"scenes": 9}}, "rf2": {"experiment": "reflow", "init": "more"}}
+    more = {"more": {"parent": "rf1", "data": {"scenes": 9}}, "rf2": {"experiment": "reflow", "parent": "more"}}
     assert links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=mixed"])[0].overrides[0] == "data=mixed"
     links = links_of({"rf1": {"data": {"scenes": 8}}, **more}, "runs", ["data=folder"])
     assert ["data=folder" in link.overrides for link in links] == [True, True, False]  # rf2 learns from pairs
@@ -226,7 +231,7 @@ def test_a_chain_s_report_draws_what_each_system_can(chained: tuple[Path, str], 
 
 
 def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_options():
-    chain = {"td4": {"stage": {"name": "distill", "steps": 4, "init": "runs/old"}}}
+    chain = {"td4": {"stage": {"name": "distill", "steps": 4, "parent": "runs/old"}}}
     (link,) = links_of(chain, "runs/x", ["data.pairs.num=5", "data.root=scans"])
     assert compose(link.overrides)["stage"]["steps"] == 4
     assert "data.pairs.num=5" in link.overrides
@@ -252,10 +257,9 @@ def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path: Path
 
 def test_a_link_that_lost_its_last_checkpoint_is_not_finished(chained: tuple[Path, str], tmp_path: Path):
     run = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "rf1"))
-    link = Link("rf1", run, tuple(json.loads((run / "link.json").read_text())[0]["overrides"]))
-    assert is_finished(link)
+    assert has_ended(run)
     checkpoints_of(run)[0].unlink()
-    assert not is_finished(link)
+    assert not has_ended(run)
 
 
 @pytest.mark.parametrize("key", ["plugins", "+plugins", "++plugins"])

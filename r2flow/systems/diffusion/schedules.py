@@ -15,7 +15,7 @@ from r2flow.errors import InputError
 from r2flow.registry import Bound, NonNegative, Positive, Registry
 
 LogSNR = Callable[[Tensor], Tensor]
-Steps = Annotated[int, Bound("of at least 2", lambda n: n >= 2)]
+Steps = Annotated[int, Bound("at least 2", lambda n: n >= 2)]
 Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
 
 _FARTHEST = 20  # largest |lambda|: up to it, the float32 tangent has an error of at most 0.005

@@ -135,6 +135,7 @@ class LearnGan(Stage):
         self.automatic_optimization = False
         self.r1 = r1
         self.r1_every = r1_every
+        self.last_r1: Tensor | None = None
         channels, *shape = self.space.shape
         chosen = discriminator or {"name": "dcgan"}
         self.discriminator: nn.Module = DISCRIMINATORS.build(chosen, shape, channels)
@@ -177,8 +178,9 @@ class LearnGan(Stage):
         if self.r1 and step % self.r1_every == 0:
             penalty = self.penalty(real, images, BatchDraws(self.hparams["seed"], batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
-            # Lightning repeats it until the next one.
-            self.log("train/last_r1", penalty, sync_dist=True)
+            self.last_r1 = penalty.detach()
+        if self.last_r1 is not None:
+            self.log("train/last_r1", self.last_r1, sync_dist=True)
         if self.augment is not None:
             self.augment.count(of_real)
             if self.augment.every and step % self.augment.every == 0:

@@ -37,7 +37,7 @@ class LearnCompletion(Rectify):
     generator_name = "toy_completion"
 
     def condition(self, batch):
-        draws = [noise.generator(self.seed, "condition", int(k)) for k in batch["k"]]
+        draws = [noise.generator(self.hparams.seed, "condition", int(k)) for k in batch["k"]]
         rows = [torch.from_numpy(draw.random(batch["x_1"].shape[-2]) < draw.random()) for draw in draws]
         mask = torch.stack(rows)[:, None, :, None].to(batch["x_1"]).expand_as(batch["x_1"][:, :1])
         return {"image": batch["x_1"], "mask": mask}

@@ -32,11 +32,11 @@ class OneEvaluation(Sampler):
 class ToyGAN(Stage):
     generator_name = "toy_gan"
 
-    def __init__(self, generator, width: int = 32, **options):
-        super().__init__(generator, **options)
+    def __init__(self, *model, width: int = 32, **options):
+        super().__init__(*model, **options)
         self.automatic_optimization = False
         self.discriminator = nn.Sequential(
-            nn.Flatten(), nn.Linear(prod(generator.space.shape), width), nn.SiLU(), nn.Linear(width, 1)
+            nn.Flatten(), nn.Linear(prod(self.space.shape), width), nn.SiLU(), nn.Linear(width, 1)
         )
 
     def configure_optimizers(self):
