@@ -33,8 +33,12 @@ __all__ = [
     "build_callbacks",
 ]
 
-if __name__ != "r2flow.callbacks":  # callbacks look up each other by class, and a second copy has other classes
-    raise ImportError("import r2flow.callbacks, not callbacks: the folder is part of the package r2flow.")
+if (
+    __name__ != "r2flow.callbacks"
+):  # callbacks look up each other by class, and a second copy has other classes
+    raise ImportError(
+        "import r2flow.callbacks, not callbacks: the folder is part of the package r2flow."
+    )
 
 # In the order of execution.
 CALLBACKS: Registry[type[Callback]] = Registry(
@@ -57,13 +61,18 @@ def build_callbacks(options: Mapping[str, Any]) -> list[Callback]:
     for name in wanted:
         CALLBACKS[name]  # refuses an unknown name
     if {"ema", "half_life_ema"} <= wanted.keys():
-        raise InputError("a run keeps one average of its weights, found callbacks.ema and half_life_ema: null one.")
+        raise InputError(
+            "a run keeps one average of its weights, found callbacks.ema and half_life_ema: null "
+            "one."
+        )
     built: list[Callback] = []
     for name in CALLBACKS:
         if name in wanted:
             callback = construct(f"callbacks.{name}", CALLBACKS[name], wanted[name])
             if not isinstance(callback, Callback):
-                raise InputError(f"callbacks.{name} must make a Lightning callback, found {callback!r}.")
+                raise InputError(
+                    f"callbacks.{name} must make a Lightning callback, found {callback!r}."
+                )
             built.append(callback)
     # It saves the state of all others, plug-ins' too.
     return sorted(built, key=lambda callback: isinstance(callback, Stopping))

@@ -16,10 +16,15 @@ from r2flow.registry import Count
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes Lightning's checkpoints to a temporary file, flushed to disk before it replaces the old checkpoint."""
+    """Writes Lightning's checkpoints to a temporary file, flushed to disk before it replaces the
+    old checkpoint.
+    """
 
     def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
+        self,
+        checkpoint: dict[str, Any],
+        path: str | os.PathLike[str],
+        storage_options: Any | None = None,
     ) -> None:
         try:
             with atomic_write(Path(path)) as file:
@@ -29,17 +34,27 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             cause = error.__context__ if isinstance(error, RuntimeError) else error
             if not isinstance(cause, OSError):
                 raise
-            kept = "The earlier checkpoints are intact; fix" if any(Path(path).parent.glob("step-*.ckpt")) else "Fix"
+            kept = (
+                "The earlier checkpoints are intact; fix"
+                if any(Path(path).parent.glob("step-*.ckpt"))
+                else "Fix"
+            )
             raise InputError(
-                f"{path} cannot be written: {cause.strerror or cause}. {kept} this and give the same command again."
+                f"{path} cannot be written: {cause.strerror or cause}. {kept} this and give the "
+                "same command again."
             ) from None
 
-    def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None) -> dict[str, Any]:
+    def load_checkpoint(
+        self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None
+    ) -> dict[str, Any]:
         # On the CPU, as in Lightning, so that a run can resume without the GPU that it started on.
         checkpoint = read_checkpoint(path, map_location or "cpu")
-        # Lightning's timer would resume with its time used up; trainer.max_time applies to each command.
+        # Lightning's timer would resume with its time used up; trainer.max_time applies to each
+        # command.
         states = checkpoint.get("callbacks") or {}
-        checkpoint["callbacks"] = {name: state for name, state in states.items() if not name.startswith("Timer")}
+        checkpoint["callbacks"] = {
+            name: state for name, state in states.items() if not name.startswith("Timer")
+        }
         return checkpoint
 
 
@@ -56,7 +71,12 @@ class Checkpoints(Checkpoint):
         self._stop = False
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         stop = self._stop or trainer.should_stop  # after a whole step: no run can resume within one

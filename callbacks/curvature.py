@@ -11,10 +11,12 @@ from .periodic import Periodic, seed_of
 
 
 class Curvature(Periodic):
-    """Logs int s(t) dt (paper, eq. 6) of a few scans from fixed noise; of flows alone, and not of distilled ones.
+    """Logs int s(t) dt (paper, eq. 6) of a few scans from fixed noise; of flows alone, and not of
+    distilled ones.
 
-    The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/bend`: an untrained flow
-    is straight because its paths have almost no length. `r2flow report curvature` writes s(t) itself.
+    The metrics are `curvature/s` and, divided by the squared length of the path, `curvature/bend`:
+    an untrained flow is straight because its paths have almost no length. `r2flow report curvature`
+    writes s(t) itself.
 
     Args:
         every: Steps between two measurements; 0 for none.
@@ -31,8 +33,15 @@ class Curvature(Periodic):
         flow = pl_module.generator
         if not isinstance(flow, Flow) or not flow.unconditional or flow.fixed:
             return
-        x_0 = Draws(seed_of(pl_module), range(self.num)).start(flow.noise_shape).to(pl_module.device)
+        x_0 = (
+            Draws(seed_of(pl_module), range(self.num)).start(flow.noise_shape).to(pl_module.device)
+        )
         result = straightness(flow.velocity, x_0, self.steps)
-        values = {"curvature/s": result.s.mean().item(), "curvature/bend": result.s_normalised.mean().item()}
+        values = {
+            "curvature/s": result.s.mean().item(),
+            "curvature/bend": result.s_normalised.mean().item(),
+        }
         for logger in trainer.loggers:
-            logger.log_metrics(values, trainer.global_step - 1)  # the index of the step, as Lightning logs
+            logger.log_metrics(
+                values, trainer.global_step - 1
+            )  # the index of the step, as Lightning logs

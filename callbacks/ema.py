@@ -12,7 +12,9 @@ from r2flow.registry import Count, Natural, Portion, Positive, Registry
 
 
 def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
-    """min(highest, 1 - (1 + n)^(-power)) with n the steps after the warm-up; 0, a copy, during the warm-up."""
+    """min(highest, 1 - (1 + n)^(-power)) with n the steps after the warm-up; 0, a copy, during the
+    warm-up.
+    """
     n = step - warmup
     return 0.0 if n <= 0 else min(highest, 1 - (1 + n) ** -power)
 
@@ -23,7 +25,9 @@ def constant_decay(step: int, warmup: int, highest: float) -> float:
 
 
 def ratio_decay(step: int, warmup: int, highest: float) -> float:
-    """min(highest, (1 + n) / (10 + n)) with n the steps after the warm-up, from 1; 0 during the warm-up (LiDM)."""
+    """min(highest, (1 + n) / (10 + n)) with n the steps after the warm-up, from 1; 0 during the
+    warm-up (LiDM).
+    """
     n = step + 1 - warmup
     return 0.0 if n <= 0 else min(highest, (1 + n) / (10 + n))
 
@@ -36,20 +40,26 @@ DECAYS: Registry[Callable[[int, int, float], float]] = Registry(
 class EMA(WeightAveraging):
     """Exponential moving average of the weights, for validation, pictures and checkpoints.
 
-    Every `every` steps: average <- decay average + (1 - decay) weights. A run that ends before the first update after
-    the warm-up keeps its raw weights as the average.
+    Every `every` steps: average <- decay average + (1 - decay) weights. A run that ends before the
+    first update after the warm-up keeps its raw weights as the average.
 
     Args:
         decay: Highest decay.
         rule: Decay schedule, a name in `DECAYS`; `ratio` and `constant` are meant for every=1.
         every: Steps between two updates.
-        warmup_steps: Steps during which the average copies the weights; None: the stage's learning-rate warm-up.
+        warmup_steps: Steps during which the average copies the weights; None: the stage's
+            learning-rate warm-up.
     """
 
     def __init__(
-        self, decay: Portion = 0.995, every: Count = 10, warmup_steps: Natural | None = None, rule: str = "power"
+        self,
+        decay: Portion = 0.995,
+        every: Count = 10,
+        warmup_steps: Natural | None = None,
+        rule: str = "power",
     ) -> None:
-        # Buffers are not averaged: most are constants (ray angles, frequencies), the others counters.
+        # Buffers are not averaged: most are constants (ray angles, frequencies), the others
+        # counters.
         super().__init__(use_buffers=False, avg_fn=self._average)
         self.decay = decay
         self.every = every
@@ -61,7 +71,9 @@ class EMA(WeightAveraging):
 
     def _decay(self) -> float:
         """Decay after step `_step`, counted from 0."""
-        return 0.0 if self._copies else self._decay_at(self._step, self.warmup_steps or 0, self.decay)
+        return (
+            0.0 if self._copies else self._decay_at(self._step, self.warmup_steps or 0, self.decay)
+        )
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
         return average.lerp(weight, 1 - self._decay())
@@ -76,10 +88,14 @@ class EMA(WeightAveraging):
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         self._device = trainer.strategy.root_device  # the module moves there later
-        trainer.precision_plugin.convert_module(pl_module)  # as the strategy does later: the average has its type
+        trainer.precision_plugin.convert_module(
+            pl_module
+        )  # as the strategy does later: the average has its type
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
-            self._average_model.n_averaged.fill_(1)  # at 0 the base class copies the weights, whatever the rule
+            self._average_model.n_averaged.fill_(
+                1
+            )  # at 0 the base class copies the weights, whatever the rule
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._end = trainer.estimated_stepping_batches - 1
@@ -89,18 +105,20 @@ class EMA(WeightAveraging):
 
 
 def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:
-    """Decay of the generator's average after step 1, 2, ...: 2^(-B / h), h = min(half_life, rampup B step).
+    """Decay of the generator's average after step 1, 2, ...: 2^(-B / h), h = min(half_life, rampup
+    B step).
 
-    Half of the average is from the last h images. h grows with the images seen, so that the average is not that of an
-    untrained generator; the first step all but copies the weights (Karras et al. 2020, StyleGAN2-ADA, appendix B).
+    Half of the average is from the last h images. h grows with the images seen, so that the average
+    is not that of an untrained generator; the first step all but copies the weights (Karras et al.
+    2020, StyleGAN2-ADA, appendix B).
     """
     images = min(half_life, rampup * batch_size * step)
     return 0.5 ** (batch_size / images) if images > 0 else 0.0
 
 
 class HalfLifeEMA(EMA):
-    """EMA of a GAN's generator, updated every step: its half-life is `half_life` images, or a share `rampup` of the
-    images seen so far if that is less (`half_life_decay`).
+    """EMA of a GAN's generator, updated every step: its half-life is `half_life` images, or a share
+    `rampup` of the images seen so far if that is less (`half_life_decay`).
 
     Args:
         half_life: Half-life in images.
@@ -122,7 +140,9 @@ class HalfLifeEMA(EMA):
 
 @contextmanager
 def averaged_weights(trainer: L.Trainer, pl_module: L.LightningModule) -> Iterator[None]:
-    """Context with the averaged weights in the module, if the run has an `EMA`; else with the raw weights."""
+    """Context with the averaged weights in the module, if the run has an `EMA`; else with the raw
+    weights.
+    """
     averages = [c for c in trainer.callbacks if isinstance(c, EMA)]  # type: ignore[attr-defined]
     for average in averages:
         average.on_validation_epoch_start(trainer, pl_module)

@@ -1,4 +1,6 @@
-"""Guard against NaN: skips steps with a non-finite loss or gradient, and stops the run after too many."""
+"""Guard against NaN: skips steps with a non-finite loss or gradient, and stops the run after too
+many.
+"""
 
 import logging
 from collections.abc import Iterable
@@ -21,10 +23,11 @@ log = logging.getLogger(__name__)
 class Guard(L.Callback):
     """Skips steps with a non-finite loss or gradient, and stops the run after too many of them.
 
-    A skipped step changes neither weights nor AdamW's averages; learning rate and data advance. The decision uses the
-    gradients shared by all devices, so that all devices decide alike. With 16-mixed, overflowing gradients adjust the
-    loss scale: such steps are skipped too, but only count as an error if the scale falls below `lowest_scale` or
-    `skips` steps are skipped in a row.
+    A skipped step changes neither weights nor AdamW's averages; learning rate and data advance. The
+    decision uses the gradients shared by all devices, so that all devices decide alike. With
+    16-mixed, overflowing gradients adjust the
+    loss scale: such steps are skipped too, but only count as an error if the scale falls below
+    `lowest_scale` or `skips` steps are skipped in a row.
 
     In a stage with several optimisers, only the optimiser with non-finite gradients skips its step.
 
@@ -47,14 +50,19 @@ class Guard(L.Callback):
         self._losses: list[Tensor] = []
         self._found: list[bool] = []  # whether the gradients are finite, per optimiser in this step
 
-    def on_before_backward(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: Tensor) -> None:
+    def on_before_backward(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, loss: Tensor
+    ) -> None:
         value = loss.detach()
         self._losses.append(value)
-        # A loss can overflow while its gradient is finite, and on one device only. x - x is 0 or NaN: adding it makes
-        # every gradient NaN in that case, and the sum over devices distributes it to all of them.
+        # A loss can overflow while its gradient is finite, and on one device only. x - x is 0 or
+        # NaN: adding it makes every gradient NaN in that case, and the sum over devices distributes
+        # it to all of them.
         loss.register_hook(lambda gradient: gradient + (value - value))
 
-    def on_before_optimizer_step(self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Any) -> None:
+    def on_before_optimizer_step(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Any
+    ) -> None:
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         gradients = [p.grad for p in parameters if p.grad is not None]
         finite = bool(torch.isfinite(get_total_norm(gradients)))  # the only device synchronisation
@@ -65,7 +73,12 @@ class Guard(L.Callback):
         self._found.append(finite)
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: object, batch: object, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: object,
+        batch: object,
+        batch_idx: int,
     ) -> None:
         if self._found:  # else the batch was accumulated
             self.in_a_row = 0 if all(self._found) else self.in_a_row
@@ -76,19 +89,28 @@ class Guard(L.Callback):
         """Count a skipped step, once for all optimisers, and stop the run after too many."""
         scaler = getattr(trainer.precision_plugin, "scaler", None)
         scale = None if scaler is None else float(scaler.get_scale())
-        loss = float(trainer.strategy.reduce(torch.stack(self._losses).sum(), reduce_op="mean")) / (scale or 1.0)
+        loss = float(trainer.strategy.reduce(torch.stack(self._losses).sum(), reduce_op="mean")) / (
+            scale or 1.0
+        )
         overflow = scale is not None and loss - loss == 0
         self.in_a_row += first
         self.total += first and not overflow
         if self.in_a_row >= self.skips or (scale is not None and scale < self.lowest_scale):
             what = f"{self.in_a_row} steps in a row were" if self.in_a_row > 1 else "the step was"
-            scaled = f"loss scale {scale:g}" if scale is not None else f"no loss scale in {trainer.precision}"
+            scaled = (
+                f"loss scale {scale:g}"
+                if scale is not None
+                else f"no loss scale in {trainer.precision}"
+            )
             hint = "" if trainer.precision == "32-true" else "try trainer.precision=32-true; "
             self._end(
                 trainer,
-                f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss or gradient, "
-                f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; {scaled}; "
-                f"{describe_batch(trainer)}. {last_good(trainer)} Look at these scans; {hint}try, in a run of another "
+                f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss "
+                "or gradient, "
+                f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; "
+                f"{scaled}; "
+                f"{describe_batch(trainer)}. {last_good(trainer)} Look at these scans; {hint}try, "
+                "in a run of another "
                 "name, a lower stage.learning_rate.",
             )
         if trainer.is_global_zero and not overflow:
@@ -98,16 +120,24 @@ class Guard(L.Callback):
                 trainer.global_step + 1, what, self.in_a_row, self.skips,
             )  # fmt: skip
 
-    def on_save_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
         learned = [name for name, _ in pl_module.named_parameters()]
         for key in ("current_model_state", "state_dict"):
             state = checkpoint.get(key, {})
             if broken := _not_finite((name, state[name]) for name in learned if name in state):
-                what = "averaged weights" if key == "state_dict" and "current_model_state" in checkpoint else "weights"
+                what = (
+                    "averaged weights"
+                    if key == "state_dict" and "current_model_state" in checkpoint
+                    else "weights"
+                )
                 self._end(
                     trainer,
-                    f"stopped at step {trainer.global_step}: the {what} are no longer finite ({broken[0]} first, "
-                    f"{len(broken)} of {len(learned)}), so no checkpoint was written. {last_good(trainer)} "
+                    f"stopped at step {trainer.global_step}: the {what} are no longer finite "
+                    f"({broken[0]} first, "
+                    f"{len(broken)} of {len(learned)}), so no checkpoint was written. "
+                    f"{last_good(trainer)} "
                     "Start under another name with a lower stage.learning_rate.",
                 )
 
@@ -135,17 +165,25 @@ def describe_gradients(module: torch.nn.Module) -> str:
     """Describe the first parameter, in the module's order, with a non-finite gradient."""
     named = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
     broken = _not_finite(named)
-    return f"gradient of {broken[0]} non-finite first, {len(broken)} of {len(named)}" if broken else "gradients finite"
+    return (
+        f"gradient of {broken[0]} non-finite first, {len(broken)} of {len(named)}"
+        if broken
+        else "gradients finite"
+    )
 
 
 def describe_batch(trainer: L.Trainer) -> str:
-    """Describe the images and scans of the current step, on all devices and in all accumulated batches."""
+    """Describe the images and scans of the current step, on all devices and in all accumulated
+    batches.
+    """
     sampler = getattr(trainer.train_dataloader, "sampler", None)
     size = getattr(trainer.datamodule, "batch_size", None)  # type: ignore[attr-defined]
     if not isinstance(sampler, RunSampler) or size is None:
         return "images unknown to the loader"
     images = range(trainer.global_step * size, (trainer.global_step + 1) * size)
-    scans = ", ".join(str(sampler.order[k]) for k in images[:16]) + (", ..." if len(images) > 16 else "")
+    scans = ", ".join(str(sampler.order[k]) for k in images[:16]) + (
+        ", ..." if len(images) > 16 else ""
+    )
     return f"images k = {images[0]} to {images[-1]}, scans {scans}"
 
 

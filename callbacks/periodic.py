@@ -16,7 +16,8 @@ from .loggers import log_picture
 
 
 class Periodic(L.Callback, ABC):
-    """Calls `act` every `every` steps and at the end, in the first process, with averaged weights in eval mode.
+    """Calls `act` every `every` steps and at the end, in the first process, with averaged weights
+    in eval mode.
 
     Args:
         every: Steps between two calls; 0 for none.
@@ -34,7 +35,12 @@ class Periodic(L.Callback, ABC):
         self._last = trainer.global_step  # a resumed run has already acted at this step
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: object, batch: object, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: object,
+        batch: object,
+        batch_idx: int,
     ) -> None:
         step = trainer.global_step
         last = step == trainer.estimated_stepping_batches
@@ -46,7 +52,9 @@ class Periodic(L.Callback, ABC):
             self._act_once(trainer, pl_module)
 
     def _act_once(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Act at this step, unless it was done: with gradient accumulation a step spans several batches."""
+        """Act at this step, unless it was done: with gradient accumulation a step spans several
+        batches.
+        """
         if not trainer.is_global_zero or trainer.global_step in (0, self._last):
             return
         self._last = trainer.global_step
@@ -94,6 +102,8 @@ class SamplePictures(Periodic):
         if path.exists() or not generator.unconditional:
             return
         drawn = draw(generator, range(self.num), seed_of(pl_module), self.sampler(generator))
-        figure = contact_sheet(list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"])
+        figure = contact_sheet(
+            list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"]
+        )
         save_figure(figure, path)
         log_picture(trainer.loggers, "samples", figure_pixels(figure), step)

@@ -11,7 +11,9 @@ from r2flow.registry import NonNegative
 
 
 class Progress(ProgressBar):
-    """A bar of steps with losses and scans per second; a line every `seconds` if standard error is not a terminal."""
+    """A bar of steps with losses and scans per second; a line every `seconds` if standard error is
+    not a terminal.
+    """
 
     def __init__(self, seconds: NonNegative = 15.0) -> None:
         super().__init__()
@@ -27,7 +29,9 @@ class Progress(ProgressBar):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         steps = trainer.estimated_stepping_batches
         self._total = int(steps) if steps < float("inf") else 0
-        self._bar = Bar("training", self._total, "steps", None if self.is_enabled else False, every=self.seconds)
+        self._bar = Bar(
+            "training", self._total, "steps", None if self.is_enabled else False, every=self.seconds
+        )
         self._bar.live.transient = False
         self._bar.start()
         self._bar.set(trainer.global_step)
@@ -42,8 +46,11 @@ class Progress(ProgressBar):
         if now - self._noted >= min(self.seconds, 1):  # reading a loss waits for the GPU
             self._noted, shown = now, trainer.progress_bar_metrics  # logged with prog_bar=True
             losses = [f"{key.removeprefix('train/')} {value:.4f}" for key, value in shown.items()]
-            rate = (self._bar.tasks[0].speed or 0.0) * int(getattr(trainer.datamodule, "batch_size", 1))  # type: ignore[attr-defined]
-            fits = self._bar.disable or self._bar.console.width >= 100  # else the time left would be cut
+            data = getattr(trainer, "datamodule", None)
+            rate = (self._bar.tasks[0].speed or 0.0) * int(getattr(data, "batch_size", 1))
+            fits = (
+                self._bar.disable or self._bar.console.width >= 100
+            )  # else the time left would be cut
             note = "  ".join([*losses, *[f"{rate:.1f} scans/s"] * bool(fits and rate)])
         self._bar.set(trainer.global_step, note)
 

@@ -20,10 +20,17 @@ class ReflowPairs(L.Callback):
         if not isinstance(data, ScanDataModule) or data.pairs is None:
             return
         if data.pairs.of is None and not pl_module.hparams.get("parent"):
-            raise InputError("pairs are drawn by a trained flow: give the stage a parent, or pairs={'of': RUN}.")
-        record = find_parent(data.pairs.of).record() if data.pairs.of else pl_module.hparams["parent"]
+            raise InputError(
+                "pairs are drawn by a trained flow: give the stage a parent, or pairs={'of': RUN}."
+            )
+        record = (
+            find_parent(data.pairs.of).record() if data.pairs.of else pl_module.hparams["parent"]
+        )
         data.drawn_by(record)
         store = data.pair_store
         if store.missing_pairs():
-            # File locks, not a barrier: collective calls time out after half an hour, and a slow rank may take longer.
-            make_pairs(store, load_checkpoint(record["path"]).generator.to(trainer.strategy.root_device))
+            # File locks, not a barrier: collective calls time out after half an hour, and a slow
+            # rank may take longer.
+            make_pairs(
+                store, load_checkpoint(record["path"]).generator.to(trainer.strategy.root_device)
+            )

@@ -17,7 +17,15 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count
-from r2flow.signals import LATER, STOPPING, Stopped, code_of, handling_signals, install_handlers, wait_for_launcher
+from r2flow.signals import (
+    LATER,
+    STOPPING,
+    Stopped,
+    code_of,
+    handling_signals,
+    install_handlers,
+    wait_for_launcher,
+)
 
 from .checkpoints import Checkpoints
 
@@ -25,17 +33,21 @@ log = logging.getLogger(__name__)
 
 
 class Stopping(L.Callback):
-    """On SIGTERM, SIGHUP, Ctrl-C and, in a SLURM job, SIGUSR1: writes a checkpoint after the step and raises `Stopped`.
+    """On SIGTERM, SIGHUP, Ctrl-C and, in a SLURM job, SIGUSR1: writes a checkpoint after the step
+    and raises `Stopped`.
 
-    SLURM sends SIGUSR1 before a time limit: the job is requeued by `scontrol requeue`. Until training starts, a run
-    stops at once without a checkpoint; on several machines it ends, since Python hears nothing while it waits for them.
+    SLURM sends SIGUSR1 before a time limit: the job is requeued by `scontrol requeue`. Until
+    training starts, a run stops at once without a checkpoint; on several machines it ends, since
+    Python hears nothing while it waits for them.
 
-    Lightning's handlers exit with code 0, or save from within the signal handler, in the middle of a step, to a file
-    that a resumed run ignores; they are therefore replaced when training starts. A validation due at the step of the
+    Lightning's handlers exit with code 0, or save from within the signal handler, in the middle of
+    a step, to a file that a resumed run ignores; they are therefore replaced when training starts.
+    A validation due at the step of the
     stop is skipped: the curves lack a point, the weights are the same.
 
     Args:
-        every: Steps between two checks whether any device received a signal; a single device checks every step.
+        every: Steps between two checks whether any device received a signal; a single device checks
+            every step.
     """
 
     def __init__(self, every: Count = 10) -> None:
@@ -57,7 +69,9 @@ class Stopping(L.Callback):
             try:
                 yield
             except Exception:
-                if self.received is None:  # other errors, as of a killed worker, follow from the signal
+                if (
+                    self.received is None
+                ):  # other errors, as of a killed worker, follow from the signal
                     raise
             if self.received is not None:
                 self._leave("stopped")
@@ -77,7 +91,12 @@ class Stopping(L.Callback):
             install_handlers(self.on_signal, self.signals)
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         if (batch_idx + 1) % trainer.accumulate_grad_batches:
             return
@@ -90,11 +109,18 @@ class Stopping(L.Callback):
                 if trainer.strategy.reduce_boolean_decision(self.received == number, all=False):
                     self.received = number
         if stopped and trainer.global_step < trainer.estimated_stepping_batches:
-            if trainer.checkpoint_callbacks:  # a plug-in's own callback does not save where the run stops
-                ours = (callback for callback in trainer.checkpoint_callbacks if isinstance(callback, Checkpoints))
+            if (
+                trainer.checkpoint_callbacks
+            ):  # a plug-in's own callback does not save where the run stops
+                ours = (
+                    callback
+                    for callback in trainer.checkpoint_callbacks
+                    if isinstance(callback, Checkpoints)
+                )
                 next(ours, Checkpoints(keep=sys.maxsize)).save(trainer)
             self._training = False
-            trainer._logger_connector.update_train_step_metrics()  # as Lightning does after the callbacks
+            # as Lightning does after the callbacks
+            trainer._logger_connector.update_train_step_metrics()
             environment = getattr(trainer.strategy, "cluster_environment", None)
             if not trainer.is_global_zero and isinstance(environment, LightningEnvironment):
                 wait_for_launcher()
@@ -103,7 +129,9 @@ class Stopping(L.Callback):
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._training = False
 
-    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
         self._training = False
 
     def _leave(self, where: str) -> None:
@@ -116,10 +144,18 @@ class Stopping(L.Callback):
                 try:
                     subprocess.run(["scontrol", "requeue", str(self.job)], check=True)
                 except (OSError, subprocess.CalledProcessError) as error:
-                    refused = f"error: {where}, but SLURM did not take job {self.job} back ({error})"
-                    raise Stopped(2, f"{refused}. Submit the same script again.") from None  # `handling_signals` passes it on
+                    refused = (
+                        f"error: {where}, but SLURM did not take job {self.job} back ({error})"
+                    )
+                    raise Stopped(
+                        2, f"{refused}. Submit the same script again."
+                    ) from None  # `handling_signals` passes it on
         has_checkpoint = bool(checkpoints_of(self.run_dir))
-        consequence = "resumes from the last checkpoint" if has_checkpoint else "starts it again: no checkpoint yet"
+        consequence = (
+            "resumes from the last checkpoint"
+            if has_checkpoint
+            else "starts it again: no checkpoint yet"
+        )
         raise Stopped(code, f"{where}; the same command {consequence}" if first else "") from None
 
 

@@ -30,7 +30,8 @@ _PLACES = {
     "BACKBONES": "r2flow.backbones",
     "ScanDataModule": "r2flow.data.datamodule",
     **dict.fromkeys(
-        ("STAGES", "Distill", "LearnFlowMap", "Rectify", "Reflow", "Stage", "Transfer"), "r2flow.stages"
+        ("STAGES", "Distill", "LearnFlowMap", "Rectify", "Reflow", "Stage", "Transfer"),
+        "r2flow.stages",
     ),
 }
 
@@ -61,7 +62,8 @@ def __dir__() -> list[str]:
 
 
 def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoint":
-    """Load a trained generator: a model by name (see `r2flow info`), a run folder or a checkpoint file.
+    """Load a trained generator: a model by name (see `r2flow info`), a run folder or a checkpoint
+    file.
 
     Args:
         device: cpu, cuda, cuda:1, ..., or auto: a GPU if available.
@@ -81,15 +83,18 @@ def read(
     reflectance_scale: float | None = None,
     columns: "Sequence[str] | None" = None,
 ) -> "torch.Tensor":
-    """Read a scan from a file: range in metres and reflectance, (2, H, W) float32, 0 for rays without a return.
+    """Read a scan from a file: range in metres and reflectance, (2, H, W) float32, 0 for rays
+    without a return.
 
     Args:
         path: A scan file, or a range image (.npy).
-        sensor: Sensor of the image, or its name or YAML file. Default: the sensor in the manifest of a folder that
-            r2flow wrote, else the built-in sensor with the file's beams, else hdl64e.
-        reflectance_scale: Value of full reflectance in the file. Default: the sensor's, else the first of 1, 100 (with
-            a warning), 255, 256, 65535 that no value exceeds or, with a warning, about the largest value if that is
-            below a tenth of it. Fractions of 1 are not divided by 100, 255, 256 or 65535.
+        sensor: Sensor of the image, or its name or YAML file. Default: the sensor in the manifest
+            of a folder that r2flow wrote, else the built-in sensor with the file's beams, else
+            hdl64e.
+        reflectance_scale: Value of full reflectance in the file. Default: the sensor's, else the
+            first of 1, 100 (with a warning), 255, 256, 65535 that no value exceeds or, with a
+            warning, about the largest value if that is below a tenth of it. Fractions of 1 are not
+            divided by 100, 255, 256 or 65535.
         columns: Names of the columns of a file without names, as ("x", "y", "z", "intensity", "_").
 
     Raises:

@@ -1,7 +1,8 @@
-"""Rules of config keys: whether a key may change on resume, and which links of a chain it applies to.
+"""Rules of config keys: whether a key may change on resume, and which links of a chain it applies
+to.
 
-Constructors document and type the keys; defaults are in `conf/`. A key without an entry in `RULES` follows its
-innermost group with one, else the defaults of `Key`.
+Constructors document and type the keys; defaults are in `conf/`. A key without an entry in `RULES`
+follows its innermost group with one, else the defaults of `Key`.
 """
 
 import json
@@ -17,9 +18,12 @@ from typing import Any, Literal
 class Key:
     """Rule of a config key."""
 
-    resume: Literal["fixed", "free"] = "fixed"  #: `free`: may differ on resume, since it does not affect the result
-    #: Links of a chain that take the key from the chain's command line: `all`, those that read `scans` (others inherit
-    #: from them), those trained on `pairs`, or none, for keys of the `chain`.
+    resume: Literal["fixed", "free"] = (
+        "fixed"  #: `free`: may differ on resume, since it does not affect the result
+    )
+    #: Links of a chain that take the key from the chain's command line: `all`, those that read
+    #: `scans` (others inherit from them), those trained on `pairs`, or none, for keys of the
+    #: `chain`.
     links: Literal["all", "scans", "pairs", "chain"] = "all"
 
 
@@ -29,11 +33,18 @@ OF_SCANS = Key(links="scans")
 OF_PAIRS = Key(links="pairs")
 
 RULES: dict[str, Key] = {
-    **dict.fromkeys(("experiment", "size", "hydra", "name", "run_dir", "chain", "preview"), OF_THE_CHAIN),
+    **dict.fromkeys(
+        ("experiment", "size", "hydra", "name", "run_dir", "chain", "preview"), OF_THE_CHAIN
+    ),
     **dict.fromkeys(("plugins", "loggers", "samples", "sampler", "few"), FREE),
     **dict.fromkeys(("stage.parent.path", "stage.parent.pairs"), FREE),
-    **dict.fromkeys(("sensor", "encoding", "generator", "backbone", "data", "data.validation.data"), OF_SCANS),
-    **dict.fromkeys(("data.root", "data.parts.*.root", "data.validation.data.root"), replace(OF_SCANS, resume="free")),
+    **dict.fromkeys(
+        ("sensor", "encoding", "generator", "backbone", "data", "data.validation.data"), OF_SCANS
+    ),
+    **dict.fromkeys(
+        ("data.root", "data.parts.*.root", "data.validation.data.root"),
+        replace(OF_SCANS, resume="free"),
+    ),
     **dict.fromkeys(("data.validation", "data.batch_size"), Key()),
     **dict.fromkeys(("data.workers", "data.memory_gib"), FREE),
     **dict.fromkeys(("data.pairs", "data.scans"), OF_PAIRS),
@@ -41,10 +52,25 @@ RULES: dict[str, Key] = {
     **dict.fromkeys(("data.pairs.of", "data.scans.root"), replace(OF_PAIRS, resume="free")),
     **dict.fromkeys(
         (
-            *("callbacks.reflow_pairs", "callbacks.pictures", "callbacks.curvature", "callbacks.guard"),
+            *(
+                "callbacks.reflow_pairs",
+                "callbacks.pictures",
+                "callbacks.curvature",
+                "callbacks.guard",
+            ),
             *("callbacks.requeue", "callbacks.checkpoint", "callbacks.progress"),
-            *("trainer.accelerator", "trainer.strategy", "trainer.devices", "trainer.num_nodes", "trainer.precision"),
-            *("trainer.default_root_dir", "trainer.enable_progress_bar", "trainer.log_every_n_steps"),
+            *(
+                "trainer.accelerator",
+                "trainer.strategy",
+                "trainer.devices",
+                "trainer.num_nodes",
+                "trainer.precision",
+            ),
+            *(
+                "trainer.default_root_dir",
+                "trainer.enable_progress_bar",
+                "trainer.log_every_n_steps",
+            ),
             *("trainer.max_time", "trainer.profiler", "trainer.val_check_interval"),
         ),
         FREE,
@@ -67,7 +93,11 @@ def key_of(override: str) -> str:
 def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """('a.b', value) for every leaf of a nested mapping; groups in a list are numbered, 'a.0.b'."""
     for key, value in config.items():
-        if isinstance(value, Sequence) and value and all(isinstance(group, Mapping) for group in value):
+        if (
+            isinstance(value, Sequence)
+            and value
+            and all(isinstance(group, Mapping) for group in value)
+        ):
             value = dict(enumerate(value))
         if isinstance(value, Mapping):
             yield from flatten(value, f"{prefix}{key}.")
@@ -79,11 +109,17 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str
     """Keys whose values differ between two configs, with a text of both values."""
     before, now = dict(flatten(old)), dict(flatten(new))
     keys = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-    return {key: f"{key}={_brief(before.get(key))} there, {_brief(now.get(key))} here" for key in keys}
+    return {
+        key: f"{key}={_brief(before.get(key))} there, {_brief(now.get(key))} here" for key in keys
+    }
 
 
 def _brief(value: Any) -> str:
-    return f"a list of {len(value)}" if isinstance(value, list | tuple) and len(value) > 6 else str(value)
+    return (
+        f"a list of {len(value)}"
+        if isinstance(value, list | tuple) and len(value) > 6
+        else str(value)
+    )
 
 
 def at_most_three(texts: Sequence[str]) -> str:
@@ -92,7 +128,9 @@ def at_most_three(texts: Sequence[str]) -> str:
 
 
 def check_tree(config: Mapping[str, Any]) -> None:
-    """Raise an error for a config that contains itself, as YAML and pickles can, or whose groups are not groups."""
+    """Raise an error for a config that contains itself, as YAML and pickles can, or whose groups
+    are not groups.
+    """
     json.dumps(config, skipkeys=True, default=str)
     for key in ("stage", "data", "trainer"):
         if not isinstance(config.get(key) or {}, Mapping):
@@ -107,8 +145,16 @@ def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
             if inner := learned(value, f"{prefix}{key}."):
                 fixed[key] = inner
         elif rule(f"{prefix}{key}").resume == "fixed":
-            groups = isinstance(value, Sequence) and value and all(isinstance(group, Mapping) for group in value)
-            fixed[key] = [learned(group, f"{prefix}{key}.{n}.") for n, group in enumerate(value)] if groups else value
+            groups = (
+                isinstance(value, Sequence)
+                and value
+                and all(isinstance(group, Mapping) for group in value)
+            )
+            fixed[key] = (
+                [learned(group, f"{prefix}{key}.{n}.") for n, group in enumerate(value)]
+                if groups
+                else value
+            )
     return fixed
 
 
@@ -118,8 +164,12 @@ def override(key: str, value: Any) -> str:
         return f"{key}=[{','.join(override('', item)[1:] for item in value)}]"
     if value is None or isinstance(value, bool):
         return f"{key}={json.dumps(value)}"
-    if isinstance(value, str) and not re.fullmatch(r"(?!(?i:null|true|false|inf|nan)$)[a-zA-Z][\w-]*", value, re.A):
-        value = "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value) + "'"
+    if isinstance(value, str) and not re.fullmatch(
+        r"(?!(?i:null|true|false|inf|nan)$)[a-zA-Z][\w-]*", value, re.A
+    ):
+        value = (
+            "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value) + "'"
+        )
     return f"{key}={value}"
 
 

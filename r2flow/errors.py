@@ -20,8 +20,8 @@ IN_MEMORY = "points in memory"  # the name of points without a file
 class InputError(ValueError):
     """Unusable input of the user.
 
-    The message is one line: what was wrong, what was found, what to do. The command line prints it without a traceback
-    and exits with 2; any other exception is a bug and keeps its traceback.
+    The message is one line: what was wrong, what was found, what to do. The command line prints it
+    without a traceback and exits with 2; any other exception is a bug and keeps its traceback.
     """
 
 
@@ -34,17 +34,25 @@ def check(holds: object, message: str) -> None:
 def require(what: str, extra: str, *packages: str) -> None:
     """Raise InputError with the extra to install if a package is missing."""
     for package in packages:
-        check(find_spec(package), f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.")
+        check(
+            find_spec(package),
+            f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.",
+        )
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be written to or created, before any work; with a manifest it may be complete."""
+    """Refuse a folder that cannot be written to or created, before any work; with a manifest it may
+    be complete.
+    """
     there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-    usable = there.is_dir() and ((folder / "manifest.json").is_file() or os.access(there, os.W_OK | os.X_OK))
+    usable = there.is_dir() and (
+        (folder / "manifest.json").is_file() or os.access(there, os.W_OK | os.X_OK)
+    )
     check(usable, f"{there} is not a folder that can be written to; give another one.")
 
 
-# System errors of files, disks and limits, for the user to act on; others (a lost connection) keep their traceback.
+# System errors of files, disks and limits, for the user to act on; others (a lost connection) keep
+# their traceback.
 MENDABLE = {
     errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP, errno.ESTALE, errno.EIO,
@@ -67,7 +75,9 @@ _warned: set[tuple[Path, str]] = set()  # folders and kinds of odd values
 
 
 def warn_odd(path: Path, kind: str, points: int = 0) -> None:
-    """Warn about odd values of a file, once per folder and kind in a process; points in memory count as a folder."""
+    """Warn about odd values of a file, once per folder and kind in a process; points in memory
+    count as a folder.
+    """
     folder, name = path.parent, path
     if folder.name.startswith(IN_MEMORY):  # each scan has a new folder
         folder = name = Path(IN_MEMORY)
@@ -84,12 +94,17 @@ def explain_mistake(error: InputError | OSError) -> str:
             raise error
         if error.errno in (errno.ENOTDIR, errno.EEXIST) and error.filename:
             given = Path(os.fsdecode(error.filename))
-            if file := next((path for path in (given, *given.parents) if path.exists() and not path.is_dir()), None):
+            if file := next(
+                (path for path in (given, *given.parents) if path.exists() and not path.is_dir()),
+                None,
+            ):
                 return one_line(f"{file} is a file, not a folder; give another name.")
         where = f"{error.filename}: " if error.filename else ""
         return one_line(f"{where}{error.strerror or error}")
     text = str(error)
-    if "Traceback (most recent call last)" in text:  # from a loader's worker, with the message at the end
+    if (
+        "Traceback (most recent call last)" in text
+    ):  # from a loader's worker, with the message at the end
         text = text.rpartition("InputError: ")[2]
     return one_line(text) or "unknown"
 
@@ -115,7 +130,9 @@ class PlainFormatter(logging.Formatter):
 class Unbroken(io.FileIO):
     """A file descriptor that can be written to after its reader, terminal or disk room is gone."""
 
-    lost: OSError | None = None  # of standard output, if it was not the end of its reader (`| head`)
+    lost: OSError | None = (
+        None  # of standard output, if it was not the end of its reader (`| head`)
+    )
 
     def write(self, data: Any) -> int:
         try:
@@ -129,7 +146,9 @@ class Unbroken(io.FileIO):
 
 
 def open_streams() -> None:
-    """Make standard output and error accept any file name, outlive their reader, exist in a daemon and have a width."""
+    """Make standard output and error accept any file name, outlive their reader, exist in a daemon
+    and have a width.
+    """
     if os.environ.get("COLUMNS") == "0":  # rich would print nothing
         del os.environ["COLUMNS"]
     for name in ("stdout", "stderr"):
@@ -140,4 +159,8 @@ def open_streams() -> None:
             stream.flush()
             raw = io.BufferedWriter(Unbroken(stream.fileno(), "w", closefd=False))
             lines = name == "stderr" or stream.isatty()
-            setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, "backslashreplace", line_buffering=lines))
+            setattr(
+                sys,
+                name,
+                io.TextIOWrapper(raw, stream.encoding, "backslashreplace", line_buffering=lines),
+            )

@@ -3,8 +3,9 @@
     r2flow train --plugin my.module stage=my_stage
     r2flow sample --plugin ./my_stage.py runs/NAME
 
-Installed packages in the entry-point group `r2flow.plugins` are imported when a registry lacks a name. Configs and
-checkpoints list their plug-ins for information only: r2flow never imports a module because a file names it.
+Installed packages in the entry-point group `r2flow.plugins` are imported when a registry lacks a
+name. Configs and checkpoints list their plug-ins for information only: r2flow never imports a
+module because a file names it.
 """
 
 import argparse
@@ -24,11 +25,15 @@ from r2flow.registry import Registry, UnknownName
 
 GROUP = "r2flow.plugins"
 
-_loaded: dict[str, str] = {}  # names and files of loaded modules, and the names that were given for them
+_loaded: dict[
+    str, str
+] = {}  # names and files of loaded modules, and the names that were given for them
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split a command line into (other arguments, names of plug-ins), for any number of `--plugin NAME`."""
+    """Split a command line into (other arguments, names of plug-ins), for any number of `--plugin
+    NAME`.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--plugin", action="append", default=[])
     try:
@@ -48,9 +53,15 @@ def load_plugins(names: Sequence[str]) -> None:
             file = _import(name)
         except (Exception, SystemExit) as error:  # modules may raise any exception
             message = " ".join(str(error).split()) or "no message"
-            lines = [n for frame, n in walk_tb(error.__traceback__) if frame.f_code.co_filename == _identity(name)]
+            lines = [
+                n
+                for frame, n in walk_tb(error.__traceback__)
+                if frame.f_code.co_filename == _identity(name)
+            ]
             message += f" (line {lines[-1]})" if lines else ""  # the last one of the file itself
-            raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {message}") from None
+            raise InputError(
+                f"the plug-in {name} cannot be imported: {type(error).__name__}: {message}"
+            ) from None
         _loaded.update({_identity(name): name, file: name})
 
 
@@ -61,7 +72,11 @@ def loaded_plugins() -> list[str]:
 
 def plugin_digests() -> list[str]:
     """SHA-256 of the loaded modules' files: stored results depend on a plug-in's code."""
-    return [sha256(Path(file).read_bytes()).hexdigest() for file in sorted(_loaded) if Path(file).is_file()]
+    return [
+        sha256(Path(file).read_bytes()).hexdigest()
+        for file in sorted(_loaded)
+        if Path(file).is_file()
+    ]
 
 
 def _identity(name: str) -> str:
@@ -79,7 +94,9 @@ def _import(name: str) -> str:
             return _identity(spec.origin)
         file = importlib.import_module(name).__file__
         if file is None:
-            raise ImportError("it is a folder without an __init__.py; to name a file, end it in .py")
+            raise ImportError(
+                "it is a folder without an __init__.py; to name a file, end it in .py"
+            )
         return _identity(file)
     path = _identity(name)
     module_name = f"r2flow_plugin_{Path(path).stem}"
@@ -100,7 +117,9 @@ Registry.on_missing.append(load_installed)
 
 @contextmanager
 def made_with(config: Mapping[str, Any], what: str) -> Iterator[None]:
-    """Add the plug-ins that may define an unknown name of a stored config to the error; `what` is its owner."""
+    """Add the plug-ins that may define an unknown name of a stored config to the error; `what` is
+    its owner.
+    """
     try:
         yield
     except UnknownName as error:
@@ -109,4 +128,6 @@ def made_with(config: Mapping[str, Any], what: str) -> Iterator[None]:
             raise
         give = " ".join(f"--plugin {name}" for name in missing)
         message = str(error).rstrip(".")
-        raise UnknownName(f"{message}; {what} was made with the plug-in {', '.join(missing)}: give {give}.") from None
+        raise UnknownName(
+            f"{message}; {what} was made with the plug-in {', '.join(missing)}: give {give}."
+        ) from None

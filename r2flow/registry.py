@@ -1,4 +1,6 @@
-"""Registries of named constructors, and their options, checked by pydantic against the constructors' signatures."""
+"""Registries of named constructors, and their options, checked by pydantic against the
+constructors' signatures.
+"""
 
 import difflib
 import inspect
@@ -33,7 +35,9 @@ strict = with_config(STRICT)  # decorates a dataclass of options: no unknown one
 
 
 def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:
-    """Range of an option, in its annotation: `width: Annotated[int, Bound("odd", lambda n: n % 2)]`."""
+    """Range of an option, in its annotation: `width: Annotated[int, Bound("odd", lambda n: n %
+    2)]`.
+    """
 
     def validate(value: Any) -> Any:
         if not holds(value):
@@ -45,8 +49,12 @@ def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:
 
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
     """' Did you mean ...?' with the closest known name, or an empty string if there is none."""
-    others = [other for other in known if other != name]  # a broken link is there under its own name
-    close = difflib.get_close_matches(name, others, n=1, cutoff=0.6) or [o for o in others if o.startswith(name)]
+    others = [
+        other for other in known if other != name
+    ]  # a broken link is there under its own name
+    close = difflib.get_close_matches(name, others, n=1, cutoff=0.6) or [
+        o for o in others if o.startswith(name)
+    ]
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
@@ -60,20 +68,24 @@ class _Lazy(NamedTuple):
 
 
 def lazy(place: str, *given: Any) -> Any:
-    """A registry entry `module:name` that is imported at its first use; with arguments to begin with, if given."""
+    """A registry entry `module:name` that is imported at its first use; with arguments to begin
+    with, if given.
+    """
     return _Lazy(place, given)
 
 
 class Registry(Mapping[str, T]):
-    """Named values of one kind, and the names of the files in conf/KIND/, which stand for one of them with options.
+    """Named values of one kind, and the names of the files in conf/KIND/, which stand for one of
+    them with options.
 
     BACKBONES = Registry("backbone", hdit=HDiT, adm_unet=ADMUNet)
     BACKBONES["hditt"]
     # no backbone named 'hditt'; known: adm_unet, hdit. Did you mean 'hdit'?
 
     Attributes:
-        on_missing: Functions that may add entries, such as loaders of installed plug-ins. Each is called once per
-            process, when a registry first lacks a name; then the name is looked up again.
+        on_missing: Functions that may add entries, such as loaders of installed plug-ins. Each is
+            called once per process, when a registry first lacks a name; then the name is looked up
+            again.
     """
 
     on_missing: ClassVar[list[Callable[[], None]]] = []
@@ -109,7 +121,9 @@ class Registry(Mapping[str, T]):
         return f"Registry({self.kind}: {', '.join(self)})"
 
     def add(self, name: str, entry: T) -> None:
-        """Add an entry; raises ValueError for a name that is taken, except by a former run of a notebook's cell."""
+        """Add an entry; raises ValueError for a name that is taken, except by a former run of a
+        notebook's cell.
+        """
         modules = {getattr(one, "__module__", "") for one in (self._entries.get(name), entry)}
         if name in self._entries and modules != {"__main__"}:
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
@@ -118,18 +132,33 @@ class Registry(Mapping[str, T]):
     def name_of(self, entry: Any) -> str | None:
         """The name of an entry, or None."""
         place = f"{getattr(entry, '__module__', '')}:{getattr(entry, '__qualname__', '')}"
-        return next((name for name, own in self._entries.items() if own is entry or own == _Lazy(place, ())), None)
+        return next(
+            (
+                name
+                for name, own in self._entries.items()
+                if own is entry or own == _Lazy(place, ())
+            ),
+            None,
+        )
 
     def options(self, given: str | Mapping[str, Any]) -> dict[str, Any]:
-        """Name and options of an entry, from a name, also of a file in conf/, or a mapping with a name and options."""
+        """Name and options of an entry, from a name, also of a file in conf/, or a mapping with a
+        name and options.
+        """
         chosen = {"name": given} if isinstance(given, str) else given
         if not isinstance(chosen, Mapping) or not isinstance(chosen.get("name"), str):
             known = ", ".join(sorted(self))
-            raise InputError(f"a {self.kind} config needs a 'name', found {given!r}; known: {known}.")
+            raise InputError(
+                f"a {self.kind} config needs a 'name', found {given!r}; known: {known}."
+            )
         name = chosen["name"]
         if name in self._entries or name not in presets(self.kind):
             return dict(chosen)
-        return {**chosen, **presets(self.kind)[name], **{key: chosen[key] for key in chosen if key != "name"}}
+        return {
+            **chosen,
+            **presets(self.kind)[name],
+            **{key: chosen[key] for key in chosen if key != "name"},
+        }
 
     def build(self, given: str | Mapping[str, Any], *args: Any) -> Any:
         """Call the entry of `options` with `args` and its options as keywords."""
@@ -141,7 +170,9 @@ class Registry(Mapping[str, T]):
 
 @cache
 def presets(group: str) -> dict[str, dict[str, Any]]:
-    """Options of each file of a folder of conf/, by its name, with those of the files in its `defaults`."""
+    """Options of each file of a folder of conf/, by its name, with those of the files in its
+    `defaults`.
+    """
     folder = files("r2flow") / "conf" / group
     read: dict[str, Any] = {}
     for file in folder.iterdir() if folder.is_dir() else ():
@@ -152,7 +183,9 @@ def presets(group: str) -> dict[str, dict[str, Any]]:
     def merged(name: str) -> dict[str, Any]:
         options = dict(read[name])
         bases = [base for base in options.pop("defaults", ()) if base in read]
-        return {key: value for part in (*map(merged, bases), options) for key, value in part.items()}
+        return {
+            key: value for part in (*map(merged, bases), options) for key, value in part.items()
+        }
 
     return {name: merged(name) for name in read}
 
@@ -171,15 +204,21 @@ def check_options(
         return _schema(constructor, given).validate_python(dict(options))
 
 
-def construct(what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any) -> T:
+def construct(
+    what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any
+) -> T:
     """Call a constructor with `args` and a config's options, which are checked; None: its defaults."""
     checked = check_options(what, constructor, options or {}, given=len(args))
-    with _in_one_line(what, constructor, checked, len(args)):  # the constructor of an `options_class` checks too
+    with _in_one_line(
+        what, constructor, checked, len(args)
+    ):  # the constructor of an `options_class` checks too
         return constructor(*args, **checked)
 
 
 @contextmanager
-def _in_one_line(what: str, constructor: Callable[..., Any], options: Any, given: int) -> Iterator[None]:
+def _in_one_line(
+    what: str, constructor: Callable[..., Any], options: Any, given: int
+) -> Iterator[None]:
     """Turn a ValidationError into an InputError about `what`."""
     try:
         yield
@@ -188,21 +227,31 @@ def _in_one_line(what: str, constructor: Callable[..., Any], options: Any, given
 
 
 def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
-    """Keyword options of a constructor, after `given` positional ones, with their defaults; `MISSING` without one."""
+    """Keyword options of a constructor, after `given` positional ones, with their defaults;
+    `MISSING` without one.
+    """
     parameters = _by_keyword(constructor, given)
     return {name: MISSING if p.default is p.empty else p.default for name, p in parameters.items()}
 
 
 def _by_keyword(constructor: Callable[..., Any], given: int = 0) -> dict[str, inspect.Parameter]:
-    """Parameters after `given` positional ones; of a class that passes `**options` on, also those of its base."""
+    """Parameters after `given` positional ones; of a class that passes `**options` on, also those
+    of its base.
+    """
     parameters = inspect.signature(constructor).parameters.values()
     named = {p.name: p for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
     positional = [name for name, p in named.items() if p.kind is not p.KEYWORD_ONLY][:given]
     passes_on = any(p.kind is p.VAR_KEYWORD for p in parameters)
     if passes_on and inspect.isclass(constructor) and constructor.__bases__[0] is not object:
-        named |= {name: p for name, p in _by_keyword(constructor.__bases__[0], given).items() if name not in named}
+        named |= {
+            name: p
+            for name, p in _by_keyword(constructor.__bases__[0], given).items()
+            if name not in named
+        }
     return {
-        name: p for name, p in named.items() if name not in positional and p.kind is not p.POSITIONAL_ONLY
+        name: p
+        for name, p in named.items()
+        if name not in positional and p.kind is not p.POSITIONAL_ONLY
     }
 
 
@@ -211,8 +260,14 @@ def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[dict[str
     fields: dict[str, Any] = {}
     for name, parameter in _by_keyword(constructor, given).items():
         annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
-        fields[name] = Required[annotation] if parameter.default is parameter.empty else NotRequired[annotation]
-    config = ConfigDict(STRICT, extra="allow") if _takes_any(constructor) else STRICT
+        fields[name] = (
+            Required[annotation]
+            if parameter.default is parameter.empty
+            else NotRequired[annotation]
+        )
+    config = STRICT
+    if _takes_any(constructor):
+        config = ConfigDict(**{**STRICT, "extra": "allow"})
     typed_dict: Any = TypedDict  # of fields that are known now alone
     schema: Any = with_config(config)(typed_dict("options", fields))
     return TypeAdapter(schema)
@@ -224,7 +279,9 @@ def _takes_any(constructor: Callable[..., Any]) -> bool:
     return inspect.Parameter.VAR_KEYWORD in kinds and not inspect.isclass(constructor)
 
 
-def _first_problem(error: ValidationError, options: Any, constructor: Callable[..., Any], given: int) -> str:
+def _first_problem(
+    error: ValidationError, options: Any, constructor: Callable[..., Any], given: int
+) -> str:
     """The first problem of a validation in one line, without the names of a union's members."""
     problem = error.errors(include_url=False)[0]
     if isinstance(own := problem.get("ctx", {}).get("error"), InputError):  # of a nested class
@@ -247,11 +304,15 @@ def _first_problem(error: ValidationError, options: Any, constructor: Callable[.
     return f"{'.'.join(keys)}: {words[:1].lower()}{words[1:]}, found {problem['input']!r}."
 
 
-def _keys_below(constructor: Callable[..., Any], given: int, path: Sequence[int | str]) -> list[str]:
+def _keys_below(
+    constructor: Callable[..., Any], given: int, path: Sequence[int | str]
+) -> list[str]:
     """The options of a constructor, or of an `options_class` that is the annotation of one of them."""
     parameters = _by_keyword(constructor, given)
     for part in path:
         annotation = parameters[str(part)].annotation if part in parameters else None
         members = [annotation, *get_args(annotation)]
-        parameters = next((_by_keyword(one) for one in members if is_dataclass(one) and isinstance(one, type)), {})
+        parameters = next(
+            (_by_keyword(one) for one in members if is_dataclass(one) and isinstance(one, type)), {}
+        )
     return list(parameters)

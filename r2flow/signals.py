@@ -67,8 +67,8 @@ def install_handlers(handler: _Handler, signals: Sequence[int] = STOPPING) -> di
 
 @contextmanager
 def handling_signals(handler: _Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
-    """Handle signals within a block as `install_handlers`; without effect outside the main thread, which alone
-    receives them.
+    """Handle signals within a block as `install_handlers`; without effect outside the main thread,
+    which alone receives them.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -102,13 +102,17 @@ def end_at_once(number: int, frame: FrameType | None = None) -> None:
 @contextmanager
 def handling_signals_of_program() -> Iterator[None]:
     """Answer stop signals by one line during a whole program, its imports and its exit."""
-    atexit.register(partial(install_handlers, signal.SIG_IGN))  # registered first, so that it is called last
+    atexit.register(
+        partial(install_handlers, signal.SIG_IGN)
+    )  # registered first, so that it is called last
     with handling_signals(end_at_once):
         try:
             yield
         finally:
             atexit.unregister(install_handlers)
-            atexit.register(install_handlers, end_at_once)  # registered last, so that it is called first
+            atexit.register(
+                install_handlers, end_at_once
+            )  # registered last, so that it is called first
 
 
 def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exit(1)) -> None:
@@ -151,7 +155,9 @@ def init_loader_worker(worker: int = 0) -> None:
 
 
 def run_process(command: Sequence[str]) -> int:
-    """Run a command, forward stop signals to it, and end it with this process; its exit code is that of a shell."""
+    """Run a command, forward stop signals to it, and end it with this process; its exit code is
+    that of a shell.
+    """
     received: list[int] = []
 
     def pass_on(number: int, frame: FrameType | None) -> None:
@@ -161,8 +167,13 @@ def run_process(command: Sequence[str]) -> int:
 
     process: subprocess.Popen[bytes] | None = None
     with handling_signals(pass_on):
-        # PR_SET_PDEATHSIG: a run that outlived its sweep would block the same command when given again.
-        end = (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL)) if sys.platform == "linux" else None
+        # PR_SET_PDEATHSIG: a run that outlived its sweep would block the same command when given
+        # again.
+        end = (
+            (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL))
+            if sys.platform == "linux"
+            else None
+        )
         process = subprocess.Popen(command, preexec_fn=end)
         if received:
             process.send_signal(received[0])

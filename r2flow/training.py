@@ -5,8 +5,8 @@
     result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
     result.metrics["val/loss"], result.checkpoint
 
-A `Run` holds a stage, a `ScanDataModule` and a Trainer, which `fit` gives to `trainer.fit`. The same command, or the
-same config, resumes from the last checkpoint.
+A `Run` holds a stage, a `ScanDataModule` and a Trainer, which `fit` gives to `trainer.fit`. The
+same command, or the same config, resumes from the last checkpoint.
 """
 
 import logging
@@ -64,7 +64,9 @@ EXPECTED_WARNINGS = (
 PEER_LOST = r"(?i)connection .*(close|reset)|broken pipe|process exited|gloo.*(timed out|(read|write) error)|NCCL"
 
 Named = Annotated[Mapping[str, Any], Bound("a group with a name", lambda group: "name" in group)]
-InRuns = Annotated[str, Bound("a folder in runs", lambda name: name.strip("./") and ".." not in Path(name).parts)]
+InRuns = Annotated[
+    str, Bound("a folder in runs", lambda name: name.strip("./") and ".." not in Path(name).parts)
+]
 
 
 @strict
@@ -78,7 +80,9 @@ class SampleOptions:
 @strict
 @dataclass(frozen=True)
 class RunConfig:
-    """Top-level keys of a run's config. Those of the groups are the options of the classes that they are for."""
+    """Top-level keys of a run's config. Those of the groups are the options of the classes that
+    they are for.
+    """
 
     stage: Named  # class of `STAGES`, with its options
     backbone: Mapping[str, Any] | None  # the following four: as in `Stage`
@@ -128,17 +132,20 @@ class Result:
     finished: bool  #: whether the run reached its end; `trainer.max_time` can stop it earlier
 
 
-def build(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> Run:
+def build(
+    config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None
+) -> Run:
     """Build the stage, the data and the Trainer of a config; scans are listed, not read.
 
     Args:
         config: As returned by `compose`.
-        asked: Overrides of the command line: only these are refused if they contradict the parent; other keys take the
-            parent's values.
+        asked: Overrides of the command line: only these are refused if they contradict the parent;
+            other keys take the parent's values.
         parent: The parent, if it is not the one that the config names.
 
     Raises:
-        InputError: an invalid value, an unknown name or option, a parent that is missing or not finished.
+        InputError: an invalid value, an unknown name or option, a parent that is missing or not
+            finished.
     """
     run = construct("the config", RunConfig, config)
     if run.chain or run.preview:
@@ -151,32 +158,51 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
             parent = find_parent(named["path"] if isinstance(named, Mapping) else named)
         with made_with(parent.config if parent else {}, "the run that it starts from"):
             options = model_options(
-                _given(config, asked, parent), parent, stage_class.generator_name, stage_class.needs_pairs
+                _given(config, asked, parent),
+                parent,
+                stage_class.generator_name,
+                stage_class.needs_pairs,
             )
         data = _build_data(run, options, asked, parent)
         options["encoding"] = data.encoding.described()
         options |= {"parent": parent, "sampler": run.sampler, "few": run.few, "seed": run.seed}
-        stage: Stage = construct(f"stage '{run.stage['name']}'", stage_class, {**stage_options, **options})
-        if stage.hparams["backbone"] is None and any(key_of(text).partition(".")[0] == "backbone" for text in asked):
-            raise InputError(f"stage={run.stage['name']} has its own network: leave the backbone out.")
+        stage: Stage = construct(
+            f"stage '{run.stage['name']}'", stage_class, {**stage_options, **options}
+        )
+        if stage.hparams["backbone"] is None and any(
+            key_of(text).partition(".")[0] == "backbone" for text in asked
+        ):
+            raise InputError(
+                f"stage={run.stage['name']} has its own network: leave the backbone out."
+            )
         stage.check_data(data)
         data.adopt(stage.item_format)
         trainer = _build_trainer(run, stage)
         complete = config_of(stage.hparams, data.hparams, run.stage["name"])
-        return Run({**config, **complete, "plugins": list(run.plugins) or loaded_plugins()}, stage, data, trainer)
+        return Run(
+            {**config, **complete, "plugins": list(run.plugins) or loaded_plugins()},
+            stage,
+            data,
+            trainer,
+        )
 
 
-def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
+def check(
+    config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None
+) -> dict[str, Any]:
     """Check a config by building its run; no files are written.
 
-    The result is completed with values of its parent; `parent` is one that has not been trained yet.
+    The result is completed with values of its parent; `parent` is one that has not been trained
+    yet.
     """
     run = build(config, asked, parent)
     check_run(run.folder, run.config)
     return run.config
 
 
-def _given(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
+def _given(
+    config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None
+) -> dict[str, Any]:
     """Options of the model for `model_options`; next to a parent's, only those of the command line."""
     given = {group: config.get(group) for group in MODEL}
     if parent is None:
@@ -185,7 +211,9 @@ def _given(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | Non
     for group in ("backbone", "sensor", "encoding"):
         if group not in keys:
             own = {key.split(".")[1] for key in keys if key.startswith(f"{group}.")}
-            given[group] = {key: value for key, value in (config[group] or {}).items() if key in own} or None
+            given[group] = {
+                key: value for key, value in (config[group] or {}).items() if key in own
+            } or None
     return given
 
 
@@ -206,10 +234,16 @@ def _build_data(
         for key, value in chosen.chosen.items():
             given = {"data.reading", f"data.reading.{key}"} & {key_of(text) for text in asked}
             if given and value != (theirs or {}).get(key):
-                raise InputError(f"data.reading.{key} is that of the flow that draws the pairs: leave it out.")
+                raise InputError(
+                    f"data.reading.{key} is that of the flow that draws the pairs: leave it out."
+                )
         data["reading"] = theirs
     elif theirs and not of_simulated:  # the rays of simulated scans are given
-        data["reading"] = {"projection": theirs["projection"], "convention": theirs["convention"], **chosen.chosen}
+        data["reading"] = {
+            "projection": theirs["projection"],
+            "convention": theirs["convention"],
+            **chosen.chosen,
+        }
     encoding = dict(options["encoding"])
     if parent is None:
         encoding["reflectance"] = run.encoding.get("reflectance", True)  # `auto` looks at the scans
@@ -219,9 +253,13 @@ def _build_data(
     if module.encoding.levels is None:
         module.encoding.levels = options["encoding"].get("levels")
     if module.pairs is not None:
+        assert parent is not None
+        assert drawer is not None
         for group in ("sensor", "encoding"):
             if drawer is not parent and drawer.config[group] != parent.config[group]:
-                raise InputError(f"data.pairs.of={module.pairs.of} has another {group} than {parent.path}.")
+                raise InputError(
+                    f"data.pairs.of={module.pairs.of} has another {group} than {parent.path}."
+                )
         module.drawn_by(drawer.record())
     return module
 
@@ -233,7 +271,10 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
     if not stage.automatic_optimization:  # Lightning leaves these two to the stage
         if options["accumulate_grad_batches"] != 1:
             name = run.stage["name"]
-            raise InputError(f"stage={name} takes its own optimiser steps: trainer.accumulate_grad_batches must be 1.")
+            raise InputError(
+                f"stage={name} takes its own optimiser steps: trainer.accumulate_grad_batches must "
+                "be 1."
+            )
         stage.gradient_clip_val = options["gradient_clip_val"]
         options["gradient_clip_val"] = None
     interval = options["val_check_interval"]
@@ -247,13 +288,17 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
     for key, kind in (("enable_checkpointing", Checkpoint), ("enable_progress_bar", ProgressBar)):
         if not options[key]:
             callbacks = [callback for callback in callbacks if not isinstance(callback, kind)]
-        options[key] = any(isinstance(callback, kind) for callback in callbacks)  # or Lightning adds its own
+        options[key] = any(
+            isinstance(callback, kind) for callback in callbacks
+        )  # or Lightning adds its own
     loggers = [LOGGERS[name](Path(run.run_dir)) for name in run.loggers or ()]
     if loggers:
         callbacks.insert(0, LearningRates("step"))
     try:
         with _quiet():
-            trainer = L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
+            trainer = L.Trainer(
+                **options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()]
+            )
         rank_zero_only.rank = trainer.global_rank  # type: ignore[attr-defined] # not SLURM_PROCID of a task alone
         if environment := getattr(trainer.strategy, "cluster_environment", None):
             environment.validate_settings(trainer.num_devices, trainer.num_nodes)
@@ -263,7 +308,8 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
     processes = trainer.num_devices * trainer.num_nodes
     if tasks != processes:
         raise InputError(
-            f"trainer: the cluster starts {tasks} of {processes} processes; under SLURM start it by srun "
+            f"trainer: the cluster starts {tasks} of {processes} processes; under SLURM start it "
+            "by srun "
             f"--ntasks-per-node={trainer.num_devices}, or on one machine by env -u SLURM_NTASKS."
         )
     return trainer
@@ -272,14 +318,17 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
 def fit(run: Run) -> Result:
     """Train a run in its folder, resuming from its last checkpoint, and draw its samples.
 
-    SIGTERM, SIGHUP and Ctrl-C stop it after the current step, with a checkpoint; before the first step, at once.
+    SIGTERM, SIGHUP and Ctrl-C stop it after the current step, with a checkpoint; before the first
+    step, at once.
 
     Raises:
         InputError: unreadable scans, another run in its folder, non-finite weights, a full disk.
         r2flow.signals.Stopped: a stop signal was received, or another device's process was killed.
     """
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
-    stopping = next((callback for callback in callbacks if isinstance(callback, Stopping)), Stopping())
+    stopping = next(
+        (callback for callback in callbacks if isinstance(callback, Stopping)), Stopping()
+    )
     stopping.run_dir = run.folder
     first = run.trainer.is_global_zero
     with stopping.handling_signals(), _quiet(repeated=False):  # each trains on scans of its own
@@ -294,7 +343,8 @@ def fit(run: Run) -> Result:
                 check_folder(run.folder)
                 run.data.read()  # a bad scan leaves no folder
         with run_lock(run.folder) if first else nullcontext():
-            # Python hears no signal while it waits for other machines; from its first step on, `Stopping` does.
+            # Python hears no signal while it waits for other machines; from its first step on,
+            # `Stopping` does.
             with handling_signals(SIG_DFL, STOPPING if run.trainer.num_nodes > 1 else ()):
                 step = _fit_in_folder(run, stopping)
             finished = has_ended(run.folder) or not run.trainer.checkpoint_callbacks
@@ -302,7 +352,14 @@ def fit(run: Run) -> Result:
                 where = run.trainer.strategy.root_device
                 device = str(where) if where.type == "cuda" else "cpu"
                 kept = bool(run.trainer.checkpoint_callbacks)
-                finish(run.folder, run.config["samples"], run.config["seed"], device, finished, kept=kept)
+                finish(
+                    run.folder,
+                    run.config["samples"],
+                    run.config["seed"],
+                    device,
+                    finished,
+                    kept=kept,
+                )
                 log_figures(run.trainer.loggers, run.folder, step)
     return _result(run, step, finished)
 
@@ -322,22 +379,43 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     if first:
         log_config(run.trainer.loggers, run.config)
     try:
-        if last is None and run.stage.hparams["parent"] and is_overridden("validation_step", run.stage):
-            run.trainer.validate(run.stage, run.data, verbose=False)  # what the end of the run is compared with
+        if (
+            last is None
+            and run.stage.hparams["parent"]
+            and is_overridden("validation_step", run.stage)
+        ):
+            run.trainer.validate(
+                run.stage, run.data, verbose=False
+            )  # what the end of the run is compared with
         run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
-    except (MisconfigurationException, ValueError) as error:  # as of limit_val_batches, with few scans
+    except (
+        MisconfigurationException,
+        ValueError,
+    ) as error:  # as of limit_val_batches, with few scans
         lightnings = isinstance(error, MisconfigurationException) or "trainer" in str(error).lower()
         if isinstance(error, InputError) or not lightnings:
             raise
         raise InputError(f"trainer: {one_line(str(error))}") from None
     except RuntimeError as error:
-        if isinstance(cause := error.__context__, OSError) and re.search("combined_loader|Too many open", str(error)):
+        if isinstance(cause := error.__context__, OSError) and re.search(
+            "combined_loader|Too many open", str(error)
+        ):
             raise cause from None
-        if run.trainer.world_size > 1 and stopping.received is None and re.search(PEER_LOST, str(error)):
+        if (
+            run.trainer.world_size > 1
+            and stopping.received is None
+            and re.search(PEER_LOST, str(error))
+        ):
             if any(map(_failed, getattr(run.trainer.strategy.launcher, "procs", ()))):
-                raise InputError("a process of this run on another device ended with an error.") from error
-            again = "resumes" if checkpoints_of(run.folder) else "starts it again: no checkpoint yet"
-            raise Stopped(LATER, f"a process of this run on another device ended; the same command {again}.") from error
+                raise InputError(
+                    "a process of this run on another device ended with an error."
+                ) from error
+            again = (
+                "resumes" if checkpoints_of(run.folder) else "starts it again: no checkpoint yet"
+            )
+            raise Stopped(
+                LATER, f"a process of this run on another device ended; the same command {again}."
+            ) from error
         raise
     return run.trainer.global_step
 
@@ -351,13 +429,18 @@ def _failed(process: Popen[bytes]) -> bool:
 
 def _result(run: Run, step: int, finished: bool) -> Result:
     logged = {name: float(values[-1]) for name, (_, values) in read_curves(run.folder).items()}
-    metrics = {**logged, **{name: float(value) for name, value in run.trainer.callback_metrics.items()}}
+    metrics = {
+        **logged,
+        **{name: float(value) for name, value in run.trainer.callback_metrics.items()},
+    }
     return Result(metrics, next(iter(checkpoints_of(run.folder)), None), run.folder, step, finished)
 
 
 @contextmanager
 def _quiet(repeated: bool = True) -> Iterator[None]:
-    """Suppress Lightning's messages, its warnings about intended choices, and logs that further devices repeat."""
+    """Suppress Lightning's messages, its warnings about intended choices, and logs that further
+    devices repeat.
+    """
     levels = dict.fromkeys(("lightning.pytorch", "lightning.fabric"), logging.WARNING)
     if getattr(rank_zero_only, "rank", 0) and repeated:
         levels["r2flow"] = logging.ERROR

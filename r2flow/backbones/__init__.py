@@ -37,7 +37,9 @@ class _Backbones(Registry[type[Backbone]]):
         return super().build({**self.options(options), **given}, rays)
 
 
-BACKBONES = _Backbones("backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, local=Local)
+BACKBONES = _Backbones(
+    "backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, local=Local
+)
 
 
 def build_backbone(
@@ -55,14 +57,21 @@ def build_backbone(
         out_channels: None means as many.
     """
     if options is None:
-        raise InputError("stage.parent names a run without a backbone: leave it out, or name a flow.")
-    given: dict[str, Any] = {"in_channels": in_channels, "out_channels": out_channels or in_channels}
+        raise InputError(
+            "stage.parent names a run without a backbone: leave it out, or name a flow."
+        )
+    given: dict[str, Any] = {
+        "in_channels": in_channels,
+        "out_channels": out_channels or in_channels,
+    }
     if second_time:  # a plug-in may have one time only
         given["second_time"] = True
     return BACKBONES.build(options, rays, **given)
 
 
 def configurations() -> Registry[dict[str, Any]]:
-    """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of backbones without a file."""
+    """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of backbones without a
+    file.
+    """
     defaults = {name: {"name": name} for name in BACKBONES}
     return Registry("backbone configuration", **{**defaults, **presets("backbone")})

@@ -10,7 +10,8 @@ from r2flow.signals import handling_signals_of_program
 def main(*verb: str, command: Sequence[str] = ("-m", "r2flow", "train")) -> None:
     """Run a verb; Ctrl-C, SIGTERM and SIGHUP stop it with a one-line message.
 
-    `verb` precedes the command line; Python with `command` trains a link of a chain or a job of a sweep.
+    `verb` precedes the command line; Python with `command` trains a link of a chain or a job of a
+    sweep.
     """
     prepare_process()
     with handling_signals_of_program():

@@ -84,8 +84,8 @@ def prepare(
 ) -> None:
     """Project a data set into shards for training: range in 2 bytes, reflectance in 1.
 
-    The same command resumes an interrupted run, shares the work with others at the same time and replaces damaged
-    shards. Train on them with python train.py data=prepared data.root=FOLDER.
+    The same command resumes an interrupted run, shares the work with others at the same time and
+    replaces damaged shards. Train on them with python train.py data=prepared data.root=FOLDER.
     """
     from r2flow.data import prepared
     from r2flow.data.opening import SOURCES, parse
@@ -124,9 +124,11 @@ def sensor(
     columns: ColumnsOption = None,
     most: MostOption = 8,
 ) -> None:
-    """Estimate a sensor from scans (beams, resolution, range limits, height, reflectance) and write it as YAML.
+    """Estimate a sensor from scans (beams, resolution, range limits, height, reflectance) and write
+    it as YAML.
 
-    Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py (sensor=mine).
+    Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py
+    (sensor=mine).
     """
     from r2flow.data.sources import warn_of_frame
     from r2flow.lidar.estimation import estimate_sensor, nearest_sensor
@@ -157,7 +159,8 @@ def sensor(
         "elevations": f"{degrees[0]:+.2f} to {degrees[-1]:+.2f} degrees; points lie {off:.2f} from their beams",
         "nearest sensor": f"{nearest}, its beams {distance:.2f} degrees off" if nearest else "none",
         "resolution": f"{steps:,.0f} steps a turn; images of {mine.columns} columns",
-        "range seen": f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle is visible",
+        "range "
+        "seen": f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle is visible",
         "height": height if ground else f"not found, {mine.height:g} m assumed",
         "reflectance": f"reflectance_scale={scale:g}"
         if scale
@@ -189,7 +192,8 @@ def unpack(
 ) -> None:
     """Write the PointCloud2 messages of a recording as scan files, named by time in ns.
 
-    The time is header.stamp, if 0 that of recording. The files contain x, y, z and, if present, intensity and ring.
+    The time is header.stamp, if 0 that of recording. The files contain x, y, z and, if present,
+    intensity and ring.
     """
     from r2flow.lidar.bags import read_bag
     from r2flow.lidar.scan_files import read_points, write_points

@@ -75,7 +75,8 @@ def sample(
     ] = None,
     pictures: Annotated[int, Option(min=0, help="Number of scans to draw as pictures.")] = 8,
 ) -> None:
-    """Sample scans from a trained model (default: `street`): point clouds, range images and pictures.
+    """Sample scans from a trained model (default: `street`): point clouds, range images and
+    pictures.
 
     The default sampler is the generator's.
     """
@@ -174,7 +175,9 @@ def interpolate(
 
 @dataclass(frozen=True)
 class PartialOptions:
-    """The scans to complete: their sensor, what is known of them, and the sensor of the completed scans."""
+    """The scans to complete: their sensor, what is known of them, and the sensor of the completed
+    scans.
+    """
 
     source: Annotated[
         str | None,
@@ -210,7 +213,9 @@ class PartialOptions:
     def open(
         self, model: str, device: str, what: Sequence[str]
     ) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
-        """The model, for another sensor if given, the scans as it takes them, and remarks on their sensor."""
+        """The model, for another sensor if given, the scans as it takes them, and remarks on their
+        sensor.
+        """
         from r2flow.lidar.sensors import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
 
@@ -255,7 +260,8 @@ def complete(
 ) -> None:
     """Complete scans: more beams, filled gaps, hidden parts.
 
-    Files have the format of the input, or .ply if it cannot be written. The same command resumes an interrupted run.
+    Files have the format of the input, or .ply if it cannot be written. The same command resumes an
+    interrupted run.
     """
     from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.model.completion import completing

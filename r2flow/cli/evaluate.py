@@ -36,9 +36,9 @@ def evaluate(
 ) -> None:
     """Evaluate generated scans against real scans: distances with their protocols and sensor.
 
-    One table compares all sets with reference distances between real scans and with baselines. Models are sampled;
-    several --steps or --sampler plot distance against evaluations and seconds. The same command with --out resumes.
-    Under torchrun, processes share the scans.
+    One table compares all sets with reference distances between real scans and with baselines.
+    Models are sampled; several --steps or --sampler plot distance against evaluations and seconds.
+    The same command with --out resumes. Under torchrun, processes share the scans.
     """
     from r2flow.processes import process_group
 

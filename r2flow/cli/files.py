@@ -40,10 +40,11 @@ def export(
         Path | None, Option("--out", "-o", help="File to write. Default: NAME.onnx, ...")
     ] = None,
 ) -> None:
-    """Export a flow as a file that runs without r2flow: from noise to range in metres, reflectance and points.
+    """Export a flow as a file that runs without r2flow: from noise to range in metres, reflectance
+    and points.
 
-    The file has a fixed number of steps; r2flow runs it and compares it with the flow. --to safetensors writes the
-    averaged weights, config and sampler of any generator, reproducibly.
+    The file has a fixed number of steps; r2flow runs it and compares it with the flow. --to
+    safetensors writes the averaged weights, config and sampler of any generator, reproducibly.
     """
     from r2flow.generators import RectifiedFlow
     from r2flow.model import export as writing
@@ -92,10 +93,11 @@ def info(
         Option(metavar="NAME FILE", help="Install a feature network from its file or folder."),
     ] = None,
 ) -> None:
-    """Print the contents of a checkpoint, or list the models and the feature networks of published metrics.
+    """Print the contents of a checkpoint, or list the models and the feature networks of published
+    metrics.
 
-    r2flow does not download networks: get the published file, then --add it. It is loaded as tensors only, checked and
-    stored in R2FLOW_WEIGHTS (default ~/.cache/r2flow/weights).
+    r2flow does not download networks: get the published file, then --add it. It is loaded as
+    tensors only, checked and stored in R2FLOW_WEIGHTS (default ~/.cache/r2flow/weights).
     """
     from r2flow.config import flatten
     from r2flow.metrics.extractors.base import add as install

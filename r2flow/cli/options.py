@@ -112,7 +112,8 @@ def grouped(verb: Callable[..., None]) -> Callable[..., None]:
 
     @app.command()
     @grouped
-    def evaluate(real: str, reading: ReadingOptions) -> None: ...   # r2flow evaluate REAL --sensor vlp16 --size 16x512
+    def evaluate(real: str, reading: ReadingOptions) -> None: ...   # r2flow evaluate REAL --sensor
+    vlp16 --size 16x512
     """
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
@@ -173,7 +174,8 @@ class SamplerOptions:
         str | None,
         Option(
             help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: dopri5, torchdiffeq; "
-            "stochastic: sde; flow maps: jump, renoise, refine; completion: transport, mmps, replace, repaint. "
+            "stochastic: sde; flow maps: jump, renoise, refine; completion: transport, mmps, "
+            "replace, repaint. "
             "For other systems see docs/systems.md."
         ),
     ] = None

@@ -1,4 +1,6 @@
-"""`r2flow report`: solvers, curvature, backbones, completion, the paper's tables; and `r2flow compare`."""
+"""`r2flow report`: solvers, curvature, backbones, completion, the paper's tables; and `r2flow
+compare`.
+"""
 
 import logging
 import math
@@ -47,7 +49,9 @@ def curvature(
     draw: DrawOptions,
     steps: Annotated[int, Option(min=1, help="Euler steps per path.")] = 256,
 ) -> None:
-    """Measure the straightness s(t) of trained flows; plot paths of the most curved pixels (the paper's figure 8)."""
+    """Measure the straightness s(t) of trained flows; plot paths of the most curved pixels (the
+    paper's figure 8).
+    """
     from r2flow.generators import as_flow
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
@@ -88,7 +92,8 @@ def solvers(
         str | None, Option(help="Test problems by name, or none. Default: all.")
     ] = None,
 ) -> None:
-    """Compare solvers by error against run time, on test problems with exact solutions and on a trained flow.
+    """Compare solvers by error against run time, on test problems with exact solutions and on a
+    trained flow.
 
     The page lists the best sampler for each error as a command.
     """
@@ -135,7 +140,9 @@ def backbones(
     ] = 3,
     device: DeviceOption = "auto",
 ) -> None:
-    """List parameters, multiply-accumulates and latency of all backbone configurations (the paper's table II)."""
+    """List parameters, multiply-accumulates and latency of all backbone configurations (the paper's
+    table II).
+    """
     from r2flow.backbones import configurations
     from r2flow.lidar.sensors import named_sensor
     from r2flow.progress import track
@@ -249,7 +256,9 @@ def paper(
     steps: Annotated[int, Option(min=1, help="Euler steps of the paths in figure 8.")] = 256,
     device: DeviceOption = "auto",
 ) -> None:
-    """Reproduce the paper's tables I and II and figures 6 to 8, printed numbers next to those of `evaluate`."""
+    """Reproduce the paper's tables I and II and figures 6 to 8, printed numbers next to those of
+    `evaluate`.
+    """
     from r2flow.data.opening import open_scans, reading_for
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.paper import PaperRun, paper_page, read_results, role_of

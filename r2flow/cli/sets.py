@@ -103,7 +103,9 @@ class EvaluateOptions:
 def reading_of(
     how: ReadingOptions, specs: Sequence[str], flows: "Sequence[Checkpoint]"
 ) -> "Reading":
-    """How points become images, whatever the order of models and samples: with all returns that any of them has."""
+    """How points become images, whatever the order of models and samples: with all returns that any
+    of them has.
+    """
     from r2flow.data.opening import PREPARED, own_reading, parse, reading_for
     from r2flow.metrics.scans import MASK
 

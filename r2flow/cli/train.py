@@ -28,7 +28,9 @@ from r2flow.devices import choose_device
     epilog="Example: r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small",
 )
 def train(context: typer.Context) -> int:
-    """Train a model; set config keys as KEY=VALUE. --help lists the choices, --cfg job prints all keys."""
+    """Train a model; set config keys as KEY=VALUE. --help lists the choices, --cfg job prints all
+    keys.
+    """
     from r2flow.runs.launch import main
 
     return main(context.args, *context.obj)
@@ -55,9 +57,10 @@ def pairs(
 ) -> None:
     """Generate reflow pairs with a flow; several processes share the missing or damaged pairs.
 
-    `python train.py experiment=reflow stage.parent=RUN` generates pairs itself; this verb only generates, also under
-    torchrun or as a SLURM array, with the settings of `data.pairs`. Default sampler: adams3 in 32 steps; the paper uses
-    --sampler dopri5. renoise samples a flow map in several jumps, as targets for its first jump.
+    `python train.py experiment=reflow stage.parent=RUN` generates pairs itself; this verb only
+    generates, also under torchrun or as a SLURM array, with the settings of `data.pairs`. Default
+    sampler: adams3 in 32 steps; the paper uses --sampler dopri5. renoise samples a flow map in
+    several jumps, as targets for its first jump.
     """
     import torch
 
@@ -91,7 +94,8 @@ def pairs(
     missing = store.missing_pairs()
     if missing:
         print(
-            f"{folder}: other processes are still generating about {min(missing, num)} of {num} pairs"
+            f"{folder}: other processes are still generating about {min(missing, num)} of {num} "
+            "pairs"
         )
         return
     size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)

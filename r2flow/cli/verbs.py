@@ -31,15 +31,17 @@ _CURES = {
     r"MPS framework doesn't support float64": "Use --device cpu.",
     r"DataLoader worker \(pid": "Is there memory for as many processes that read scans?",
     r"home directory": "Write the path in full.",
-    r"allocate|out of memory|not enough memory|failed to map segment": "Give smaller batches or images, or more "
-    "memory.",
+    r"allocate|out of memory|not enough memory|failed to map "
+    r"segment": "Give smaller batches or images, or more memory.",
 }
 
 
 def run(arguments: Sequence[str], command: Sequence[str]) -> int:
-    """Run a verb, with `--plugin MODULE` anywhere; the exit code is 2 for a user error, which prints one line.
+    """Run a verb, with `--plugin MODULE` anywhere; the exit code is 2 for a user error, which
+    prints one line.
 
-    `command` starts the processes of chains and sweeps. Shells leave the ~ of --out=~/scans, which is expanded here.
+    `command` starts the processes of chains and sweeps. Shells leave the ~ of --out=~/scans, which
+    is expanded here.
     """
     open_streams()
     handler = logging.StreamHandler()

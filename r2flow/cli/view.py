@@ -44,7 +44,9 @@ def show(
         Option(help="png, pdf: pictures; npy: range images, (2, H, W)."),
     ] = "png",
 ) -> None:
-    """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write range images."""
+    """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write
+    range images.
+    """
     from r2flow.data.opening import parse
     from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure

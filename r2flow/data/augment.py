@@ -11,11 +11,15 @@ from r2flow import noise
 class Augmentation:
     """Augmentations of a training scan (`data.augment`); both are off by default.
 
-    The draws for image k depend only on (seed, k), and are independent of each other and of the image's noise and time.
+    The draws for image k depend only on (seed, k), and are independent of each other and of the
+    image's noise and time.
     """
 
-    flip: bool = False  # mirror half of the images: azimuth -> -azimuth; exact, as the bins are symmetric
-    roll: bool = False  # rotate about the sensor by a whole number of columns, drawn uniformly; exact on the ring
+    flip: bool = (
+        False  # mirror half of the images: azimuth -> -azimuth; exact, as the bins are symmetric
+    )
+    # rotate about the sensor by a whole number of columns, drawn uniformly; exact on the ring
+    roll: bool = False
 
     def __bool__(self) -> bool:
         return self != Augmentation()

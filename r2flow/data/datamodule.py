@@ -14,7 +14,16 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow.data.augment import Augmentation
-from r2flow.data.loader import FlowDataset, Item, ItemFormat, MixedOrder, Mixture, Order, Permutations, RunSampler
+from r2flow.data.loader import (
+    FlowDataset,
+    Item,
+    ItemFormat,
+    MixedOrder,
+    Mixture,
+    Order,
+    Permutations,
+    RunSampler,
+)
 from r2flow.data.opening import Described
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions
 from r2flow.data.pairs import PairDataset, PairStore
@@ -34,18 +43,21 @@ Scans = Mixture | np.ndarray  # scans, or the numbers of pairs
 
 
 class ScanDataModule(L.LightningDataModule):
-    """Projected scans with their noise, or pairs that a flow has drawn, for training and validation.
+    """Projected scans with their noise, or pairs that a flow has drawn, for training and
+    validation.
 
-    `r2flow.data.loader.FlowDataset` describes a batch. An epoch is a pass over the training scans, without those left
-    over when they are shared in batches; test and prediction use the held-out scans. In a Trainer, scans have the
-    encoding of the module's `item_format`, if it has one. Noise, times and order derive from the seed (`r2flow.noise`).
+    `r2flow.data.loader.FlowDataset` describes a batch. An epoch is a pass over the training scans,
+    without those left over when they are shared in batches; test and prediction use the held-out
+    scans. In a Trainer, scans have the encoding of the module's `item_format`, if it has one.
+    Noise, times and order derive from the seed (`r2flow.noise`).
 
         data = ScanDataModule("kitti_raw", root="KITTI", sensor="hdl64e_small", batch_size=8)
 
     Args:
         name: Kind of scans, a name in `r2flow.data.opening.SOURCES`, `mixed` or `pairs`.
         sensor: Sensor of the images, its name, YAML file or options.
-        encoding: Encoding of the images, a name in conf/encoding, or options; `reflectance: auto` looks at the scans.
+        encoding: Encoding of the images, a name in conf/encoding, or options; `reflectance: auto`
+            looks at the scans.
         seed: Seed of noise, times and order.
         options: Further fields of `r2flow.data.options.DataOptions`: root, split, batch_size, ...
 
@@ -74,7 +86,10 @@ class ScanDataModule(L.LightningDataModule):
         if name == PAIRS:
             self.pairs = self.options.pairs
             if self.augment:
-                raise InputError("data.augment changes scans, and an augmented pair is not a flow's; leave it out.")
+                raise InputError(
+                    "data.augment changes scans, and an augmented pair is not a flow's; leave it "
+                    "out."
+                )
         self.described_sets = [Described(part.name, part) for part in self.plan.sets]  # listed once
         held_out = self.plan.held_out
         self.described_held_out = None if held_out is None else Described(held_out.name, held_out)
@@ -84,7 +99,9 @@ class ScanDataModule(L.LightningDataModule):
         self.training_source: Scans | None = None
         self.validation_source: Scans | None = None
         self.scans: Mixture | None = None  # next to pairs
-        self.save_hyperparameters(self.described(), logger=False)  # the module logs those that they share
+        self.save_hyperparameters(
+            self.described(), logger=False
+        )  # the module logs those that they share
 
     def described(self) -> dict[str, Any]:
         """The arguments of this DataModule, complete, as plain values."""
@@ -102,7 +119,9 @@ class ScanDataModule(L.LightningDataModule):
 
     @cached_property
     def encoding(self) -> Encoding:
-        """Encoding of the images; looks at the scans for whether they have reflectance, and its levels."""
+        """Encoding of the images; looks at the scans for whether they have reflectance, and its
+        levels.
+        """
         options = dict(self._encoding_options)
         if options["reflectance"] == AUTO:
             held_out = [self.described_held_out] if self.described_held_out else []
@@ -117,26 +136,38 @@ class ScanDataModule(L.LightningDataModule):
     @property
     def sensors(self) -> list[Sensor]:
         """The sensor of each set of scans."""
-        return [build_sensor(**part.sensor) if part.sensor else self.sensor for part in self.plan.sets]
+        return [
+            build_sensor(**part.sensor) if part.sensor else self.sensor for part in self.plan.sets
+        ]
 
     @property
     def format(self) -> ItemFormat:
-        """What items are: the module's `item_format`, else this DataModule's encoding and noise of its shape."""
+        """What items are: the module's `item_format`, else this DataModule's encoding and noise of
+        its shape.
+        """
         return self.item_format or ItemFormat(self.encoding, self.encoding.shape)
 
     def drawn_by(self, parent: Mapping[str, Any]) -> None:
-        """Complete the identity of the pairs by the record of the flow that draws them (`Parent.record`)."""
+        """Complete the identity of the pairs by the record of the flow that draws them
+        (`Parent.record`).
+        """
         assert self.pairs is not None
         first = parent["first_pair"] if self.pairs.first is None else self.pairs.first
         self.pairs = replace(self.pairs, parent=parent["weights"], first=first)
-        self.options = replace(self.options, root=self.options.root or parent["pairs"], pairs=self.pairs)
-        self.save_hyperparameters(self.described(), logger=False)  # the module logs those that they share
+        self.options = replace(
+            self.options, root=self.options.root or parent["pairs"], pairs=self.pairs
+        )
+        self.save_hyperparameters(
+            self.described(), logger=False
+        )  # the module logs those that they share
 
     @property
     def pair_store(self) -> PairStore:
         """The folder of the run's pairs, complete or not."""
         assert self.pairs is not None
-        return PairStore(self.options.folder, self.pairs, self.format.encoding.shape, self.format.noise_shape)
+        return PairStore(
+            self.options.folder, self.pairs, self.format.encoding.shape, self.format.noise_shape
+        )
 
     def setup(self, stage: str | None = None) -> None:
         """Open the scans; `read` reads them."""
@@ -146,7 +177,9 @@ class ScanDataModule(L.LightningDataModule):
             self.adopt(wanted)
         if self.pairs is None and self.training_source is None:
             self.training_source, self.validation_source = self.opened = self._open_all()
-            self._order(self.training_source)  # refuses wrong weights before anything is read or written
+            self._order(
+                self.training_source
+            )  # refuses wrong weights before anything is read or written
         elif self.plan.scans is not None and self.scans is None:
             self.scans = Mixture([self._open(Described(self.plan.scans.name, self.plan.scans))])
             self.names = list(self.scans.names)
@@ -156,15 +189,24 @@ class ScanDataModule(L.LightningDataModule):
         """Make the items that a module takes; refuses scans that it cannot learn from."""
         sensor = wanted.encoding.sensor
         if self.pairs is None and not sensor.same_image(self.sensor):
-            ours, theirs = ("x".join(map(str, one.shape)) + f" of {one.name}" for one in (self.sensor, sensor))
-            raise InputError(f"the module's images are {theirs}, the data's {ours}: give both the same sensor.")
+            ours, theirs = (
+                "x".join(map(str, one.shape)) + f" of {one.name}" for one in (self.sensor, sensor)
+            )
+            raise InputError(
+                f"the module's images are {theirs}, the data's {ours}: give both the same sensor."
+            )
         several = any(part.sensor for part in self.plan.sets)
         if several and not wanted.several_sensors:
-            raise InputError("this stage learns from scans of one sensor: leave sensor out of data.parts.")
+            raise InputError(
+                "this stage learns from scans of one sensor: leave sensor out of data.parts."
+            )
         for number, one in enumerate(self.sensors if several else ()):
             if one.shape[0] < wanted.smallest[0] or one.shape[1] < wanted.smallest[1]:
                 least = "x".join(map(str, wanted.smallest))
-                raise InputError(f"data.parts[{number}]: crops of {least} need images as large, found {one.shape}.")
+                raise InputError(
+                    f"data.parts[{number}]: crops of {least} need images as large, found "
+                    f"{one.shape}."
+                )
         self.item_format = wanted
 
     def read(self) -> None:
@@ -172,7 +214,9 @@ class ScanDataModule(L.LightningDataModule):
         self.setup()
         if self.scans is not None:
             self.scans = self._kept(self.scans, "scans next to the pairs")
-        if isinstance(self.training_source, Mixture) and isinstance(self.validation_source, Mixture):
+        if isinstance(self.training_source, Mixture) and isinstance(
+            self.validation_source, Mixture
+        ):
             self.training_source = self._kept(self.training_source, "training scans")
             self.validation_source = self._kept(self.validation_source, "validation scans")
 
@@ -187,7 +231,9 @@ class ScanDataModule(L.LightningDataModule):
             whole.append(self._open(scans, first_scene, sensor))
             first_scene += scans.options.scenes if scans.options.name == SIMULATED else 0
         for number, source in enumerate(whole):
-            label = f"{number}: " if len(whole) > 1 else ""  # makes the names of the parts' scans distinct
+            label = (
+                f"{number}: " if len(whole) > 1 else ""
+            )  # makes the names of the parts' scans distinct
             self.names += [f"{label}{name}" for name in source.names]
         other = self.described_held_out
         training, held = whole, list[ScanSource]()
@@ -203,17 +249,29 @@ class ScanDataModule(L.LightningDataModule):
         if other is not None or len(whole) > 1:
             self._warn_of_shared(training, held)
         validation = Mixture(held)
-        return Mixture(training), validation.subset(spread(len(validation), self.options.validation.scans))
+        return Mixture(training), validation.subset(
+            spread(len(validation), self.options.validation.scans)
+        )
 
     def _warn_of_shared(self, training: Sequence[ScanSource], held: Sequence[ScanSource]) -> None:
         trained = set[str]().union(*(source.places() for source in training))
         validated = set[str]().union(*(source.places() for source in held))
         if shared := trained & validated:
-            what = "data.validation.data" if self.plan.held_out else "a held-out block of data.parts"
+            what = (
+                "data.validation.data" if self.plan.held_out else "a held-out block of data.parts"
+            )
             advice = "give each set its own split or drives"
-            log.warning("%s holds %d scans that are trained on, as %s: %s", what, len(shared), min(shared), advice)
+            log.warning(
+                "%s holds %d scans that are trained on, as %s: %s",
+                what,
+                len(shared),
+                min(shared),
+                advice,
+            )
 
-    def _open(self, scans: Described, first_scene: int = 0, sensor: Sensor | None = None) -> ScanSource:
+    def _open(
+        self, scans: Described, first_scene: int = 0, sensor: Sensor | None = None
+    ) -> ScanSource:
         images = {"reflectance": self.format.encoding.reflectance, "within_limits": True}
         own = (sensor or self.format.encoding.sensor).described()
         reading = Reading.of({**scans.options.chosen, **images, "sensor": own})
@@ -226,8 +284,12 @@ class ScanDataModule(L.LightningDataModule):
         return Permutations(len(source), self.seed)
 
     def fingerprint(self) -> str:
-        """Identity of the data, independent of its path: a run resumes only with the same scans and order."""
-        texts = [] if self.pairs is None else [f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"]
+        """Identity of the data, independent of its path: a run resumes only with the same scans and
+        order.
+        """
+        texts = (
+            [] if self.pairs is None else [f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"]
+        )
         if self.opened:
             known = [*self.names, *(source.contents for source in self.opened)]
             digest = hashlib.sha256(os.fsencode("\n".join(known))).hexdigest()[:12]
@@ -238,14 +300,19 @@ class ScanDataModule(L.LightningDataModule):
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = [*source.parts]
         firsts = {i: part[0] for i, part in enumerate(parts) if part.slow and len(part)}
-        if sum(4 * len(parts[i]) * first.size for i, first in firsts.items()) > self.options.memory_gib * 2**30:
+        if (
+            sum(4 * len(parts[i]) * first.size for i, first in firsts.items())
+            > self.options.memory_gib * 2**30
+        ):
             return source
         for i, first in firsts.items():
             images = np.empty((len(parts[i]), *first.shape), np.float32)
             for number in track(range(len(images)), f"reading {what}", least=16):
                 image = parts[i][number]
                 if image.shape != first.shape:  # of one channel, it would fill both
-                    raise InputError(f"{parts[i].names[number]}: an image of {first.shape}, found {image.shape}.")
+                    raise InputError(
+                        f"{parts[i].names[number]}: an image of {first.shape}, found {image.shape}."
+                    )
                 images[number] = image
             parts[i] = InMemory(images, parts[i].names)
         return Mixture(parts)
@@ -266,12 +333,15 @@ class ScanDataModule(L.LightningDataModule):
         parts = self.trainer.accumulate_grad_batches if self.trainer else 1
         if self.batch_size % (ranks * parts):
             raise InputError(
-                f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times {parts} accumulated "
+                f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
+                f"{parts} accumulated "
                 f"batches; give a multiple of {ranks * parts}."
             )
         images = max(len(source) // self.batch_size, 1) * self.batch_size
         sampler = RunSampler(self._order(source), images, rank, ranks, self._place)
-        return self._loader(self._dataset(source, "training"), sampler, self.batch_size // (ranks * parts))
+        return self._loader(
+            self._dataset(source, "training"), sampler, self.batch_size // (ranks * parts)
+        )
 
     def _place(self) -> tuple[int, int]:
         """The next k of the run, and the number of images of this epoch before it."""
@@ -305,7 +375,9 @@ class ScanDataModule(L.LightningDataModule):
         return FlowDataset(source, item_format, self.seed, purpose, augment, sensors)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
-        """The held-out scans, each once, without those that are left when the devices share them equally."""
+        """The held-out scans, each once, without those that are left when the devices share them
+        equally.
+        """
         return self._held_out_loader()
 
     def test_dataloader(self) -> DataLoader[Item] | list[Any]:
@@ -322,14 +394,16 @@ class ScanDataModule(L.LightningDataModule):
             return []
         rank, ranks = self.ranks
         batch_size = max(self.batch_size // ranks, 1)
-        # All ranks need the same number of batches, or they would wait for each other: with fewer scans than ranks,
-        # every rank takes all scans; otherwise the remainder is left out.
+        # All ranks need the same number of batches, or they would wait for each other: with fewer
+        # scans than ranks, every rank takes all scans; otherwise the remainder is left out.
         if len(source) < ranks:
             rank, ranks = 0, 1
         sampler = RunSampler(range(len(source)), len(source) - len(source) % ranks, rank, ranks)
         return self._loader(self._dataset(source, "validation", whole), sampler, batch_size)
 
-    def _loader(self, dataset: Dataset[Item], sampler: RunSampler, batch_size: int) -> DataLoader[Item]:
+    def _loader(
+        self, dataset: Dataset[Item], sampler: RunSampler, batch_size: int
+    ) -> DataLoader[Item]:
         return DataLoader(
             dataset,
             batch_size=batch_size,

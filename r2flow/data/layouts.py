@@ -19,7 +19,11 @@ from r2flow.store import manifest_of
 log = logging.getLogger(__name__)
 
 KITTI_360_SPLIT = {"train": (3, 4, 5, 6, 7, 9, 10), "test": (0, 2)}
-ODOMETRY_SPLIT = {"train": (0, 1, 2, 3, 4, 5, 6, 7, 9, 10), "validation": (8,), "test": tuple(range(11, 22))}
+ODOMETRY_SPLIT = {
+    "train": (0, 1, 2, 3, 4, 5, 6, 7, 9, 10),
+    "validation": (8,),
+    "test": tuple(range(11, 22)),
+}
 OBJECT_SPLIT = {"train": ("training",), "test": ("testing",)}
 
 
@@ -32,19 +36,25 @@ class Drive:
     """One recording: consecutive scans."""
 
     name: str  # its name in `data.drives`
-    scans: tuple[str, ...]  # paths as strings: 100,000 Path objects take seconds and ten times the memory
+    scans: tuple[
+        str, ...
+    ]  # paths as strings: 100,000 Path objects take seconds and ten times the memory
 
 
 class SourceKind(ABC):
     """A kind of scans, an entry of `SOURCES`: `data=NAME` in a run, `NAME:ROOT` in a command."""
 
-    splits: Mapping[str, Sequence[int | str]] = {}  # standard split: names or numbers of each part's drives
+    splits: Mapping[
+        str, Sequence[int | str]
+    ] = {}  # standard split: names or numbers of each part's drives
     sensor = "hdl64e"  # name of the default sensor
     reflectance_scale = 1.0  # default value of full reflectance
     levels: int | None = None  # reflectance is n / levels
 
     @abstractmethod
-    def open(self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+    def open(
+        self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0
+    ) -> ScanSource:
         """The scans in order, not yet read; `seed` and `first_scene` are for simulated scans.
 
         `reading.reflectance` is True or False.
@@ -60,18 +70,26 @@ class SourceKind(ABC):
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
         """The drives of scan files, in order."""
-        raise InputError(f"{options.name} scans are not files in drives: train on them by data={options.name}.")
+        raise InputError(
+            f"{options.name} scans are not files in drives: train on them by data={options.name}."
+        )
 
     def split_of(self, drive: str) -> str | None:
         """The part of the standard split that contains a drive, by its name, or None."""
         names = {drive, *_numbers(drive)}
         return next((part for part, members in self.splits.items() if names & set(members)), None)
 
-    def chosen(self, drives: list[Drive], split: str | None, names: Sequence[str | int] | None) -> list[Drive]:
+    def chosen(
+        self, drives: list[Drive], split: str | None, names: Sequence[str | int] | None
+    ) -> list[Drive]:
         """Select drives by a part of the standard split, then by names or numbers; None takes all."""
         if split is not None:
             if split not in self.splits:
-                splits = f"known: {', '.join(self.splits)}" if self.splits else "the data set has no standard split"
+                splits = (
+                    f"known: {', '.join(self.splits)}"
+                    if self.splits
+                    else "the data set has no standard split"
+                )
                 raise InputError(f"no split named {split!r}; {splits}.")
             drives = [drive for drive in drives if self.split_of(drive.name) == split]
         if names is None:
@@ -83,7 +101,9 @@ class SourceKind(ABC):
 class Layout(SourceKind):
     """A data set of scan files; `find` lists its drives below a folder, in order."""
 
-    find: Callable[[Path], list[Drive]]  # the first line of its docstring is the pattern of its files
+    find: Callable[
+        [Path], list[Drive]
+    ]  # the first line of its docstring is the pattern of its files
     splits: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
     sensor: str = "hdl64e"
     reflectance_scale: float = 1.0
@@ -94,24 +114,34 @@ class Layout(SourceKind):
         name, split, root = options.name, options.split, options.folder
         self.chosen([], split, None)  # refuses an unknown split before any search
         found = root.is_dir()
-        check(found, f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb {name}:FOLDER).")
+        check(
+            found,
+            f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb "
+            f"{name}:FOLDER).",
+        )
         nonempty = [drive for drive in self.find(root) if drive.scans]
         if not nonempty:
             where = (self.find.__doc__ or "scan files").splitlines()[0]
-            raise InputError(f"{root} holds no scan. Looked for ({name}): {where}{_elsewhere(root)}")
+            raise InputError(
+                f"{root} holds no scan. Looked for ({name}): {where}{_elsewhere(root)}"
+            )
         drives = self.chosen(nonempty, split, None)
         if not drives:
             names = ", ".join(f"{drive.name} ({self.split_of(drive.name)})" for drive in nonempty)
             raise InputError(
-                f"{root} holds no scan of its {split} split; it holds {names[:200]}: give another data.split "
+                f"{root} holds no scan of its {split} split; it holds {names[:200]}: give another "
+                "data.split "
                 "(--split), or null for all."
             )
         return self.chosen(drives, None, options.drives)
 
-    def open(self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanFiles:
+    def open(
+        self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0
+    ) -> ScanFiles:
         if reading.projection == "unfolding" and reading.sensor.name == "hdl64e":
             log.warning(
-                "unfolded rows are the sensor's rings, which are not evenly spaced: sensor=hdl64e_rings has their "
+                "unfolded rows are the sensor's rings, which are not evenly spaced: "
+                "sensor=hdl64e_rings has their "
                 "elevations, sensor=hdl64e is up to 6 degrees off"
             )
         first = 0
@@ -151,51 +181,75 @@ def odometry(root: Path) -> list[Drive]:
 
 
 def kitti_object(root: Path) -> list[Drive]:
-    """`training/velodyne/*.bin` and `testing/velodyne/*.bin`: KITTI object, each scan another place."""
-    folders = [folder for name in ("training", "testing") if (folder := root / name / "velodyne").is_dir()]
+    """`training/velodyne/*.bin` and `testing/velodyne/*.bin`: KITTI object, each scan another
+    place.
+    """
+    folders = [
+        folder for name in ("training", "testing") if (folder := root / name / "velodyne").is_dir()
+    ]
     return [Drive(folder.parent.name, _files(folder, (".bin",))) for folder in folders]
 
 
 def nuscenes(root: Path) -> list[Drive]:
-    """`samples/LIDAR_TOP/*.pcd.bin` and `sweeps/LIDAR_TOP/*.pcd.bin`, or such files in the folder itself.
+    """`samples/LIDAR_TOP/*.pcd.bin` and `sweeps/LIDAR_TOP/*.pcd.bin`, or such files in the folder
+    itself.
 
-    A drive is a log, named at the start of each file name: n015-2018-07-24-11-22-45+0800. Samples, the annotated scans,
-    and sweeps are merged in the order of recording.
+    A drive is a log, named at the start of each file name: n015-2018-07-24-11-22-45+0800. Samples,
+    the annotated scans, and sweeps are merged in the order of recording.
     """
     logs: dict[str, list[tuple[str, str]]] = {}
     for folder in (root / "samples" / "LIDAR_TOP", root / "sweeps" / "LIDAR_TOP", root):
         for path in _files(folder, (".pcd.bin",)) if folder.is_dir() else ():
             file = os.path.basename(path)
             logs.setdefault(file.partition("__")[0], []).append((file, path))
-    return [Drive(log, tuple(path for _, path in sorted(scans))) for log, scans in sorted(logs.items())]
+    return [
+        Drive(log, tuple(path for _, path in sorted(scans))) for log, scans in sorted(logs.items())
+    ]
 
 
 def folder(root: Path) -> list[Drive]:
-    """Any folder of .bin, .pcd.bin, .pcd, .ply, .npy, .xyz, .las, .feather, .parquet, else of .csv, .txt, .npz.
+    """Any folder of .bin, .pcd.bin, .pcd, .ply, .npy, .xyz, .las, .feather, .parquet, else of .csv,
+    .txt, .npz.
 
-    Each folder below it with such files is a drive. If a scan exists in several formats, one file is taken: its range
-    image, else the last by its ending. Folders that r2flow wrote below a folder of other scans are left out: answers
-    would be taken for measurements.
+    Each folder below it with such files is a drive. If a scan exists in several formats, one file
+    is taken: its range image, else the last by its ending. Folders that r2flow wrote below a folder
+    of other scans are left out: answers would be taken for measurements.
     """
     if (root / "samples" / "LIDAR_TOP").is_dir():
-        warn_odd(root / "samples", "of nuScenes? data=nuscenes, in a verb nuscenes:FOLDER, reads its lidar alone")
+        warn_odd(
+            root / "samples",
+            "of nuScenes? data=nuscenes, in a verb nuscenes:FOLDER, reads its lidar alone",
+        )
     below = sorted(Path(place) for place, _ in _walk(root))
     made = {place for place in below if place != root and manifest_of(place)}
     own = [place for place in below if made.isdisjoint((place, *place.parents))]
     for endings in (FIRM_ENDINGS, LOOSE_ENDINGS):
         for places in (own, below):
-            drives = [Drive(str(place.relative_to(root)), _one_of_each(_files(place, endings))) for place in places]
+            drives = [
+                Drive(str(place.relative_to(root)), _one_of_each(_files(place, endings)))
+                for place in places
+            ]
             if any(drive.scans for drive in drives):
                 if len(places) < len(below):
-                    warn_odd(min(made), "left out, since r2flow wrote it, as are other such folders below the scans")
+                    warn_odd(
+                        min(made),
+                        "left out, since r2flow wrote it, as are other such folders below the "
+                        "scans",
+                    )
                 return drives
     return []
 
 
 def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
-    """All folders from a root down with their files, following links, each folder once, without hidden folders."""
+    """All folders from a root down with their files, following links, each folder once, without
+    hidden folders.
+    """
     seen: set[str] = set()
-    walk = os.walk(root, onerror=lambda e: warn_odd(Path(e.filename), "left out, not readable"), followlinks=True)
+    walk = os.walk(
+        root,
+        onerror=lambda e: warn_odd(Path(e.filename), "left out, not readable"),
+        followlinks=True,
+    )
     for place, folders, names in walk:
         if (real := os.path.realpath(place)) in seen:
             folders.clear()
@@ -206,9 +260,16 @@ def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def _elsewhere(root: Path) -> str:
-    """Advice on how to convert the files of a folder without scans, if they hold scans in another form."""
+    """Advice on how to convert the files of a folder without scans, if they hold scans in another
+    form.
+    """
     paths = (os.path.join(place, name) for place, names in _walk(root) for name in sorted(names))
-    known = ((path, advice) for path in paths for end, advice in ELSEWHERE.items() if path.lower().endswith(end))
+    known = (
+        (path, advice)
+        for path in paths
+        for end, advice in ELSEWHERE.items()
+        if path.lower().endswith(end)
+    )
     return next((f" {path} {advice.format(path=path)}." for path, advice in known), "")
 
 
@@ -219,12 +280,19 @@ def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def named_drive(drives: list[Drive], name: str) -> Drive:
-    """The only drive with a name, or with a number in its name; refuses names that match no drive or several."""
-    matches = [d for d in drives if name == d.name or (name.isdecimal() and int(name) in _numbers(d.name))]
+    """The only drive with a name, or with a number in its name; refuses names that match no drive
+    or several.
+    """
+    matches = [
+        d for d in drives if name == d.name or (name.isdecimal() and int(name) in _numbers(d.name))
+    ]
     if len(matches) != 1:
         names = [drive.name for drive in drives]
         listed = "none, its scans are in one folder" if names == ["."] else ", ".join(names)
-        raise InputError(f"{len(matches) or 'no'} drive{'s' * (len(matches) > 1)} named {name!r}; known: {listed}.")
+        raise InputError(
+            f"{len(matches) or 'no'} drive{'s' * (len(matches) > 1)} named {name!r}; known: "
+            f"{listed}."
+        )
     return matches[0]
 
 
@@ -236,8 +304,14 @@ def _numbers(name: str) -> set[int]:
 
 
 def _files(folder: Path, endings: tuple[str, ...]) -> tuple[str, ...]:
-    """The files of a folder with some endings, in order, without hidden files (macOS writes ._NAME next to NAME)."""
+    """The files of a folder with some endings, in order, without hidden files (macOS writes ._NAME
+    next to NAME).
+    """
     names = [n for n in os.listdir(folder) if n.lower().endswith(endings) and not n.startswith(".")]
     # By the numbers in a name: 2.bin comes before 10.bin.
-    names.sort(key=lambda n: [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"([0-9]+)", n)])
+    names.sort(
+        key=lambda n: [
+            (int(part) if part.isdecimal() else -1, part) for part in re.split(r"([0-9]+)", n)
+        ]
+    )
     return tuple(os.path.join(folder, name) for name in names)

@@ -17,8 +17,12 @@ from r2flow.lidar.encoding import FAR, Encoding, wrong_with
 from r2flow.lidar.sensors import Sensor
 
 Item = dict[str, Tensor]
-Further = Callable[[Tensor, Sensor, np.random.Generator], Item]  # of x_1, (C, H, W), its sensor, the image's draws
-Key = int | tuple[int, int]  # of an item: the number k of the image in the run, and that of the scan; or both in one
+Further = Callable[
+    [Tensor, Sensor, np.random.Generator], Item
+]  # of x_1, (C, H, W), its sensor, the image's draws
+Key = (
+    int | tuple[int, int]
+)  # of an item: the number k of the image in the run, and that of the scan; or both in one
 
 
 class ItemFormat(NamedTuple):
@@ -39,7 +43,8 @@ class FlowDataset(Dataset[Item]):
     - x_1, (B, C, H, W): scans in model space, where t = 1;
     - x_0, (B, *noise_shape): standard normal noise, where t = 0;
     - u, (B,): uniform in [0, 1); the stage maps it to t;
-    - k, (B,): number of the image in the run; a stage derives further draws for an image from (seed, purpose, k);
+    - k, (B,): number of the image in the run; a stage derives further draws for an image from
+      (seed, purpose, k);
     - the keys of `further`: a stage's conditions, the same for every seed in validation.
 
     A mixture has a sensor per part; images of several sizes need a `further` that crops them.
@@ -73,7 +78,9 @@ class FlowDataset(Dataset[Item]):
         encoding = self.encodings[self.source.locate(index)[0]]
         image = self.source[index][: encoding.channels]
         if image.shape != encoding.shape:
-            raise InputError(f"{self.source.names[index]}: an image of {encoding.shape}, found {image.shape}.")
+            raise InputError(
+                f"{self.source.names[index]}: an image of {encoding.shape}, found {image.shape}."
+            )
         if wrong := wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range)):
             raise InputError(f"{self.source.names[index]}: {wrong}.")
         if self.augment:
@@ -83,7 +90,9 @@ class FlowDataset(Dataset[Item]):
         if self.format.further is None:
             return item
         seed = self.seed if self.purpose == "training" else 0
-        return item | self.format.further(x_1, encoding.sensor, noise.generator(seed, "condition", k))
+        return item | self.format.further(
+            x_1, encoding.sensor, noise.generator(seed, "condition", k)
+        )
 
 
 class Order(Protocol):
@@ -93,7 +102,8 @@ class Order(Protocol):
 
 
 class Permutations:
-    """Scan permutation_{k // n}[k mod n] of n scans: every epoch has every scan once, in a new order.
+    """Scan permutation_{k // n}[k mod n] of n scans: every epoch has every scan once, in a new
+    order.
 
     The permutations are counter-based: the order at k does not need the draws before k.
     """
@@ -115,14 +125,15 @@ class Permutations:
 class RunSampler(DistributedSampler[Key]):
     """The images of one rank in an epoch of a run, or a validation, as (k, scan).
 
-    An epoch of n images is the range [first, first + n) of k, of which rank r of R takes first + r, first + r + R, ...
-    So batches of b images on each rank are the global batches of b R images, whatever R is. Lightning leaves a
-    `DistributedSampler` as it is.
+    An epoch of n images is the range [first, first + n) of k, of which rank r of R takes first + r,
+    first + r + R, ... So batches of b images on each rank are the global batches of b R images,
+    whatever R is. Lightning leaves a `DistributedSampler` as it is.
 
     Args:
         order: Maps k to a scan.
         images: Number n of images of an epoch, on all ranks.
-        place: Gives the next k of the run, and the number of images of this epoch before it, which a resumed run skips.
+        place: Gives the next k of the run, and the number of images of this epoch before it, which
+            a resumed run skips.
     """
 
     def __init__(
@@ -185,7 +196,9 @@ class Mixture(ScanSource):
         for index in indices:
             part, number = self.locate(index)
             chosen[part].append(number)
-        return Mixture([part.subset(numbers) for part, numbers in zip(self.parts, chosen, strict=True)])
+        return Mixture(
+            [part.subset(numbers) for part, numbers in zip(self.parts, chosen, strict=True)]
+        )
 
 
 class MixedOrder:
@@ -196,7 +209,9 @@ class MixedOrder:
 
     def __init__(self, sizes: Sequence[int], weights: Sequence[float], seed: int) -> None:
         if not all(sizes):
-            raise InputError(f"data.parts: a part has no scan left to train on; the parts have {list(sizes)}.")
+            raise InputError(
+                f"data.parts: a part has no scan left to train on; the parts have {list(sizes)}."
+            )
         self.seed = seed
         self.sizes = sizes
         self.edges = np.cumsum(weights) / np.sum(weights)

@@ -3,8 +3,8 @@
     scans = open_scans("kitti_360:/data/KITTI-360", Reading(SENSORS["hdl64e"]), split="test")
     scans.source[0]                 range in metres and reflectance, (2, H, W)
 
-`SOURCES` is the registry of names. To add a kind of scans, register it: `SOURCES.add("mine", Layout(find_mine))` for
-scan files listed by `find_mine(root)`, or a subclass of `SourceKind`.
+`SOURCES` is the registry of names. To add a kind of scans, register it: `SOURCES.add("mine",
+Layout(find_mine))` for scan files listed by `find_mine(root)`, or a subclass of `SourceKind`.
 """
 
 import logging
@@ -23,7 +23,14 @@ from r2flow.data.options import FOLDER, PREPARED, SIMULATED, SourceOptions
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, mismatch_of, warn_of_other_sensor
+from r2flow.data.sources import (
+    ScanFiles,
+    ScanSource,
+    SimulatedScans,
+    made_here,
+    mismatch_of,
+    warn_of_other_sensor,
+)
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS, Sensor, named_sensor
@@ -39,7 +46,9 @@ SCENES = 1000  # default number of simulated scans
 class Simulated(SourceKind):
     levels = 100
 
-    def open(self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+    def open(
+        self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0
+    ) -> ScanSource:
         scenes = range(first_scene, first_scene + scans.options.scenes)
         return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance))
 
@@ -47,7 +56,9 @@ class Simulated(SourceKind):
 class Prepared(SourceKind):
     """Shards of `r2flow prepare`."""
 
-    def open(self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+    def open(
+        self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0
+    ) -> ScanSource:
         options = scans.options
         store = read_prepared(options.folder)
         refuse_other_images(store, reading)
@@ -57,7 +68,11 @@ class Prepared(SourceKind):
             parts = sorted({part for drive in store.drives if (part := kind.split_of(drive.name))})
             if len(parts) > 1:
                 held = " and ".join(parts)
-                log.warning("%s holds %s drives, and data.split=null takes all of them", options.folder, held)
+                log.warning(
+                    "%s holds %s drives, and data.split=null takes all of them",
+                    options.folder,
+                    held,
+                )
         place = {name: number for number, name in enumerate(store.names)}
         chosen = kind.chosen(store.drives, options.split, options.drives)
         numbers = [place[name] for drive in chosen for name in drive.scans]
@@ -65,7 +80,9 @@ class Prepared(SourceKind):
 
     def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
         folder = scans.options.folder
-        return f"the scans in {folder} have no reflectance" if self.levels_of(scans) is None else None
+        return (
+            f"the scans in {folder} have no reflectance" if self.levels_of(scans) is None else None
+        )
 
     def levels_of(self, scans: "Described") -> int | None:
         return read_prepared(scans.options.folder).described["levels"]
@@ -113,17 +130,25 @@ class Described:
 
     @cached_property
     def stored(self) -> Reading | None:
-        """The stored reading of scans that r2flow wrote (prepared, sampled or simulated); None for other scans."""
+        """The stored reading of scans that r2flow wrote (prepared, sampled or simulated); None for
+        other scans.
+        """
         described = self.manifest.get("recipe", {}).get("reading")
         if described is None:
             return None
         stored = Reading.of(described)
-        return replace(stored, reflectance=AUTO, within_limits=False) if self.options.name == PREPARED else stored
+        return (
+            replace(stored, reflectance=AUTO, within_limits=False)
+            if self.options.name == PREPARED
+            else stored
+        )
 
     @cached_property
     def made_here(self) -> bool:
         """Whether r2flow wrote the samples or simulated scans, whose reflectance is in [0, 1]."""
-        return self.options.name == FOLDER and (bool(self.manifest) or made_here(self.options.folder))
+        return self.options.name == FOLDER and (
+            bool(self.manifest) or made_here(self.options.folder)
+        )
 
     @property
     def is_samples(self) -> bool:
@@ -131,7 +156,9 @@ class Described:
         return self.manifest.get("format") in ("r2flow samples", "r2flow answers")
 
     def scale(self, of_sensor: float | None) -> float:
-        """Default value of full reflectance in the files; `of_sensor`: that of the sensor, if known."""
+        """Default value of full reflectance in the files; `of_sensor`: that of the sensor, if
+        known.
+        """
         if self.options.name == FOLDER:
             return 1.0 if self.made_here else of_sensor or 1.0
         return self.kind.reflectance_scale
@@ -148,7 +175,9 @@ class Described:
             if self.made_here:
                 reading = replace(reading, reflectance_scale=1.0)
         if reading.reflectance == AUTO:
-            reading = replace(reading, reflectance=self.kind.lacks_reflectance(self, reading.on_bad_scan) is None)
+            reading = replace(
+                reading, reflectance=self.kind.lacks_reflectance(self, reading.on_bad_scan) is None
+            )
         source = self.kind.open(self, reading, seed, first_scene)
         if not len(source):
             chosen = f"split={options.split!r}, drives={options.drives}"
@@ -159,18 +188,25 @@ class Described:
         """Refuse samples or completed scans of another sensor or size."""
         if not self.is_samples or self.stored is None or self.stored.sensor.same_image(sensor):
             return
-        theirs, ours = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (self.stored.sensor, sensor))
+        theirs, ours = (
+            f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (self.stored.sensor, sensor)
+        )
         raise InputError(
-            f"{self.options.folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: give no other "
-            "--sensor or --size, no scans of another sensor next to them, and for a model of another sensor point "
+            f"{self.options.folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: "
+            "give no other "
+            "--sensor or --size, no scans of another sensor next to them, and for a model of "
+            "another sensor point "
             "clouds (.ply, .bin)."
         )
 
     def refuse_parts(self) -> None:
-        """Refuse samples of a region of the image: metrics would treat the rest of the image as missing returns."""
+        """Refuse samples of a region of the image: metrics would treat the rest of the image as
+        missing returns.
+        """
         if self.manifest.get("recipe", {}).get("region"):
             raise InputError(
-                f"{self.label} holds a part of each scan alone (see its {MANIFEST}) and cannot be compared with whole "
+                f"{self.label} holds a part of each scan alone (see its {MANIFEST}) and cannot be "
+                "compared with whole "
                 "scans: sample without --sector and --rows."
             )
 
@@ -182,8 +218,9 @@ def describe(spec: Spec) -> Described:
     """Look a name of scans up.
 
     Args:
-        spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`, `NAME:ROOT` with a
-            name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run folder (its samples).
+        spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`,
+            `NAME:ROOT` with a name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run
+            folder (its samples).
 
     Raises:
         InputError: there is no such file, folder or data set.
@@ -195,7 +232,9 @@ def describe(spec: Spec) -> Described:
     kind, colon, rest = text.partition(":")
     if colon and kind in SOURCES:
         if kind == SIMULATED and not rest.isdecimal():
-            raise InputError(f"simulated scans are named by their seed, as simulated:0; found {text!r}.")
+            raise InputError(
+                f"simulated scans are named by their seed, as simulated:0; found {text!r}."
+            )
         return Described(text, SourceOptions(kind, rest, scenes=SCENES))
     if colon and not path.exists() and "/" not in kind and "\\" not in kind:
         SOURCES[kind]  # not known
@@ -209,7 +248,9 @@ def describe(spec: Spec) -> Described:
     if (path / "config.yaml").is_file() or (path / "checkpoints").is_dir():
         samples = path / "samples"
         if not samples.is_dir():
-            raise InputError(f"{path} is a run without samples; draw some: r2flow sample {path} --out {samples}.")
+            raise InputError(
+                f"{path} is a run without samples; draw some: r2flow sample {path} --out {samples}."
+            )
         return Described(text, SourceOptions(FOLDER, str(samples)))
     return folder
 
@@ -220,7 +261,9 @@ def _not_found(text: str, path: Path) -> InputError:
     if path.is_symlink():
         return InputError(f"{path} is a broken link to {path.readlink()}.")
     hint = did_you_mean(path.name, [*MODELS, *(other.name for other in path.parent.glob("*"))])
-    return InputError(f"{path} does not exist. Give a scan, a folder, NAME:FOLDER, simulated:SEED or a run.{hint}")
+    return InputError(
+        f"{path} does not exist. Give a scan, a folder, NAME:FOLDER, simulated:SEED or a run.{hint}"
+    )
 
 
 def open_scans(
@@ -232,14 +275,16 @@ def open_scans(
     sensor: Sensor | str | None = None,
     size: tuple[int, int] | None = None,
 ) -> ScanSet:
-    """Open the scans of a name. Scans are read on access, except those that decide whether the set has reflectance.
+    """Open the scans of a name. Scans are read on access, except those that decide whether the set
+    has reflectance.
 
     Args:
         spec: As for `describe`.
         reading: How scans become images; None: `reading_for([spec], sensor=sensor, size=size)`.
         split: A part of the data set's standard split.
         num: Maximum number of scans, chosen by a fixed shuffle; the number of simulated scenes.
-        own_size: For pictures: take the size of the range image instead of the sensor's, and do not compare beams.
+        own_size: For pictures: take the size of the range image instead of the sensor's, and do not
+            compare beams.
     """
     scans = describe(spec)
     if num is not None and num < 1:
@@ -252,7 +297,9 @@ def open_scans(
         raise InputError(f"{scans.label} has no split: leave {split!r} out.")
     if scans.file is None:
         if split or simulated or reading.columns:
-            scans = scans.part(split=split, scenes=num or SCENES, reading={"columns": reading.columns})
+            scans = scans.part(
+                split=split, scenes=num or SCENES, reading={"columns": reading.columns}
+            )
         seed = int(scans.options.root or 0) if simulated else 0
         return ScanSet(scans.label, scans.open(reading, seed), reading.sensor).limited(num)
     image = read_range_image(scans.file)
@@ -275,7 +322,9 @@ def find_drives(
     name: str, root: str | Path, split: str | None = None, drives: Sequence[str | int] | None = None
 ) -> list[Drive]:
     """The drives of a data set of scan files, in order: `Layout.find_drives`."""
-    return SOURCES[name].find_drives(SourceOptions(name, str(root), split, None if drives is None else list(drives)))
+    return SOURCES[name].find_drives(
+        SourceOptions(name, str(root), split, None if drives is None else list(drives))
+    )
 
 
 def reading_for(
@@ -286,25 +335,32 @@ def reading_for(
     estimate_scale: bool = False,
     **fields: Any,
 ) -> Reading:
-    """How scans become images: `fields` first, then the model's training scans, the scans' manifest, the defaults.
+    """How scans become images: `fields` first, then the model's training scans, the scans'
+    manifest, the defaults.
 
-    `fields` are those of `Reading`; None is not given. The default sensor is hdl64e, or the built-in sensor whose beams
-    plain scan files have. Scans have names as for `describe`; None is skipped. `model` is the checkpoint that they
-    are for: another sensor or size than its own is refused. `estimate_scale` leaves None for plain scan files whose
+    `fields` are those of `Reading`; None is not given. The default sensor is hdl64e, or the
+    built-in sensor whose beams plain scan files have. Scans have names as for `describe`; None is
+    skipped. `model` is the checkpoint that they
+    are for: another sensor or size than its own is refused. `estimate_scale` leaves None for plain
+    scan files whose
     sensor does not tell it: an estimate.
     """
     described = [describe(spec) for spec in scans if spec is not None]
     stored = next((one.stored for one in described if one.stored is not None), None)
     first = described[0] if described else Described("", SourceOptions(FOLDER))
     reading = _reading_of(model) if model else stored or Reading(SENSORS[first.kind.sensor])
-    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if v is not None}
+    given: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if v is not None
+    }
     reading = replace(reading, **given)
     if described and not (model or stored or sensor):
         sensor = _detected(first, reading)
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and not chosen.same_image(model.sensor):
         expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
-        raise InputError(f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out.")
+        raise InputError(
+            f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out."
+        )
     reading = replace(reading, sensor=reading.sensor if model else chosen)
     if "reflectance_scale" in given or not described:
         return reading
@@ -322,17 +378,29 @@ def _detected(scans: Described, reading: Reading) -> str | None:
     mismatch = mismatch_of(scans.paths, reading, scans.made_here)
     if mismatch is None or not mismatch.sure:
         return None
-    log.warning("%s: read as scans of %s, whose beams are nearest; --sensor names another", scans.label, mismatch.name)
+    log.warning(
+        "%s: read as scans of %s, whose beams are nearest; --sensor names another",
+        scans.label,
+        mismatch.name,
+    )
     return mismatch.name
 
 
 def _reading_of(model: Any) -> Reading:
-    """How a model's training scans became images; for a mixture, the fields on which all parts agree."""
+    """How a model's training scans became images; for a mixture, the fields on which all parts
+    agree.
+    """
     data = model.config.get("data", {})
     readings = [part.get("reading") for part in data.get("parts") or ()] or [data.get("reading")]
     fields = ("projection", "convention", "reflectance_scale")
-    agreed = {key: values.pop() for key in fields if len(values := {(r or {}).get(key) for r in readings}) == 1}
-    return Reading(model.sensor, **{key: value for key, value in agreed.items() if value is not None})
+    agreed = {
+        key: values.pop()
+        for key in fields
+        if len(values := {(r or {}).get(key) for r in readings}) == 1
+    }
+    return Reading(
+        model.sensor, **{key: value for key, value in agreed.items() if value is not None}
+    )
 
 
 def read(
@@ -346,7 +414,9 @@ def read(
         raise InputError(f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
     fields: dict[str, Any] = {"reflectance_scale": reflectance_scale, "columns": columns}
     reading = reading_for([scans], sensor=sensor, estimate_scale=True, **fields)
-    image = torch.from_numpy(open_scans(scans, replace(reading, on_bad_scan="error", within_limits=True)).source[0])
+    image = torch.from_numpy(
+        open_scans(scans, replace(reading, on_bad_scan="error", within_limits=True)).source[0]
+    )
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
 
 

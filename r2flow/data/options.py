@@ -14,15 +14,24 @@ from r2flow.lidar.scan_files import check_columns
 from r2flow.registry import Count, Natural, NonNegative, Portion, Positive, Seed, strict
 from r2flow.samplers import build_sampler
 
-SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # names in `r2flow.data.opening.SOURCES`
-MIXED, PAIRS = "mixed", "pairs"  # other values of `data.name`: several sets of scans, and pairs drawn by a flow
+SIMULATED, PREPARED, FOLDER = (
+    "simulated",
+    "prepared",
+    "folder",
+)  # names in `r2flow.data.opening.SOURCES`
+MIXED, PAIRS = (
+    "mixed",
+    "pairs",
+)  # other values of `data.name`: several sets of scans, and pairs drawn by a flow
 Data = dict[str, Any]  # of a config
 
 
 @strict
 @dataclass(frozen=True)
 class ReadingOptions:
-    """Fields of a `Reading` in a config (`data.reading`); None: from the parent run or the scans, or default."""
+    """Fields of a `Reading` in a config (`data.reading`); None: from the parent run or the scans,
+    or default.
+    """
 
     projection: Projection | None = None
     convention: Convention | None = None
@@ -70,7 +79,9 @@ class PartOptions(SourceOptions):
     """One part of a mixture (`data.parts`)."""
 
     weight: Positive | None = None  # relative share of a run's images
-    sensor: Mapping[str, Any] | None = None  # `build_sensor`; None: the run's. Only stage=transfer takes several
+    sensor: Mapping[str, Any] | None = (
+        None  # `build_sensor`; None: the run's. Only stage=transfer takes several
+    )
 
 
 @strict
@@ -80,7 +91,9 @@ class ValidationOptions:
 
     share: Portion = 0.1  # approximate share of the scans to hold out, in one contiguous block
     scans: Natural = 64  # maximum number of validation scans
-    data: Mapping[str, Any] | None = None  # another set of scans to hold out instead: {name, root, split, drives, ...}
+    data: Mapping[str, Any] | None = (
+        None  # another set of scans to hold out instead: {name, root, split, drives, ...}
+    )
 
 
 @strict
@@ -89,11 +102,16 @@ class PairOptions:
     """Settings of a set of pairs (`data.pairs`)."""
 
     num: Count = 1000
-    sampler: Mapping[str, Any] = field(default_factory=lambda: {"name": "adams3"})  # of the flow that draws them
+    sampler: Mapping[str, Any] = field(
+        default_factory=lambda: {"name": "adams3"}
+    )  # of the flow that draws them
     batch_size: Count = 16  # pairs solved in one batch; the last bits of a pair depend on it
     shard_mib: Positive = 16.0  # size of a shard; a killed process repeats its shard
-    seed: Seed = 0  # seed of the noise, separate from the run's: runs of several seeds can share one set of pairs
-    first: Seed | None = None  # index of the first pair; None: after the pairs that the flow itself was trained on
+    # seed of the noise, separate from the run's: runs of several seeds can share one set of pairs
+    seed: Seed = 0
+    first: Seed | None = (
+        None  # index of the first pair; None: after the pairs that the flow itself was trained on
+    )
     precision: Precision = "32-true"  # precision of the network
     of: str | None = None  # the flow that draws the pairs; None: the stage's parent
     parent: str | None = None  # hash of the flow, filled in by the run
@@ -105,21 +123,33 @@ class PairOptions:
 @strict
 @dataclass(frozen=True)
 class DataOptions(SourceOptions):
-    """All keys of a run's `data`. `name` may also be `mixed` or `pairs`; for `pairs`, `root` is their folder.
+    """All keys of a run's `data`. `name` may also be `mixed` or `pairs`; for `pairs`, `root` is
+    their folder.
 
-    The weights of parts are relative shares of the run's images; without weights, the parts are concatenated.
+    The weights of parts are relative shares of the run's images; without weights, the parts are
+    concatenated.
     """
 
-    parts: Sequence[Mapping[str, Any]] | None = None  # of `mixed`: {name, root, split, drives, ..., weight} each
-    augment: Mapping[str, Any] | None = None  # `r2flow.data.augment.Augmentation`, of training scans only
+    parts: Sequence[Mapping[str, Any]] | None = (
+        None  # of `mixed`: {name, root, split, drives, ..., weight} each
+    )
+    augment: Mapping[str, Any] | None = (
+        None  # `r2flow.data.augment.Augmentation`, of training scans only
+    )
     batch_size: Count = 8  # images in one optimiser step, over all devices and accumulated batches
     workers: Annotated[int, Field(ge=0, le=1000)] = 0  # loader processes per device
-    memory_gib: NonNegative = 2.0  # training scans that fit into this are kept in memory, others read when needed
+    memory_gib: NonNegative = (
+        2.0  # training scans that fit into this are kept in memory, others read when needed
+    )
     validation: ValidationOptions = ValidationOptions()
     pairs: PairOptions = PairOptions()
-    scans: Mapping[str, Any] | None = None  # `SourceOptions` of scans next to pairs, for the velocities of a flow map
+    scans: Mapping[str, Any] | None = (
+        None  # `SourceOptions` of scans next to pairs, for the velocities of a flow map
+    )
 
     def __post_init__(self) -> None:
         for key, name in (("parts", MIXED), ("scans", PAIRS)):
             if getattr(self, key) is not None and self.name != name:
-                raise InputError(f"data.{key} needs data={name}, found data={self.name}; leave one of them out.")
+                raise InputError(
+                    f"data.{key} needs data={name}, found data={self.name}; leave one of them out."
+                )

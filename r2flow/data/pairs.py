@@ -27,10 +27,12 @@ from r2flow.store import Damaged, Store
 
 
 class PairStore(Store):
-    """A folder of pairs: shard s holds the batches [s S, (s + 1) S), batch b the indices first + [b B, (b + 1) B).
+    """A folder of pairs: shard s holds the batches [s S, (s + 1) S), batch b the indices first + [b
+    B, (b + 1) B).
 
-    A pair depends on its index and on all `options` except `num`: folders of equal options hold the same bytes. The
-    last shard has only the batches that the first `num` pairs need; it is made again for a larger `num`.
+    A pair depends on its index and on all `options` except `num`: folders of equal options hold the
+    same bytes. The last shard has only the batches that the first `num` pairs need; it is made
+    again for a larger `num`.
 
     Args:
         shape: (C, H, W) of a scan in model space.
@@ -68,18 +70,29 @@ class PairStore(Store):
     def has(self, item: int) -> bool:
         """Whether a shard exists and has all batches that the first `num` pairs need."""
         try:
-            return len(self.head(item)["usable"]) >= len(self.batches_of(item)) * self.options.batch_size
+            return (
+                len(self.head(item)["usable"])
+                >= len(self.batches_of(item)) * self.options.batch_size
+            )
         except (FileNotFoundError, Damaged):
             return False
 
     def missing_pairs(self) -> int:
-        return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.options.batch_size
+        return (
+            sum(len(self.batches_of(shard)) for shard in self.missing(self.shards))
+            * self.options.batch_size
+        )
 
     def usable(self) -> np.ndarray:
         """The numbers of the usable pairs, from 0; refuses a folder that lacks pairs."""
         num, lacking = self.options.num, min(self.missing_pairs(), self.options.num)
-        check(not lacking, f"{self.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
-        return np.flatnonzero([flag for shard in self.shards for flag in self.head(shard)["usable"]][:num])
+        check(
+            not lacking,
+            f"{self.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.",
+        )
+        return np.flatnonzero(
+            [flag for shard in self.shards for flag in self.head(shard)["usable"]][:num]
+        )
 
     def noise(self, index: int) -> Tensor:
         """x_0 of a pair, which is not stored: the noise of (seed, "pairs", index)."""
@@ -87,28 +100,45 @@ class PairStore(Store):
 
 
 def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> list[bool]:
-    """Make the missing or damaged pairs of a store, with a progress bar; `wait`: await those that others are making.
+    """Make the missing or damaged pairs of a store, with a progress bar; `wait`: await those that
+    others are making.
 
     The result is whether each pair that this process has drawn is usable.
 
-    x_1 is the generator's sample for x_0 = `store.noise`, neither clamped nor snapped, in half precision. With
-    `renoise` of a flow map, it is the sample of the first jump, corrected by later jumps; fresh noise is a function of
-    (seed, index, step). Batches do not depend on the process: shards are byte-identical for any number of processes.
+    x_1 is the generator's sample for x_0 = `store.noise`, neither clamped nor snapped, in half
+    precision. With `renoise` of a flow map, it is the sample of the first jump, corrected by later
+    jumps; fresh noise is a function of (seed, index, step). Batches do not depend on the process:
+    shards are byte-identical for any number of processes.
     """
     if generator.noise_shape != store.noise_shape:
-        raise InputError(f"the noise of these pairs does not have the generator's shape {generator.noise_shape}.")
+        raise InputError(
+            f"the noise of these pairs does not have the generator's shape {generator.noise_shape}."
+        )
     flow, sampler = as_flow(generator, "a reflow pair", distilled=True), store.sampler
     sampler.check(flow)
-    check(sampler.paired, f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.")
-    usable, evaluations, start, seconds = list[bool](), 0, time.monotonic(), 0.0  # without waiting for others
-    launcher = os.getppid() if int(os.environ.get("LOCAL_RANK") or 0) else None  # the process that started this one
+    check(
+        sampler.paired,
+        f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.",
+    )
+    usable, evaluations, start, seconds = (
+        list[bool](),
+        0,
+        time.monotonic(),
+        0.0,
+    )  # without waiting for others
+    launcher = (
+        os.getppid() if int(os.environ.get("LOCAL_RANK") or 0) else None
+    )  # the process that started this one
 
     def make_shard(shard: int) -> None:
         nonlocal evaluations, seconds
         store.mend(shard)
         batches = []
         for batch in store.batches_of(shard):
-            if launcher not in (None, os.getppid()):  # killed: this process would draw all pairs and then fail
+            if launcher not in (
+                None,
+                os.getppid(),
+            ):  # killed: this process would draw all pairs and then fail
                 raise Stopped(LATER, "stopped: the process that launched this one has ended")
             batches.append(solve_batch(store, flow, batch))
             evaluations += int(batches[-1]["evaluations"].sum())
@@ -117,7 +147,8 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
             bar.set(len(usable))
             if not any(usable) and (len(usable) > 64 or batch == store.batches_of(shard)[-1]):
                 raise InputError(
-                    f"none of {len(usable)} pairs came to an end with sampler {sampler.name}: the flow is broken, or "
+                    f"none of {len(usable)} pairs came to an end with sampler {sampler.name}: the "
+                    "flow is broken, or "
                     "the tolerance out of its reach."
                 )
         tensors = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
@@ -129,10 +160,14 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         rank, ranks = rank_and_world_size()  # of a run, whose processes verify a part each
         for shard in store.shards[rank::ranks]:
             store.mend(shard)
-        missing = store.missing(store.shards)  # shuffled: processes rarely meet, also without common locks
+        missing = store.missing(
+            store.shards
+        )  # shuffled: processes rarely meet, also without common locks
         store.make(random.Random().sample(missing, len(missing)), make_shard, wait=wait)
     if usable:
-        unusable = "" if all(usable) else f", {usable.count(False)} did not converge and are left out"
+        unusable = (
+            "" if all(usable) else f", {usable.count(False)} did not converge and are left out"
+        )
         rate, cost = len(usable) / seconds, evaluations / len(usable)
         drawn = f"{len(usable)} pairs drawn in whole batches"
         print(f"{drawn}, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
@@ -145,7 +180,9 @@ def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.n
     x_1 is float16, (B, C, H, W); pairs that overflow float16 are not usable.
     """
     options, sampler = store.options, store.sampler
-    indices = range(store.first + batch * options.batch_size, store.first + (batch + 1) * options.batch_size)
+    indices = range(
+        store.first + batch * options.batch_size, store.first + (batch + 1) * options.batch_size
+    )
     x_0 = torch.stack([store.noise(index) for index in indices]).to(generator.device)
     fresh = noise.Draws(options.seed, indices, "pairs") if sampler.draws else None
     end = generator(x_0, sampler=sampler, draws=fresh, precision=options.precision)
@@ -160,14 +197,25 @@ def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.n
 class PairDataset(Dataset[Item]):
     """Some pairs of a store as training items; u depends only on (seed, purpose, k).
 
-    The keys are those of `FlowDataset`. Further keys with `scans`: scan, (C, H, W), a scan in model space, and noise,
-    (*noise_shape), independent of it.
+    The keys are those of `FlowDataset`. Further keys with `scans`: scan, (C, H, W), a scan in model
+    space, and noise, (*noise_shape), independent of it.
     """
 
     def __init__(
-        self, store: PairStore, numbers: np.ndarray, seed: int, purpose: str, scans: FlowDataset | None = None
+        self,
+        store: PairStore,
+        numbers: np.ndarray,
+        seed: int,
+        purpose: str,
+        scans: FlowDataset | None = None,
     ) -> None:
-        self.store, self.numbers, self.seed, self.purpose, self.scans = store, numbers, seed, purpose, scans
+        self.store, self.numbers, self.seed, self.purpose, self.scans = (
+            store,
+            numbers,
+            seed,
+            purpose,
+            scans,
+        )
         self.order = Permutations(0 if scans is None else len(scans), seed)
 
     def __len__(self) -> int:
@@ -188,7 +236,9 @@ class PairDataset(Dataset[Item]):
 
 
 def default_folder(checkpoint: Path) -> Path:
-    """The default folder of a flow's pairs: `pairs` in its run folder, else next to its file, in `runs` for a model."""
+    """The default folder of a flow's pairs: `pairs` in its run folder, else next to its file, in
+    `runs` for a model.
+    """
     if checkpoint.parent.name == "checkpoints":
         return checkpoint.parent.parent / "pairs"
     if name_of(checkpoint) is not None:

@@ -17,13 +17,32 @@ from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.errors import InputError, check, naming, warn_odd
 from r2flow.lidar.encoding import FAR, wrong_with
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
-from r2flow.lidar.scan_files import Points, points_beside, read_numbers, read_points, read_range_image, scan_ending
+from r2flow.lidar.scan_files import (
+    Points,
+    points_beside,
+    read_numbers,
+    read_points,
+    read_range_image,
+    scan_ending,
+)
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.lidar.transfer import Partial, image_through, points_of_same, points_through, rows_of, sensor_of
+from r2flow.lidar.transfer import (
+    Partial,
+    image_through,
+    points_of_same,
+    points_through,
+    rows_of,
+    sensor_of,
+)
 
-FEWER = 0.9  # with less than this share of rays per column, pixels between the rays are not measured
+FEWER = (
+    0.9  # with less than this share of rays per column, pixels between the rays are not measured
+)
 FEW = 4  # default number of simulated scans
-FROM, THROUGH = "--from, in Python by sensor", "in Python Checkpoint.through of such a sensor, uses them with densify"
+FROM, THROUGH = (
+    "--from, in Python by sensor",
+    "in Python Checkpoint.through of such a sensor, uses them with densify",
+)
 
 Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors
 
@@ -51,16 +70,19 @@ def open_partial(
     scale: float | None = None,
     most: int | None = None,
 ) -> Opened:
-    """Open the scans of some names (`open_scans`). Scans are read on demand, except a few to determine their sensor.
+    """Open the scans of some names (`open_scans`). Scans are read on demand, except a few to
+    determine their sensor.
 
-    A scan of the model's sensor is measured everywhere. A scan of another sensor is measured in the rows that contain
-    its beams: of prepared scans those of the sensor stored with them, of others those of `source`, else of the sensor
-    stored with samples, else an estimate from the scans.
+    A scan of the model's sensor is measured everywhere. A scan of another sensor is measured in the
+    rows that contain
+    its beams: of prepared scans those of the sensor stored with them, of others those of `source`,
+    else of the sensor stored with samples, else an estimate from the scans.
 
     Args:
         reading: How the model's training scans became images.
         scale: The value in scan files that means full reflectance; None: the default.
-        most: Maximum number of scans per name, evenly spread; None: all scans, or `FEW` simulated scans.
+        most: Maximum number of scans per name, evenly spread; None: all scans, or `FEW` simulated
+            scans.
     """
     opened: list[Opened] = []
     files: dict[Path, list[Described]] = {}  # by their folder
@@ -72,19 +94,29 @@ def open_partial(
             files.setdefault(scans.file.parent, []).append(scans)
         else:
             count = len(scans.paths)
-            paths = [points_beside(Path(scans.paths[number])) for number in spread(count, most or count)]
+            paths = [
+                points_beside(Path(scans.paths[number])) for number in spread(count, most or count)
+            ]
             opened.append(_files(scans, paths, reading, source, scale))
     for together in files.values():
         paths = [one.file for one in together if one.file]
         opened.append(_files(together[0], paths, reading, source, scale))
     partial_scans = [scan for some, _ in opened for scan in some]
-    if duplicates := [name for name, count in Counter(scan.name for scan in partial_scans).items() if count > 1]:
-        raise InputError(f"two of the scans would have answers called {duplicates[0]}: complete them apart.")
+    if duplicates := [
+        name for name, count in Counter(scan.name for scan in partial_scans).items() if count > 1
+    ]:
+        raise InputError(
+            f"two of the scans would have answers called {duplicates[0]}: complete them apart."
+        )
     return partial_scans, [line for _, lines in opened for line in lines]
 
 
 def _files(
-    described: Described, paths: list[Path], reading: Reading, source: Sensor | None, scale: float | None
+    described: Described,
+    paths: list[Path],
+    reading: Reading,
+    source: Sensor | None,
+    scale: float | None,
 ) -> Opened:
     target = reading.sensor
     lines: list[str] = []
@@ -92,32 +124,55 @@ def _files(
     folder = described.options.folder
     spec = described.label
     source = source or (stored.sensor if stored else None)
-    images = {path for path in paths if path.suffix.lower() == ".npy" and read_numbers(path).ndim == 3}
+    images = {
+        path for path in paths if path.suffix.lower() == ".npy" and read_numbers(path).ndim == 3
+    }
     read_image: Callable[[Path], Partial] = partial(_read_image, source=source, target=target)
     by_points = read_image
     if points := [path for path in paths if path not in images]:
-        scans = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
+        scans = [
+            read_points(points[number], reading.columns)
+            for number in spread(len(points), LOOKED_AT)
+        ]
         own = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
         doubt = other_sensor(scans, source or own)
         if not source and not doubt and own.shape[0] < target.shape[0]:
             source = own  # fewer beams than rows of the completions
         same = doubt is None
         if source:
-            same = source.shape[0] >= target.shape[0] and source.resized(*target.shape).same_image(target)
+            same = source.shape[0] >= target.shape[0] and source.resized(*target.shape).same_image(
+                target
+            )
         known = source or (target if same else None)
         try:
             fired = sensor_of(scans, known)
         except InputError as error:
-            raise InputError(f"{spec}: the sensor of the scans is not known, name it by {FROM}: {error}") from None
-        if not stored and not warn_of_frame(points[0], scans) and source and doubt and not doubt.finer:
+            raise InputError(
+                f"{spec}: the sensor of the scans is not known, name it by {FROM}: {error}"
+            ) from None
+        if (
+            not stored
+            and not warn_of_frame(points[0], scans)
+            and source
+            and doubt
+            and not doubt.finer
+        ):
             fits = f"; they fit {doubt.name}" if doubt.name else ""
-            warn_odd(points[0], f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}")
+            warn_odd(
+                points[0], f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}"
+            )
         of_sensor = known.reflectance_scale if known else None
         usual = described.scale(of_sensor) if described.options.name != FOLDER or of_sensor else 0.0
         full = scale or (1.0 if stored else full_reflectance(scans, usual) or usual) or 1.0
         strict = scale is not None or full in FULL_REFLECTANCE
         as_own = same and fired.columns >= FEWER * target.columns
-        by_points = partial(_read_points, reading=reading, fired=None if as_own else fired, scale=full, strict=strict)
+        by_points = partial(
+            _read_points,
+            reading=reading,
+            fired=None if as_own else fired,
+            scale=full,
+            strict=strict,
+        )
         if not as_own:
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
@@ -136,7 +191,9 @@ def _files(
     return [opened(path) for path in paths], lines
 
 
-def _images(described: Described, reading: Reading, source: Sensor | None, most: int | None) -> Opened:
+def _images(
+    described: Described, reading: Reading, source: Sensor | None, most: int | None
+) -> Opened:
     """Simulated and prepared scans, named by their number in the whole set."""
     spec = described.label
     target = reading.sensor
@@ -149,7 +206,9 @@ def _images(described: Described, reading: Reading, source: Sensor | None, most:
     def opened(number: int) -> PartialScan:
         name = f"{kind}-{number:06d}"
         content = name.encode if simulated else lambda: scans[number].tobytes()
-        return PartialScan(name, ".npy", lambda: image_through(scans[number], stored.sensor, target), content)
+        return PartialScan(
+            name, ".npy", lambda: image_through(scans[number], stored.sensor, target), content
+        )
 
     lines = [] if stored.sensor.same_image(target) else _described(spec, stored.sensor, target)
     return [opened(number) for number in spread(len(scans), most or len(scans))], lines
@@ -162,21 +221,35 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
     beams = f"{source.name} with {len(e)} beams from {e[0]:+.1f} to {e[-1]:+.1f} degrees"
     if not (rows >= 0).any():
         raise InputError(
-            f"{spec}: {beams}, and the model's sensor {target.name} sees {target.row_edges[0]:+.1f} to "
+            f"{spec}: {beams}, and the model's sensor {target.name} sees "
+            f"{target.row_edges[0]:+.1f} to "
             f"{target.row_edges[-1]:+.1f} degrees."
         )
-    measured = f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows of {target.name} are measured"
+    measured = (
+        f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows of {target.name} are measured"
+    )
     few = turns and source.columns < FEWER * target.columns
     turn = f", in the columns that its {source.columns} rays a turn meet" if few else ""
     lines = [f"{spec}: {beams}; {measured}{turn}"]
     if lost := int((rows < 0).sum()):
-        lines.append(f"{spec}: {lost} of its {len(e)} beams look past the view of {target.name} and are not used")
-        to = SENSORS[source.name] if source.name in SENSORS else replace(source, name="FILE (r2flow sensor)")
-        lines[-1] += f": --to {to.name} --size {max(target.shape[0], len(e))}x{to.columns}, {THROUGH}"
+        lines.append(
+            f"{spec}: {lost} of its {len(e)} beams look past the view of {target.name} and are not "
+            "used"
+        )
+        to = (
+            SENSORS[source.name]
+            if source.name in SENSORS
+            else replace(source, name="FILE (r2flow sensor)")
+        )
+        lines[-1] += (
+            f": --to {to.name} --size {max(target.shape[0], len(e))}x{to.columns}, {THROUGH}"
+        )
     return lines
 
 
-def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: float, strict: bool) -> Partial:
+def _read_points(
+    path: Path, reading: Reading, fired: Sensor | None, scale: float, strict: bool
+) -> Partial:
     """Read points of the model's sensor or, with `fired`, of another sensor."""
     target, points = reading.sensor, read_points(path, reading.columns)
     if fired is None and reading.projection == "unfolding":
@@ -194,7 +267,9 @@ def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: floa
     r = np.linalg.norm(points.xyz, axis=1)
     inside = (r >= target.min_range) & (r <= target.max_range)
     outside = int(np.count_nonzero(r) - inside.sum())
-    kept = Points(points.xyz[inside], None if strength is None else strength[inside], dropped=outside)
+    kept = Points(
+        points.xyz[inside], None if strength is None else strength[inside], dropped=outside
+    )
     return replace(seen, points=kept)
 
 
@@ -206,7 +281,11 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     check(not wrong, f"{path}: {wrong}; --mask FILE.npy names what was not measured.")
     r = stored[0]
     within = not r.any() or ((r >= target.min_range) & (r <= target.max_range)).any()
-    check(within, f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they in m?")
+    check(
+        within,
+        f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are "
+        "they in m?",
+    )
     image = read_range_image(path)
     if image is None:  # empty, or points (1, N, 4)
         raise InputError(other)
@@ -216,5 +295,7 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
         size, model = ("x".join(map(str, shape)) for shape in (image.shape[1:], target.shape))
         found = f" ({source.name} has {source.shape[0]})" if source else ""
         advice = f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone with densify"
-        raise InputError(f"{path} is a range image of {size}, those of the model are {model}: {advice}.")
+        raise InputError(
+            f"{path} is a range image of {size}, those of the model are {model}: {advice}."
+        )
     return image_through(image, target, target)

@@ -3,8 +3,8 @@
     source = open_scans("prepared/kitti_360").source
     source[0]                       range in metres and reflectance, (2, H, W)
 
-A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, if the scans have it, `reflectance` uint8 (n, H, W),
-in the codes of `r2flow.data.quantise`.
+A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, if the scans have it,
+`reflectance` uint8 (n, H, W), in the codes of `r2flow.data.quantise`.
 """
 
 import copy
@@ -45,16 +45,24 @@ class PreparedStore(Store):
         source: The scans to prepare; None of a folder that is only read.
         reading: How the scans became images.
         parts: The numbers of each shard's scans.
-        codes: The codes of range and, if the scans have it, of reflectance, by the name of their tensor.
+        codes: The codes of range and, if the scans have it, of reflectance, by the name of their
+            tensor.
     """
 
     def __init__(
-        self, folder: str | Path, recipe: Mapping[str, Any], drives: list[Drive], source: ScanSource | None = None
+        self,
+        folder: str | Path,
+        recipe: Mapping[str, Any],
+        drives: list[Drive],
+        source: ScanSource | None = None,
     ) -> None:
         super().__init__(folder, KIND, recipe)
         self.drives, self.source, self.reading = drives, source, Reading.of(recipe["reading"])
         scans, levels, sensor = range(recipe["scans"]), recipe["levels"], self.reading.sensor
-        self.parts = [scans[first : first + recipe["shard_scans"]] for first in scans[:: recipe["shard_scans"]]]
+        self.parts = [
+            scans[first : first + recipe["shard_scans"]]
+            for first in scans[:: recipe["shard_scans"]]
+        ]
         self.codes = {"range": range_codes(sensor.min_range, sensor.max_range)}
         if levels is not None:
             self.codes["reflectance"] = reflectance_codes(levels)
@@ -78,9 +86,14 @@ def plan_files(
     reading: Reading,
     shard_scans: int = 64,  # 13 MB at 64 x 1024, held in memory until written
 ) -> PreparedStore:
-    """The store in `folder` of scan files in drives below a root; reads some scans for the levels of reflectance."""
+    """The store in `folder` of scan files in drives below a root; reads some scans for the levels
+    of reflectance.
+    """
     paths = [path for drive in drives for path in drive.scans]
-    named = [Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in drives]
+    named = [
+        Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans))
+        for d in drives
+    ]
     reading = replace(reading, on_bad_scan="error", within_limits=True)
     warn_of_other_sensor(paths, reading, root)
     levels = _reflectance_levels(paths, reading)
@@ -119,15 +132,21 @@ def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
         for channel, (name, coder) in zip(image, store.codes.items(), strict=True):
             codes[name].append(coder.encode(channel))
     empty = np.empty((0, *store.reading.sensor.shape))
-    tensors = {name: np.array(codes[name] or empty, coder.dtype) for name, coder in store.codes.items()}
+    tensors = {
+        name: np.array(codes[name] or empty, coder.dtype) for name, coder in store.codes.items()
+    }
     store.write(shard, tensors, {"left_out": left_out, "files": store.sources_of(shard)})
 
 
-def prepare(store: PreparedStore, on_bad_scan: str = "error", workers: int = 1) -> tuple[int, list[int]]:
-    """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves out unusable scans.
+def prepare(
+    store: PreparedStore, on_bad_scan: str = "error", workers: int = 1
+) -> tuple[int, list[int]]:
+    """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves
+    out unusable scans.
 
-    The headers of the shards have the numbers of the scans left out and a digest of the files: shards of files that
-    have changed since are refused. The result is the number of scans left out, and the shards that were made.
+    The headers of the shards have the numbers of the scans left out and a digest of the files:
+    shards of files that have changed since are refused. The result is the number of scans left out,
+    and the shards that were made.
     """
     if not store.check() or store.missing(store.shards):  # else the folder may be read-only
         store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
@@ -136,11 +155,17 @@ def prepare(store: PreparedStore, on_bad_scan: str = "error", workers: int = 1) 
         file = store.files(shard)[0]
         check(
             not file.exists() or store.head(shard).get("files") == store.sources_of(shard),
-            f"{file} holds scans of other files. Give another folder by {store.option}, or remove it to make it again.",
+            f"{file} holds scans of other files. Give another folder by {store.option}, or remove "
+            "it to make it again.",
         )
     missing = store.missing(store.shards)
     with Bar("preparing", len(missing), "shards") as bar:
-        store.make(missing, partial(_make_shard, store, on_bad_scan == "skip"), workers, lambda shard: bar())
+        store.make(
+            missing,
+            partial(_make_shard, store, on_bad_scan == "skip"),
+            workers,
+            lambda shard: bar(),
+        )
     left_out = sum(len(store.head(shard)["left_out"]) for shard in store.shards)
     if left_out == len(store.names):
         for shard in store.shards:  # so that the folder takes another recipe
@@ -154,46 +179,72 @@ def read_prepared(folder: Path) -> PreparedStore:
     try:
         content = read_manifest(folder, KIND)
     except FileNotFoundError:
-        raise InputError(f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare.") from None
-    return PreparedStore(folder, content["recipe"], [Drive(name, tuple(scans)) for name, scans in content["drives"]])
+        raise InputError(
+            f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare."
+        ) from None
+    return PreparedStore(
+        folder, content["recipe"], [Drive(name, tuple(scans)) for name, scans in content["drives"]]
+    )
 
 
 def refuse_other_images(store: PreparedStore, reading: Reading) -> None:
-    """Refuse prepared scans of another sensor, size, projection or convention, as they cannot be projected again."""
-    # Images do not depend on these fields; the order of the lasers determines the rows in unfolding only.
-    irrelevant = {"name", "height"} if reading.projection == "unfolding" else {"name", "height", "firing"}
+    """Refuse prepared scans of another sensor, size, projection or convention, as they cannot be
+    projected again.
+    """
+    # Images do not depend on these fields; the order of the lasers determines the rows in unfolding
+    # only.
+    irrelevant = (
+        {"name", "height"} if reading.projection == "unfolding" else {"name", "height", "firing"}
+    )
     images = []
     for fields in (store.described["reading"], reading.described()):
         sensor = {key: value for key, value in fields["sensor"].items() if key not in irrelevant}
-        images.append({**sensor, "projection": fields["projection"], "convention": fields["convention"]})
+        images.append(
+            {**sensor, "projection": fields["projection"], "convention": fields["convention"]}
+        )
     if differing := [*differences(*images).values()]:
         stored = store.reading
         raise InputError(
             f"{store.folder} was prepared for other images (sensor {stored.sensor.name}, "
-            f"{stored.sensor.shape[0]}x{stored.sensor.shape[1]}, {stored.projection}, {stored.convention}): "
+            f"{stored.sensor.shape[0]}x{stored.sensor.shape[1]}, {stored.projection}, "
+            f"{stored.convention}): "
             f"{at_most_three(differing)}. Give the run the same, or prepare the scans for it."
         )
 
 
 class PreparedScans(ScanSource):
-    """A source of the prepared scans of these numbers in the data set, without those left out in preparation."""
+    """A source of the prepared scans of these numbers in the data set, without those left out in
+    preparation.
+    """
 
     def __init__(self, store: PreparedStore, numbers: Sequence[int], reflectance: bool) -> None:
-        self.store, self.reflectance, entries = store, reflectance, dict[int, tuple[int, int, int]]()
+        self.store, self.reflectance, entries = (
+            store,
+            reflectance,
+            dict[int, tuple[int, int, int]](),
+        )
         if reflectance and "reflectance" not in store.codes:
-            raise InputError(f"{store.folder} holds scans without reflectance. Set encoding.reflectance=false.")
+            raise InputError(
+                f"{store.folder} holds scans without reflectance. Set encoding.reflectance=false."
+            )
         for shard, numbers_of_shard in enumerate(store.parts):
             try:
                 left_out = set(store.head(shard)["left_out"])
             except FileNotFoundError:
-                raise InputError(f"{store.folder} is not finished: the same r2flow prepare command resumes.") from None
+                raise InputError(
+                    f"{store.folder} is not finished: the same r2flow prepare command resumes."
+                ) from None
             except (Damaged, KeyError) as error:
                 path = store.files(shard)[0]
-                raise InputError(f"{path} is damaged ({error}). The same r2flow prepare makes it again.") from None
+                raise InputError(
+                    f"{path} is damaged ({error}). The same r2flow prepare makes it again."
+                ) from None
             rows = [number for number in numbers_of_shard if number not in left_out]
             entries |= {number: (number, shard, row) for row, number in enumerate(rows)}
         #: Rows of (number in the data set, shard, row of the shard).
-        self.rows = np.array([entries[n] for n in numbers if n in entries], dtype=np.int64).reshape(-1, 3)
+        self.rows = np.array([entries[n] for n in numbers if n in entries], dtype=np.int64).reshape(
+            -1, 3
+        )
         self._shards: dict[int, list[Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -248,4 +299,6 @@ class PreparedScans(ScanSource):
         stored = [image[row : row + 1][0] for image in self._shards[shard]]
         values = [coder.values for _, coder in codes]
         # No index is out of bounds; mode="clip" only skips the bounds check.
-        return np.stack([np.take(table, code, mode="clip") for table, code in zip(values, stored, strict=True)])
+        return np.stack(
+            [np.take(table, code, mode="clip") for table, code in zip(values, stored, strict=True)]
+        )

@@ -19,19 +19,25 @@ class Codes:
     `values` are the decoded values of all codes, float32.
     """
 
-    def __init__(self, values: Sequence[float], codes: Sequence[int], dtype: type[np.unsignedinteger]) -> None:
+    def __init__(
+        self, values: Sequence[float], codes: Sequence[int], dtype: type[np.unsignedinteger]
+    ) -> None:
         self._knots, self.dtype = (values, codes), dtype
-        self.values = np.interp(np.arange(np.iinfo(dtype).max + 1), codes, values).astype(np.float32)
+        self.values = np.interp(np.arange(np.iinfo(dtype).max + 1), codes, values).astype(
+            np.float32
+        )
 
     def encode(self, x: np.ndarray) -> np.ndarray:
         return np.rint(np.interp(x, *self._knots)).astype(self.dtype)
 
 
 def range_codes(min_range: float, max_range: float) -> Codes:
-    """uint16 codes of ranges in metres, 0 or in [min_range, max_range]; the error is at most half a step.
+    """uint16 codes of ranges in metres, 0 or in [min_range, max_range]; the error is at most half a
+    step.
 
-    Code 0 is no return. One step (max_range - min_range) / 65534 if that is at most `STEP` (max_range - min_range up
-    to 124 m); else steps of at most `STEP` up to 65 m, and the remaining codes divide the rest.
+    Code 0 is no return. One step (max_range - min_range) / 65534 if that is at most `STEP`
+    (max_range - min_range up to 124 m); else steps of at most `STEP` up to 65 m, and the remaining
+    codes divide the rest.
     """
     values, codes = [0.0, min_range, max_range], [0, 1, CODES - 1]
     if (max_range - min_range) / (CODES - 2) > STEP and min_range < KNEE:
@@ -47,7 +53,9 @@ def reflectance_codes(levels: int) -> Codes:
 
 
 def find_levels(reflectance: np.ndarray) -> int:
-    """The number of levels n for which all values are multiples of 1 / n, up to rounding; 255 if no known n fits."""
+    """The number of levels n for which all values are multiples of 1 / n, up to rounding; 255 if no
+    known n fits.
+    """
     for levels in (256, 100):  # KITTI-360, KITTI
         codes = reflectance_codes(levels)
         if np.abs(codes.values[codes.encode(reflectance)] - reflectance).max(initial=0) <= ROUNDING:

@@ -21,7 +21,8 @@ AUTO = "auto"
 FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
 DIVIDED = "reflectance is divided by %g; --reflectance-scale (of r2flow.read reflectance_scale) names another value"
 DARK = (
-    "reflectance stays below a tenth of full reflectance: give its value as --reflectance-scale, in training as "
+    "reflectance stays below a tenth of full reflectance: give its value as --reflectance-scale, "
+    "in training as "
     "data.reading.reflectance_scale; r2flow sensor estimates it"
 )
 
@@ -33,26 +34,38 @@ class Reading:
     sensor: Sensor
     projection: Projection = "spherical"  #: as in `r2flow.lidar.projection.project`
     convention: Convention = "centre"  #: likewise
-    reflectance_scale: float | None = 1.0  #: value in the files of full reflectance; None estimates it from each file
-    #: Whether images have reflectance: True requires it of every scan; `auto`: see `lacks_reflectance`.
+    reflectance_scale: float | None = (
+        1.0  #: value in the files of full reflectance; None estimates it from each file
+    )
+    #: Whether images have reflectance: True requires it of every scan; `auto`: see
+    #: `lacks_reflectance`.
     reflectance: bool | str = AUTO
-    #: Treatment of unusable scans. `error` raises; `skip` takes the next usable scan; `empty` raises, but returns an
-    #: empty image for a scan without a return in the sensor's view.
+    #: Treatment of unusable scans. `error` raises; `skip` takes the next usable scan; `empty`
+    #: raises, but returns an empty image for a scan without a return in the sensor's view.
     on_bad_scan: str = "empty"
-    #: Whether ranges of a range image beyond the sensor's limits are dropped, as those of points are.
+    #: Whether ranges of a range image beyond the sensor's limits are dropped, as those of points
+    #: are.
     within_limits: bool = False
     columns: tuple[str, ...] | None = None  #: as in `r2flow.lidar.scan_files.read_points`
 
     def described(self) -> dict[str, Any]:
         """All fields as plain values, for manifests."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)} | {"sensor": self.sensor.described()}
+        values = {f.name: getattr(self, f.name) for f in fields(self)} | {
+            "sensor": self.sensor.described()
+        }
         return json.loads(json.dumps(values))  # turns tuples into lists
 
     @classmethod
     def of(cls, described: Mapping[str, Any]) -> "Reading":
         """The reading of a manifest; missing fields have their defaults."""
         columns = described.get("columns")
-        return cls(**{**described, "sensor": Sensor(**described["sensor"]), "columns": columns and tuple(columns)})
+        return cls(
+            **{
+                **described,
+                "sensor": Sensor(**described["sensor"]),
+                "columns": columns and tuple(columns),
+            }
+        )
 
     @classmethod
     def stored(cls, folder: str | Path) -> "Reading | None":
@@ -61,7 +74,9 @@ class Reading:
         return described and cls.of(described)
 
 
-def read_projected(path: str | Path, reading: Reading) -> tuple[np.ndarray, Points, np.ndarray, np.ndarray]:
+def read_projected(
+    path: str | Path, reading: Reading
+) -> tuple[np.ndarray, Points, np.ndarray, np.ndarray]:
     """A file of points as an image, (2 or 1, H, W), and all its points.
 
     Also the pixels that have a point, h W + w, (M,), and the indices of these points, (M,).
@@ -71,9 +86,15 @@ def read_projected(path: str | Path, reading: Reading) -> tuple[np.ndarray, Poin
         points = read_points(path, reading.columns)
         if reading.projection == "unfolding":
             points = points.with_lost_rays()
-        scaled = scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None
+        scaled = (
+            scaled_reflectance(path, points, reading.reflectance_scale)
+            if reading.reflectance
+            else None
+        )
         with naming(path):
-            pixels, chosen, r = project_indices(points.xyz, sensor, reading.projection, reading.convention, points.ring)
+            pixels, chosen, r = project_indices(
+                points.xyz, sensor, reading.projection, reading.convention, points.ring
+            )
         image = scatter(sensor, pixels, [r] if scaled is None else [r, scaled[chosen]])
         if not image[0].any():
             raise nothing_in_view(path, points, sensor)
@@ -89,14 +110,17 @@ def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPoint
     """The error for a scan without a return in the sensor's view."""
     r = np.linalg.norm(points.xyz, axis=1)
     return NoPointsError(
-        f"{path}: none of its {len(r)} points lies within {sensor.min_range:g}-{sensor.max_range:g} m and the "
+        f"{path}: none of its {len(r)} points lies within "
+        f"{sensor.min_range:g}-{sensor.max_range:g} m and the "
         f"view of sensor '{sensor.name}' (ranges found: {r.min():.3g}-{r.max():.3g} m). "
         "Are its units metres and its sensor the configured one?"
     )
 
 
 def read_labelled_scan(path: Path, file: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
-    """The image of a scan, and from its label file each pixel's semantic id, (H, W) uint16, 0 for no return."""
+    """The image of a scan, and from its label file each pixel's semantic id, (H, W) uint16, 0 for
+    no return.
+    """
     image, points, pixels, chosen = read_projected(path, reading)
     labels = read_labels(file, path, points)[chosen]
     return image, scatter(reading.sensor, pixels, [labels])[0].astype(np.uint16)
@@ -104,37 +128,54 @@ def read_labelled_scan(path: Path, file: Path, reading: Reading) -> tuple[np.nda
 
 def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
-        f"{path} has no reflectance, and other scans, a metric or the model need it. Give scans with it, metrics of "
-        "range or a model of range alone (in training encoding.reflectance=false without a stage.parent that has it)."
+        f"{path} has no reflectance, and other scans, a metric or the model need it. Give scans "
+        "with it, metrics of "
+        "range or a model of range alone (in training encoding.reflectance=false without a "
+        "stage.parent that has it)."
     )
 
 
 def estimated_scale(path: str | Path, scans: Iterable[Points]) -> float:
-    """The largest estimate of full reflectance of scans, 1 without any; warns of a value that others may exceed."""
+    """The largest estimate of full reflectance of scans, 1 without any; warns of a value that
+    others may exceed.
+    """
     scale = max((full_reflectance([points]) or 0.0 for points in scans), default=0.0) or 1.0
     if scale not in SURE:
         warn_odd(Path(path), DIVIDED % scale)
     return scale
 
 
-def scaled_reflectance(path: str | Path, points: Points, scale: float | None, strict: bool = True) -> np.ndarray:
-    """The reflectance of points, scaled to [0, 1]; None estimates the scale. Unless `strict`, all beyond is clipped."""
+def scaled_reflectance(
+    path: str | Path, points: Points, scale: float | None, strict: bool = True
+) -> np.ndarray:
+    """The reflectance of points, scaled to [0, 1]; None estimates the scale. Unless `strict`, all
+    beyond is clipped.
+    """
     if points.reflectance is None:
         raise _no_reflectance(path)
-    least, highest = float(points.reflectance.min(initial=0)), float(points.reflectance.max(initial=0))
+    least, highest = (
+        float(points.reflectance.min(initial=0)),
+        float(points.reflectance.max(initial=0)),
+    )
     scale = estimated_scale(path, [points]) if scale is None else scale
     if scale in FULL_REFLECTANCE[1:] and highest <= 1 and (points.reflectance % 1).any():
-        warn_odd(Path(path), f"reflectance is not divided by {scale:g}: its values are fractions of 1")
+        warn_odd(
+            Path(path), f"reflectance is not divided by {scale:g}: its values are fractions of 1"
+        )
         scale = 1.0
     if 0 < highest < FAINT * scale:
         warn_odd(Path(path), DARK)
-    check(not strict or least >= 0, f"{path}: reflectance must not be negative, found {least:g}; correct the file.")
+    check(
+        not strict or least >= 0,
+        f"{path}: reflectance must not be negative, found {least:g}; correct the file.",
+    )
     scaled = points.reflectance / np.float32(scale)
     if strict and np.count_nonzero(scaled > 1.001) > OUTLIERS * len(scaled):
         full = max(full_reflectance([points]) or 0, 255)
         raise InputError(
             f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
-            f"Give the value of full reflectance, often {full:g}: data.reading.reflectance_scale={full:g}, that of "
+            f"Give the value of full reflectance, often {full:g}: "
+            f"data.reading.reflectance_scale={full:g}, that of "
             f"its part of data.parts, or --reflectance-scale {full:g}."
         )
     return scaled.clip(0, 1)
@@ -147,9 +188,12 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     if image is None:
         return read_projected(path, reading)[0]
     if image.shape[1:] != reading.sensor.shape:
-        size, expected = ("x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape))
+        size, expected = (
+            "x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape)
+        )
         raise InputError(
-            f"{path} is a range image of {size}, the sensor's is {expected}; give --size {size}, or its points "
+            f"{path} is a range image of {size}, the sensor's is {expected}; give --size {size}, "
+            "or its points "
             "(.bin, .ply, .pcd), which take any size."
         )
     if len(image) < channels:
@@ -167,14 +211,17 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     highest = image[1:].max(initial=0)
     check(
         highest <= 1 + 1e-3,
-        f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide by full reflectance.",
+        f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide "
+        "by full reflectance.",
     )
     image[1:] = image[1:].clip(0, 1)
     return image
 
 
 def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
-    """Read points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for no return."""
+    """Read points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32,
+    0 for no return.
+    """
     image, points, pixels, chosen = read_projected(path, reading)
     return image, scatter(reading.sensor, pixels, points.xyz[chosen].T)
 
@@ -187,7 +234,9 @@ def leaving_out(advised: bool) -> Iterator[None]:
     except InputError as error:
         if not advised:
             raise
-        raise InputError(f"{error} In training data.reading.on_bad_scan=skip leaves such scans out.") from None
+        raise InputError(
+            f"{error} In training data.reading.on_bad_scan=skip leaves such scans out."
+        ) from None
 
 
 def lacks_reflectance(
@@ -195,9 +244,9 @@ def lacks_reflectance(
 ) -> str | None:
     """Reason why scan files count as files without reflectance; None if they have reflectance.
 
-    Training, metrics and pictures share this rule: the first scan with a return decides, and reflectance of only 0
-    counts as missing, because a KITTI .bin always has a column for it. Unreadable scans are skipped with
-    `on_bad_scan="skip"`, scans without a point also with "empty".
+    Training, metrics and pictures share this rule: the first scan with a return decides, and
+    reflectance of only 0 counts as missing, because a KITTI .bin always has a column for it.
+    Unreadable scans are skipped with `on_bad_scan="skip"`, scans without a point also with "empty".
     """
     for path in paths:
         try:
@@ -207,7 +256,9 @@ def lacks_reflectance(
             else:
                 reflectance = image[1][image[0] > 0] if len(image) > 1 else None
         except InputError as error:
-            if on_bad_scan == "error" or (on_bad_scan == "empty" and not isinstance(error, NoPointsError)):
+            if on_bad_scan == "error" or (
+                on_bad_scan == "empty" and not isinstance(error, NoPointsError)
+            ):
                 raise
             continue
         if reflectance is None:

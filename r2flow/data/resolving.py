@@ -20,7 +20,9 @@ from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 from r2flow.registry import construct
 
 # Options that a kind of scans would ignore.
-IGNORED = dict.fromkeys((SIMULATED, PAIRS, MIXED), ("split", "drives")) | {SIMULATED: ("root", "split", "drives")}
+IGNORED = dict.fromkeys((SIMULATED, PAIRS, MIXED), ("split", "drives")) | {
+    SIMULATED: ("root", "split", "drives")
+}
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,9 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
     if options.name in SOURCES and isinstance(SOURCES[options.name], Layout | Prepared):
         if options.scenes != DataOptions.scenes:
             raise InputError("scans in files are no simulated scenes: leave data.scenes out.")
-    usual = {key: value for key, value in options.chosen.items() if key in ("projection", "convention")}
+    usual = {
+        key: value for key, value in options.chosen.items() if key in ("projection", "convention")
+    }
     sets: list[PartOptions] = []
     if options.name == MIXED:
         sets = _parts(options, sensor)
@@ -58,14 +62,23 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
         held_out = _held_out(options, options.validation.data, sensor)
     scans = None
     if options.scans is not None:
-        scans = _complete(_checked_set("data.scans", SourceOptions, options.scans, options), usual, sensor)
+        scans = _complete(
+            _checked_set("data.scans", SourceOptions, options.scans, options), usual, sensor
+        )
     return DataPlan(tuple(sets), held_out, scans)
 
 
 def _complete(source: Any, usual: Mapping[str, Any], sensor: Sensor) -> Any:
-    """A set of scans with all fields of its reading: its own, else `usual`, else the defaults of its kind."""
+    """A set of scans with all fields of its reading: its own, else `usual`, else the defaults of
+    its kind.
+    """
     own = build_sensor(**source.sensor) if getattr(source, "sensor", None) else sensor
-    reading: Data = {"projection": "spherical", "convention": "centre", "columns": None, "on_bad_scan": "error"}
+    reading: Data = {
+        "projection": "spherical",
+        "convention": "centre",
+        "columns": None,
+        "on_bad_scan": "error",
+    }
     scans = Described(source.name, source)
     reading["reflectance_scale"] = scans.scale(own.reflectance_scale)
     reading |= {**usual, **source.chosen}
@@ -83,7 +96,11 @@ def _parts(run: DataOptions, sensor: Sensor) -> list[PartOptions]:
         part = {"scenes": run.scenes, **given}
         if part.get("sensor") is not None:
             part["sensor"] = sensor_options(part["sensor"])
-        parts.append(_complete(_checked_set(f"data.parts[{number}]", PartOptions, part, run), run.chosen, sensor))
+        parts.append(
+            _complete(
+                _checked_set(f"data.parts[{number}]", PartOptions, part, run), run.chosen, sensor
+            )
+        )
     if len({part.weight is None for part in parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
     return parts
@@ -93,19 +110,28 @@ def _held_out(run: DataOptions, other: Mapping[str, Any], sensor: Sensor) -> Sou
     held = {"name": run.name, "root": run.root, "split": None, "scenes": run.scenes, **other}
     usual = run.chosen
     if held["name"] != run.name:  # other files, with other columns and scale
-        usual = {key: value for key, value in usual.items() if key not in ("columns", "reflectance_scale")}
+        usual = {
+            key: value
+            for key, value in usual.items()
+            if key not in ("columns", "reflectance_scale")
+        }
         held["root"] = other.get("root")
     return _complete(_checked_set("data.validation.data", SourceOptions, held, run), usual, sensor)
 
 
-def _checked_set(what: str, kind: type[SourceOptions], options: Mapping[str, Any], run: DataOptions) -> Any:
+def _checked_set(
+    what: str, kind: type[SourceOptions], options: Mapping[str, Any], run: DataOptions
+) -> Any:
     """One set of scans. Refuses a data set with a standard split of which no part is named."""
     source = construct(what, kind, options)
     if options.get("name") in (None, MIXED, PAIRS):
         raise InputError(f"{what} needs the name of a data set, found {options.get('name')!r}.")
     splits = ", ".join(SOURCES[source.name].splits)
     if splits and "split" not in options:
-        raise InputError(f"{what}: {source.name} has a standard split: give split, one of {splits}, or null for all.")
+        raise InputError(
+            f"{what}: {source.name} has a standard split: give split, one of {splits}, or null for "
+            "all."
+        )
     _refuse_ignored(what, source.name, source)
     of_files = isinstance(SOURCES[source.name], Layout | Prepared)
     if of_files and options.get("scenes") not in (None, run.scenes):
@@ -120,7 +146,9 @@ def _refuse_ignored(what: str, name: str, options: SourceOptions) -> None:
 
 
 def lacking_reflectance(sets: Sequence[Described]) -> str | None:
-    """Reason why one of some sets of scans counts as scans without reflectance; None if all have reflectance."""
+    """Reason why one of some sets of scans counts as scans without reflectance; None if all have
+    reflectance.
+    """
     reasons = (one.kind.lacks_reflectance(one, one.options.chosen["on_bad_scan"]) for one in sets)
     return next((reason for reason in reasons if reason), None)
 

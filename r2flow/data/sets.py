@@ -19,7 +19,9 @@ from r2flow.signals import blocking_signals, init_loader_worker
 
 
 class ScanSet:
-    """Scans of a sensor; `label` is the user's name for them. `about`, `identity`, `drives` are as in `ScanSource`."""
+    """Scans of a sensor; `label` is the user's name for them. `about`, `identity`, `drives` are as
+    in `ScanSource`.
+    """
 
     def __init__(self, label: str, source: ScanSource, sensor: Sensor) -> None:
         self.label, self.source, self.sensor = label, source, sensor
@@ -39,17 +41,27 @@ class ScanSet:
     def __getitem__(self, key: int | slice) -> Tensor:
         """One image, (2 or 1, H, W), or those of a slice, (n, 2 or 1, H, W)."""
         numbers = range(len(self))[key]
-        return self.source.batch([*numbers]) if isinstance(numbers, range) else self.source.batch([numbers])[0]
+        return (
+            self.source.batch([*numbers])
+            if isinstance(numbers, range)
+            else self.source.batch([numbers])[0]
+        )
 
     def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
         """Some of the scans, in the given order; `name` describes the selection."""
         part = copy.copy(self)
         part.source, part.about = self.source.subset(numbers), {**self.about, "part": name}
         if self.identity is not None:  # a part of a part differs from the same numbers of the whole
-            chosen = str(self.identity.get("part", "")).encode() + np.asarray(numbers, dtype=np.int64).tobytes()
+            chosen = (
+                str(self.identity.get("part", "")).encode()
+                + np.asarray(numbers, dtype=np.int64).tobytes()
+            )
             part.identity = {**self.identity, "part": hashlib.sha256(chosen).hexdigest()[:16]}
         place = {number: i for i, number in enumerate(numbers)}
-        drives = {drive: [place[n] for n in members if n in place] for drive, members in self.drives.items()}
+        drives = {
+            drive: [place[n] for n in members if n in place]
+            for drive, members in self.drives.items()
+        }
         part.drives = {drive: kept for drive, kept in drives.items() if kept}
         return part
 
@@ -57,7 +69,9 @@ class ScanSet:
         """At most `most` scans, by `fixed_choice`."""
         if most is None or most >= len(self):
             return self
-        return self.part(fixed_choice(len(self), most), f"{most} of {len(self)}, fixed shuffle, seed 0")
+        return self.part(
+            fixed_choice(len(self), most), f"{most} of {len(self)}, fixed shuffle, seed 0"
+        )
 
     def spread(self, most: int) -> "ScanSet":
         """At most `most` scans, evenly spread over all."""
@@ -68,14 +82,22 @@ class ScanSet:
     def batches(
         self, numbers: Sequence[int], batch_size: int, workers: int = 0, with_points: bool = False
     ) -> Iterator[Any]:
-        """Batches of these scans in order, read by `workers` further processes: images, (B, 2 or 1, H, W), or pairs of
-        images and the measured points of the pixels, (B, 3, H, W) (`ScanSource.with_points`)."""
+        """Batches of these scans in order, read by `workers` further processes: images, (B, 2 or 1,
+        H, W), or pairs of images and the measured points of the pixels, (B, 3, H, W)
+        (`ScanSource.with_points`).
+        """
         read = partial(_with_points, self.source) if with_points else self.source.batch
-        chunks: Any = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
+        chunks: Any = [
+            list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)
+        ]
         # Processes take seconds to start; samples are drawn in the process of the network.
         workers = 0 if self.source.drawn or len(chunks) < 8 else workers
-        loader = DataLoader(chunks, None, collate_fn=read, num_workers=workers, worker_init_fn=init_loader_worker)
-        with blocking_signals() if workers else nullcontext():  # the end of a process would be an error here
+        loader = DataLoader(
+            chunks, None, collate_fn=read, num_workers=workers, worker_init_fn=init_loader_worker
+        )
+        with (
+            blocking_signals() if workers else nullcontext()
+        ):  # the end of a process would be an error here
             return iter(loader)
 
 

@@ -34,14 +34,19 @@ LOOKED_AT = 3  # number of scans whose beams are compared with the sensor's
 
 
 class ScanSource(ABC):
-    """Numbered range images, (2 or 1, H, W) float32: range in metres and reflectance in [0, 1], 0 where missing.
+    """Numbered range images, (2 or 1, H, W) float32: range in metres and reflectance in [0, 1], 0
+    where missing.
 
     Subclasses must implement the four abstract methods; the others are optional.
     """
 
     slow = False  #: whether reading an image is slow, so that images are kept in memory if they fit
-    drawn = False  #: whether a network draws the images on access: only in this process, each image once if possible
-    drives: Mapping[str, Sequence[int]] = {}  #: numbers of the scans of each recording, by its name, if known
+    #: whether a network draws the images on access: only in this process, each image once if
+    #: possible
+    drawn = False
+    drives: Mapping[
+        str, Sequence[int]
+    ] = {}  #: numbers of the scans of each recording, by its name, if known
     contents = ""  #: digest of what is cheaply known of the scans, equal for a copy of the data set
 
     @abstractmethod
@@ -68,15 +73,21 @@ class ScanSource(ABC):
         return torch.from_numpy(np.stack([self[index] for index in indices]))
 
     def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """An image, and the measured x, y, z of its pixels' points in metres, (3, H, W) float32, 0 where missing."""
-        raise InputError(f"{self.names[index]} holds only ranges, not the measured coordinates of its points.")
+        """An image, and the measured x, y, z of its pixels' points in metres, (3, H, W) float32, 0
+        where missing.
+        """
+        raise InputError(
+            f"{self.names[index]} holds only ranges, not the measured coordinates of its points."
+        )
 
     def about(self) -> dict[str, Any]:
         """Metadata to report with metrics of the scans, as plain values without paths."""
         return {}
 
     def identity(self) -> dict[str, Any] | None:
-        """All that determines the images, as a cache key; None if unknown, so that nothing is cached."""
+        """All that determines the images, as a cache key; None if unknown, so that nothing is
+        cached.
+        """
         return None
 
     def places(self) -> set[str]:
@@ -85,14 +96,24 @@ class ScanSource(ABC):
 
 
 def made_here(root: str | Path) -> bool:
-    """Whether r2flow wrote the samples or simulated scans in a folder, in all folders in it, or next to a file."""
+    """Whether r2flow wrote the samples or simulated scans in a folder, in all folders in it, or
+    next to a file.
+    """
     given = Path(root).expanduser()
     folder = given.parent if given.is_file() else given
     if not folder.is_dir() or manifest_of(folder):
         return folder.is_dir()
-    with os.scandir(folder) as entries:  # knows folders without a system call per file; fails at a loop of links
-        listed = [e for e in entries if scan_ending(e.name) or (os.path.isdir(e) if e.is_symlink() else e.is_dir())]
-    shown = (e for e in listed if not e.name.startswith("."))  # not a disk's .Trash-1000, nor its lost+found
+    with os.scandir(
+        folder
+    ) as entries:  # knows folders without a system call per file; fails at a loop of links
+        listed = [
+            e
+            for e in entries
+            if scan_ending(e.name) or (os.path.isdir(e) if e.is_symlink() else e.is_dir())
+        ]
+    shown = (
+        e for e in listed if not e.name.startswith(".")
+    )  # not a disk's .Trash-1000, nor its lost+found
     below = [e.path for e in shown if scan_ending(e.name) or os.access(e, os.X_OK)]
     return bool(below) and all(map(manifest_of, below))
 
@@ -105,23 +126,30 @@ def readable(paths: Sequence[str | Path], columns: Sequence[str] | None) -> Iter
 
 
 def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Doubt | None:
-    """The mismatch of a few scan files and a sensor (`other_sensor`); warns instead of one due to their frame.
+    """The mismatch of a few scan files and a sensor (`other_sensor`); warns instead of one due to
+    their frame.
 
-    Files of `ours`, that r2flow wrote, store their sensor; other range images have no beams. Unreadable files are
-    reported when they are read as scans.
+    Files of `ours`, that r2flow wrote, store their sensor; other range images have no beams.
+    Unreadable files are reported when they are read as scans.
     """
     if ours:
         sensor = reading.sensor
         for folder in sorted({os.path.dirname(path) for path in paths}):
             stored = Reading.stored(folder)
             theirs = stored.sensor if stored else sensor
-            differs = theirs.name != sensor.name or sensor.name not in SENSORS or theirs.shape[0] < sensor.shape[0]
+            differs = (
+                theirs.name != sensor.name
+                or sensor.name not in SENSORS
+                or theirs.shape[0] < sensor.shape[0]
+            )
             if differs and not theirs.resized(*sensor.shape).same_image(sensor):
                 seen = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}"
                 known = theirs.name in SENSORS
                 return Doubt(seen, theirs.name if known else None, sure=known)
         return None
-    scans = [*readable([paths[number] for number in spread(len(paths), LOOKED_AT)], reading.columns)]
+    scans = [
+        *readable([paths[number] for number in spread(len(paths), LOOKED_AT)], reading.columns)
+    ]
     mismatch = other_sensor(scans, reading.sensor) if scans else None
     if not scans or (mismatch and mismatch.hopeless):
         return mismatch
@@ -131,7 +159,10 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Do
 def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
     """Warn, once per folder, of scans that are not in one sensor's own frame; whether they are not."""
     if unclear := is_unclear(scans):
-        warn_odd(Path(path), "its beams are not clear: give scans of one sensor, in its own frame, not a vehicle's")
+        warn_odd(
+            Path(path),
+            "its beams are not clear: give scans of one sensor, in its own frame, not a vehicle's",
+        )
     return unclear
 
 
@@ -150,7 +181,9 @@ def warn_of_other_sensor(
     check(not (hopeless and reading.within_limits), f"{root}: {seen}.")
     advice = f"; give the right one, or estimate it: r2flow sensor {shlex.quote(str(root))} --out mine.yaml"
     if name is not None and name != sensor.name:
-        advice = f"; they fit '{name}': sensor={name} in training, --sensor {name} in verbs that have it"
+        advice = (
+            f"; they fit '{name}': sensor={name} in training, --sensor {name} in verbs that have it"
+        )
     log.warning(
         "%s: read as scans of sensor '%s', which sees %+.1f to %+.1f degrees, but %s%s",
         root, sensor.name, *sensor.row_edges[[0, -1]], seen, "" if hopeless else advice,
@@ -160,8 +193,8 @@ def warn_of_other_sensor(
 class ScanFiles(ScanSource):
     """Scan files of any format and range images, read on access.
 
-    With `on_bad_scan="skip"`, an unusable file is replaced by the next usable file of this source, with a warning; the
-    replacement is the same in every process.
+    With `on_bad_scan="skip"`, an unusable file is replaced by the next usable file of this source,
+    with a warning; the replacement is the same in every process.
 
     A scan's name is its path below the data set's `root`.
     """
@@ -186,10 +219,16 @@ class ScanFiles(ScanSource):
         return [str(path).removeprefix(below) for path in self.paths]
 
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
-        return ScanFiles([self.paths[i] for i in indices], self.reading, self.root, about=self.described)
+        return ScanFiles(
+            [self.paths[i] for i in indices], self.reading, self.root, about=self.described
+        )
 
     def about(self) -> dict[str, Any]:
-        return {**self.described, "files": self._digest[:12], "reflectance": bool(self.reading.reflectance)}
+        return {
+            **self.described,
+            "files": self._digest[:12],
+            "reflectance": bool(self.reading.reflectance),
+        }
 
     def identity(self) -> dict[str, Any]:
         return {"files": self._digest, **self.reading.described()}
@@ -203,7 +242,9 @@ class ScanFiles(ScanSource):
         return self._hashed(times=False)
 
     def _hashed(self, times: bool) -> str:
-        """Hash of all names and sizes, with `times` also of the times of change, and of the contents of some files."""
+        """Hash of all names and sizes, with `times` also of the times of change, and of the
+        contents of some files.
+        """
         stats, hashes = [], []
         for name, path in zip(self.names, self.paths, strict=True):
             with suppress(OSError):  # reported when the scan is read
@@ -219,7 +260,9 @@ class ScanFiles(ScanSource):
 
     def places(self) -> set[str]:
         parts = [os.path.split(path) for path in self.paths]
-        real = {folder: os.path.realpath(folder) for folder in {folder for folder, _ in parts}}  # slow on network disks
+        real = {
+            folder: os.path.realpath(folder) for folder in {folder for folder, _ in parts}
+        }  # slow on network disks
         files = (os.path.join(real[folder], name) for folder, name in parts)
         return {os.path.realpath(file) if os.path.islink(file) else file for file in files}
 
@@ -235,7 +278,9 @@ class ScanFiles(ScanSource):
     def _first_usable(self, index: int, read: Callable[[Path], Read]) -> Read:
         """Read a file, or with `on_bad_scan="skip"` the first usable file from this index on."""
         if self.reading.on_bad_scan != "skip":
-            advised = self.reading.on_bad_scan == "error" and self.described.get("kind", "file") != "file"
+            advised = (
+                self.reading.on_bad_scan == "error" and self.described.get("kind", "file") != "file"
+            )
             with leaving_out(advised):
                 return read(Path(self.paths[index]))
         for candidate in ((index + i) % len(self) for i in range(len(self))):
@@ -246,7 +291,9 @@ class ScanFiles(ScanSource):
             except InputError as error:
                 self.bad.add(candidate)
                 log.warning("left out: %s", error)
-        raise InputError(f"all {len(self.paths)} scans were left out as unusable; see the warnings above.")
+        raise InputError(
+            f"all {len(self.paths)} scans were left out as unusable; see the warnings above."
+        )
 
 
 class MadeScans(ScanSource):
@@ -273,22 +320,40 @@ class SimulatedScans(MadeScans):
 
     slow, word = True, "scene"
 
-    def __init__(self, sensor: Sensor, seed: int, numbers: Sequence[int], reflectance: bool) -> None:
+    def __init__(
+        self, sensor: Sensor, seed: int, numbers: Sequence[int], reflectance: bool
+    ) -> None:
         self.sensor, self.seed, self.numbers, self.reflectance = sensor, seed, numbers, reflectance
 
     def about(self) -> dict[str, Any]:
-        return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}
+        return {
+            "kind": "simulated",
+            "seed": self.seed,
+            "scenes": len(self),
+            "reflectance": self.reflectance,
+        }
 
     def identity(self) -> dict[str, Any]:
-        numbers = hashlib.sha256(np.asarray(self.numbers, dtype=np.int64).tobytes()).hexdigest()[:16]
-        return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": self.sensor.described()}
+        numbers = hashlib.sha256(np.asarray(self.numbers, dtype=np.int64).tobytes()).hexdigest()[
+            :16
+        ]
+        return {
+            **self.about(),
+            "numbers": numbers,
+            "simulator": simulator.REVISION,
+            "sensor": self.sensor.described(),
+        }
 
     @property
     def contents(self) -> str:  # type: ignore[override]
-        return f"simulator {simulator.REVISION}"  # its revisions draw different scans of the same name
+        return (
+            f"simulator {simulator.REVISION}"  # its revisions draw different scans of the same name
+        )
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return simulator.simulate(self.sensor, self.seed, self.numbers[index]).image[: 1 + self.reflectance]
+        return simulator.simulate(self.sensor, self.seed, self.numbers[index]).image[
+            : 1 + self.reflectance
+        ]
 
 
 class InMemory(ScanSource):
@@ -316,12 +381,16 @@ def spread(count: int, most: int) -> list[int]:
 
 
 def holdout_block(count: int, share: float, starts: Sequence[int] = ()) -> tuple[range, range]:
-    """(training, validation) numbers; the validation scans are one contiguous block, about the last `share`.
+    """(training, validation) numbers; the validation scans are one contiguous block, about the last
+    `share`.
 
-    Frames are not chosen at random, because neighbouring frames of a drive are near-duplicates. Whole drives, which
-    begin at the numbers `starts`, are held out if their size is within half of the share; otherwise the exact share is.
+    Frames are not chosen at random, because neighbouring frames of a drive are near-duplicates.
+    Whole drives, which begin at the numbers `starts`, are held out if their size is within half of
+    the share; otherwise the exact share is.
     """
     held = min(math.ceil(count * share), count - 1)
-    whole = [count - start for start in starts if start > 0 and abs(count - start - held) <= held / 2]
+    whole = [
+        count - start for start in starts if start > 0 and abs(count - start - held) <= held / 2
+    ]
     held = min(whole, key=lambda size: abs(size - held), default=held)
     return range(count - held), range(count - held, count)

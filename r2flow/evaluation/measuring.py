@@ -150,7 +150,9 @@ def gather_real(
             keys[name] = key_of(metric, real, choices[name][1] + points)
             cached = cache.read(keys[name])
             readers = sum_over_processes(torch.tensor(int(cached is not None)))
-            if cached is not None and readers == rank_and_world_size()[1]:  # all processes have read it
+            if (
+                cached is not None and readers == rank_and_world_size()[1]
+            ):  # all processes have read it
                 gathered[name] = cached
     numbers_of = {chosen: numbers for numbers, chosen in choices.values()}
     for chosen, numbers in numbers_of.items():
@@ -185,7 +187,9 @@ def measure(
         metric.load_real_state(real[name].states)
     before = getattr(generated.source, "unsolved", 0)
     empty = _update(metrics, generated, range(len(generated)), False, work, protocol)
-    unsolved = int(sum_over_processes(torch.tensor(getattr(generated.source, "unsolved", 0) - before)))
+    unsolved = int(
+        sum_over_processes(torch.tensor(getattr(generated.source, "unsolved", 0) - before))
+    )
     sensor = generated.sensor
     described = {
         "name": protocol.name,

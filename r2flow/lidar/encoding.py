@@ -139,7 +139,12 @@ class Encoding:
     def described(self) -> dict[str, Any]:
         """All options but the sensor, as plain values."""
         name = FORMATS.name_of(type(self.format))
-        return {"format": name, "reflectance": self.reflectance, "limits": self.limits, "levels": self.levels}
+        return {
+            "format": name,
+            "reflectance": self.reflectance,
+            "limits": self.limits,
+            "levels": self.levels,
+        }
 
     def through(self, sensor: Sensor) -> "Encoding":
         """The same encoding of another sensor's ranges, whose levels of reflectance are unknown."""
@@ -266,7 +271,9 @@ class ModelSpace:
 
 
 def encoding_options(encoding: Encoding | str | Mapping[str, Any]) -> dict[str, Any]:
-    """Complete options of an encoding, from itself, the name of a file in conf/encoding, or some of the options."""
+    """Complete options of an encoding, from itself, the name of a file in conf/encoding, or some of
+    the options.
+    """
     if isinstance(encoding, Encoding):
         return encoding.described()
     if not isinstance(encoding, str):
@@ -274,7 +281,9 @@ def encoding_options(encoding: Encoding | str | Mapping[str, Any]) -> dict[str, 
     known = presets("encoding")
     if encoding not in known:
         hint = did_you_mean(encoding, known)
-        raise UnknownName(f"no encoding named {encoding!r}; known: {', '.join(sorted(known))}.{hint}")
+        raise UnknownName(
+            f"no encoding named {encoding!r}; known: {', '.join(sorted(known))}.{hint}"
+        )
     return {**options_of(Encoding, given=1), **known[encoding]}
 
 

@@ -1,4 +1,6 @@
-"""Completion of partial scans: answer a to scan i depends on (seed, i, a) alone, up to the network's rounding."""
+"""Completion of partial scans: answer a to scan i depends on (seed, i, a) alone, up to the
+network's rounding.
+"""
 
 import math
 from collections.abc import Iterator
@@ -22,25 +24,39 @@ class Completed(Samples):
 
     @property
     def spread(self) -> Tensor:
-        """Per ray over the answers: standard deviation of the range in metres, and share of returns, (2, H, W).
+        """Per ray over the answers: standard deviation of the range in metres, and share of
+        returns, (2, H, W).
 
-        The standard deviation is over answers with a return, with denominator n - 1; 0 if fewer than two have one.
+        The standard deviation is over answers with a return, with denominator n - 1; 0 if fewer
+        than two have one.
         """
         r = self.images[:, 0].double()
         returned = r > 0
         count = returned.sum(0)
         mean = r.sum(0) / count.clamp(min=1)
         squares = ((r - mean).square() * returned).sum(0)
-        return torch.stack([(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]).float()
+        return torch.stack(
+            [(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]
+        ).float()
 
 
-def completing(generator: Generator, name: str | None = None, *, several: bool = False, **changes: Any) -> Sampler:
-    """The sampler for completion: the generator's default if it takes a condition, else the flow's first completer.
+def completing(
+    generator: Generator, name: str | None = None, *, several: bool = False, **changes: Any
+) -> Sampler:
+    """The sampler for completion: the generator's default if it takes a condition, else the flow's
+    first completer.
 
-    For `several` different answers, a transfer flow uses `transport`. `changes` are fields of the sampler.
+    For `several` different answers, a transfer flow uses `transport`. `changes` are fields of the
+    sampler.
     """
-    if not (generator.takes_condition or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
-        raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")
+    if (
+        not (generator.takes_condition or isinstance(generator, Flow))
+        or generator.noise_shape != generator.space.shape
+    ):
+        raise InputError(
+            f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range "
+            "images."
+        )
     if generator.takes_condition:
         if several and name is None and not changes and hasattr(generator, Transport.needs):
             name = "transport"
@@ -49,7 +65,11 @@ def completing(generator: Generator, name: str | None = None, *, several: bool =
     name = changes.pop("name", None)
     completers = {completer.name: completer for completer in getattr(generator, "completers", ())}
     completer = completers.get(name or next(iter(completers)))
-    how = build_sampler({"name": name, **changes}) if completer is None else completer.changed(**changes)
+    how = (
+        build_sampler({"name": name, **changes})
+        if completer is None
+        else completer.changed(**changes)
+    )
     how.check(generator)
     check(how.completes, f"sampler {how.name} takes no condition: give mmps, replace or repaint.")
     return how
@@ -69,30 +89,37 @@ def complete(
     progress: Progress = None,
     **changes: Any,
 ) -> Iterator[Completed]:
-    """Complete partial scans, one after another, and warn of what is not solved. Known rays are returned bit for bit.
+    """Complete partial scans, one after another, and warn of what is not solved. Known rays are
+    returned bit for bit.
 
-    A fully known scan costs no evaluation. A fully unknown scan is sampled as by `r2flow.model.sampling.sample`: answer
-    0 to scan i is sample i of the seed.
+    A fully known scan costs no evaluation. A fully unknown scan is sampled as by
+    `r2flow.model.sampling.sample`: answer 0 to scan i is sample i of the seed.
 
     Args:
-        source: A checkpoint or its generator. Generators with `draws = False` need a known ray in each scan.
-        images: Range in metres and optionally reflectance, (B, 2 or 1, H, W), 0 without a return. A model with
-            reflectance adds it to scans without; a model of range alone ignores it.
-        state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); None: rays without a return count as not measured.
+        source: A checkpoint or its generator. Generators with `draws = False` need a known ray in
+            each scan.
+        images: Range in metres and optionally reflectance, (B, 2 or 1, H, W), 0 without a return. A
+            model with reflectance adds it to scans without; a model of range alone ignores it.
+        state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); None: rays without a return count as
+            not measured.
         num: Answers per scan.
-        sampler: Sampler or its name; None: that of `completing`, for several answers `transport` if there is one.
+        sampler: Sampler or its name; None: that of `completing`, for several answers `transport` if
+            there is one.
         batch_size: Answers per batch. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
         progress: Called after every network evaluation of a batch.
         changes: Fields of the sampler: steps, grid, ...
 
     Raises:
-        InputError: a generator that cannot complete scans, images or states that do not fit it, or values outside its
-            sensor's range.
+        InputError: a generator that cannot complete scans, images or states that do not fit it, or
+            values outside its sensor's range.
     """
     generator = source if isinstance(source, Generator) else source.generator
     whole = hasattr(num, "__index__") and hasattr(batch_size, "__index__")
-    check(whole and min(num, batch_size) >= 1, f"give answers and a batch of at least 1; found {num!r}, {batch_size}.")
+    check(
+        whole and min(num, batch_size) >= 1,
+        f"give answers and a batch of at least 1; found {num!r}, {batch_size}.",
+    )
     if isinstance(sampler, Sampler):
         how = sampler.changed(**changes)
     else:
@@ -109,16 +136,28 @@ def complete(
         known = condition["known"] > 0
         any_known = bool(known.any())
         answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
-        evaluations, converged, seconds = answers.new_zeros(num).long(), answers.new_ones(num).bool(), 0.0
+        evaluations, converged, seconds = (
+            answers.new_zeros(num).long(),
+            answers.new_ones(num).bool(),
+            0.0,
+        )
         for start in range(0, 0 if bool(known.all()) else num, batch_size):
             at = slice(start, min(start + batch_size, num))
-            numbers = [first + i + answer * 2**32 for answer in range(at.start, at.stop)]  # of noise: 0 is sample i's
-            given = {name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()}
+            numbers = [
+                first + i + answer * 2**32 for answer in range(at.start, at.stop)
+            ]  # of noise: 0 is sample i's
+            given = {
+                name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()
+            }
             drawn = draw(
                 generator, numbers, seed, how if any_known else plain, given if any_known else None,
                 precision=precision, progress=progress,
             )  # fmt: skip
-            answers[at], evaluations[at], converged[at] = drawn.images, drawn.evaluations, drawn.converged
+            answers[at], evaluations[at], converged[at] = (
+                drawn.images,
+                drawn.evaluations,
+                drawn.converged,
+            )
             seconds += drawn.seconds
         shared = min(answers.shape[1], image.shape[0])
         answers[:, :shared] = torch.where(measured, image[:shared], answers[:, :shared])
@@ -132,7 +171,8 @@ def _check_values(sensor: Sensor, images: Tensor) -> None:
     wrong = ~((r == 0) | ((r >= near) & (r <= far)))
     if bool(wrong.any()):
         raise InputError(
-            f"a range of {float(r[wrong][0]):g} m is outside sensor '{sensor.name}', {sensor.min_range:g} to "
+            f"a range of {float(r[wrong][0]):g} m is outside sensor '{sensor.name}', "
+            f"{sensor.min_range:g} to "
             f"{sensor.max_range:g} m; give 0 and the state of a ray that was not measured."
         )
     problem = next(filter(None, (wrong_with(image, math.inf) for image in images)), None)

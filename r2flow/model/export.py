@@ -1,7 +1,9 @@
-"""Export of a flow to a `.pt2` or `.onnx` that runs without r2flow: the network, or the sampler (noise in, scan out).
+"""Export of a flow to a `.pt2` or `.onnx` that runs without r2flow: the network, or the sampler
+(noise in, scan out).
 
-A fixed-step sampler is linear in the noise and in the network's outputs. Its coefficients are computed once, by running
-the generator with a recording network. The exported graph consists of the coefficients, the network and the decoding.
+A fixed-step sampler is linear in the noise and in the network's outputs. Its coefficients are
+computed once, by running the generator with a recording network. The exported graph consists of the
+coefficients, the network and the decoding.
 """
 
 import io
@@ -31,7 +33,9 @@ NOTES = "r2flow.json"  # metadata file in a .pt2; an .onnx has the key `r2flow`
 
 
 class Tableau(NamedTuple):
-    """A sampler of E evaluations v_j, v(t_j, y_j) or u(y_j, t_j, s_j), at y_j = a_j0 x_0 + sum_{i<j} a_j,i+1 v_i."""
+    """A sampler of E evaluations v_j, v(t_j, y_j) or u(y_j, t_j, s_j), at y_j = a_j0 x_0 +
+    sum_{i<j} a_j,i+1 v_i.
+    """
 
     times: list[float]  # t_j, (E,)
     second: list[float] | None  # s_j, (E,); None for a network of one time
@@ -39,7 +43,9 @@ class Tableau(NamedTuple):
 
 
 class _Recorder(nn.Module):
-    """Replaces a network: records the inputs of each call and returns the j-th vector for the j-th call."""
+    """Replaces a network: records the inputs of each call and returns the j-th vector for the j-th
+    call.
+    """
 
     def __init__(self, vectors: Tensor) -> None:
         super().__init__()
@@ -60,7 +66,8 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     count = sampler.evaluations(flow)
     if count is None or sampler.draws or sampler.completes:
         raise InputError(
-            f"sampler {sampler.name} cannot be exported, as it has no fixed steps of the ODE: give --sampler "
+            f"sampler {sampler.name} cannot be exported, as it has no fixed steps of the ODE: give "
+            "--sampler "
             f"{USUAL.name} --steps {USUAL.steps}."
         )
     units = torch.eye(count + 1, dtype=torch.float64)  # x_0 is the first unit vector
@@ -68,7 +75,8 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     rows, calls = _recorded(flow, sampler, units)
     if not torch.allclose(_recorded(flow, sampler, others)[0], rows @ others):
         raise InputError(
-            f"{sampler.name} is not linear in the noise and the network's outputs here: it cannot be exported."
+            f"{sampler.name} is not linear in the noise and the network's outputs here: it cannot "
+            "be exported."
         )
     times, second, _ = zip(*calls, strict=True)
     rows = rows[:, : len(times) + 1]  # with `finish`, fewer than count
@@ -78,7 +86,9 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
 def _recorded(
     flow: RectifiedFlow, sampler: Sampler, vectors: Tensor
 ) -> tuple[Tensor, list[tuple[float, float, Tensor]]]:
-    """States of a sampler and x_1, (E + 1, N), from x_0 and network outputs that are the vectors, (E + 1, N)."""
+    """States of a sampler and x_1, (E + 1, N), from x_0 and network outputs that are the vectors,
+    (E + 1, N).
+    """
     recorder = _Recorder(vectors)
     shadow = copy(flow)
     shadow._modules = {**flow._modules, "backbone": recorder}
@@ -87,7 +97,9 @@ def _recorded(
 
 
 class Decoded(nn.Module):
-    """Decode x_1 to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B, 3, H, W)."""
+    """Decode x_1 to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B,
+    3, H, W).
+    """
 
     rays: Tensor
 
@@ -140,25 +152,27 @@ def export(
 ) -> Exported:
     """Write a rectified flow or a flow map as a `.pt2` (torch.export) or an `.onnx`.
 
-    The input is `noise` (B, C, H, W). The outputs are `scan`, range in metres and reflectance, (B, 2 or 1, H, W), 0
-    without a return, and `points` in metres, (B, 3, H, W), the origin without a return; float32. A `.pt2` unrolls all
-    evaluations; an `.onnx` has the network once, in a loop.
+    The input is `noise` (B, C, H, W). The outputs are `scan`, range in metres and reflectance, (B,
+    2 or 1, H, W), 0 without a return, and `points` in metres, (B, 3, H, W), the origin without a
+    return; float32. A `.pt2` unrolls all evaluations; an `.onnx` has the network once, in a loop.
 
     Args:
         path: Output file; its suffix sets the format.
         sampler: Sampler or its name; None: the flow's default.
-        network: Export v(t, x) alone: `t` (B,) and `x` (B, C, H, W) to `v`; for a flow map also `s` (B,).
+        network: Export v(t, x) alone: `t` (B,) and `x` (B, C, H, W) to `v`; for a flow map also `s`
+            (B,).
 
     Raises:
-        InputError: an unknown suffix, another generator, a sampler that cannot be exported, a missing package, or a
-            network that torch cannot export.
+        InputError: an unknown suffix, another generator, a sampler that cannot be exported, a
+            missing package, or a network that torch cannot export.
     """
     path = Path(path)
     flow = checkpoint.generator
     if not isinstance(flow, RectifiedFlow):
         kind = type(flow).__name__
         raise InputError(
-            f"only rectified flows and flow maps can be exported, and {checkpoint.path} holds a {kind}."
+            f"only rectified flows and flow maps can be exported, and {checkpoint.path} holds a "
+            f"{kind}."
         )
     if network and type(flow).velocity is not RectifiedFlow.velocity:
         raise InputError(
@@ -270,7 +284,8 @@ class Difference(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"range within {self.metres:.2g} m, reflectance within {self.reflectance:.2g}, {self.rays} rays differ in "
+            f"range within {self.metres:.2g} m, reflectance within {self.reflectance:.2g}, "
+            f"{self.rays} rays differ in "
             "ray-drop"
         )
 

@@ -35,8 +35,8 @@ class Parent:
     def record(self) -> dict[str, Any]:
         """Identity of the parent as plain values, as stored in the checkpoints of its children.
 
-        `weights` is the hash of its averaged weights; `first_pair` the first pair whose noise it was not trained on;
-        `pairs` the default folder of its pairs.
+        `weights` is the hash of its averaged weights; `first_pair` the first pair whose noise it
+        was not trained on; `pairs` the default folder of its pairs.
         """
         data = self.config.get("data", {})
         pairs = data.get("pairs") if data.get("name") == "pairs" else None
@@ -59,22 +59,28 @@ def find_parent(name: "str | Path | Parent") -> Parent:
     is_run = Path(str(name)).expanduser().is_dir() and name_of(checkpoint.path) is None
     if is_run and checkpoint.step < total:
         raise InputError(
-            f"{name} has stopped at step {checkpoint.step} of {total}: finish it, or name the checkpoint to start "
+            f"{name} has stopped at step {checkpoint.step} of {total}: finish it, or name the "
+            "checkpoint to start "
             f"from, {checkpoint.path}."
         )
     return Parent(checkpoint.config, checkpoint.path, checkpoint.step, checkpoint)
 
 
 def model_options(
-    given: Mapping[str, Any], parent: Parent | None, generator_name: str | None, on_pairs: bool = False
+    given: Mapping[str, Any],
+    parent: Parent | None,
+    generator_name: str | None,
+    on_pairs: bool = False,
 ) -> dict[str, Any]:
-    """Complete options of a model: `backbone`, `sensor`, `encoding` and `generator`, as plain values.
+    """Complete options of a model: `backbone`, `sensor`, `encoding` and `generator`, as plain
+    values.
 
-    What is not given comes from the parent, else it is the default. A model with the weights of a parent has its
-    encoding and backbone, and on pairs, which are images of the parent, its sensor.
+    What is not given comes from the parent, else it is the default. A model with the weights of a
+    parent has its encoding and backbone, and on pairs, which are images of the parent, its sensor.
 
     Args:
-        given: Names, options or objects; None: not given. Options of a backbone without a name change the parent's.
+        given: Names, options or objects; None: not given. Options of a backbone without a name
+            change the parent's.
         generator_name: Generator of the stage; None: the parent's, or a rectified flow.
 
     Raises:
@@ -83,7 +89,8 @@ def model_options(
     theirs = parent.config if parent else {}
     if parent and "published" in theirs and theirs["data"]["reading"]["projection"] == "unfolding":
         raise InputError(
-            f"{parent.path} was trained on unfolded scans, whose rings a new run's sensor does not have; "
+            f"{parent.path} was trained on unfolded scans, whose rings a new run's sensor does not "
+            "have; "
             "start from a flow trained on spherical images."
         )
     sensor = given.get("sensor")
@@ -104,7 +111,10 @@ def model_options(
             "encoding": _changed(theirs["encoding"], encoding, encoding_options),
         }
         if options["encoding"]["reflectance"] == AUTO:
-            options["encoding"] = {**options["encoding"], "reflectance": theirs["encoding"]["reflectance"]}
+            options["encoding"] = {
+                **options["encoding"],
+                "reflectance": theirs["encoding"]["reflectance"],
+            }
         free: dict[str, tuple[str, ...]] = {"backbone": FREE_BACKBONE, "encoding": ("levels",)}
         if on_pairs:
             free["sensor"] = ("reflectance_scale",)
@@ -127,11 +137,14 @@ def _changed(
 
 
 def _refuse_other(group: str, ours: Any, theirs: Any, free: tuple[str, ...], path: Path) -> None:
-    """Refuse options that differ from those of the weights; keys that only one side has are equal to the default."""
+    """Refuse options that differ from those of the weights; keys that only one side has are equal
+    to the default.
+    """
     for key in (ours or {}).keys() & (theirs or {}).keys() - set(free):
         if plain(ours[key]) != plain(theirs[key]):
             raise InputError(
-                f"{group}.{key} is {ours[key]} here, but {theirs[key]} in {path}, whose weights this run starts from. "
+                f"{group}.{key} is {ours[key]} here, but {theirs[key]} in {path}, whose weights "
+                "this run starts from. "
                 f"Leave it out: the {group} is the parent's."
             )
 
@@ -139,7 +152,8 @@ def _refuse_other(group: str, ours: Any, theirs: Any, free: tuple[str, ...], pat
 def _generator(
     given: str | Mapping[str, Any] | None, theirs: Mapping[str, Any] | None, of_stage: str | None
 ) -> dict[str, Any]:
-    """The generator given, else the stage's, else the parent's, or what the parent's is fine-tuned as.
+    """The generator given, else the stage's, else the parent's, or what the parent's is fine-tuned
+    as.
 
     One that is not given has the parent's options as far as they apply.
     """

@@ -46,11 +46,12 @@ def sampler_graph(
     second: Sequence[float] | None,
     states: np.ndarray,
 ) -> onnx.ModelProto:
-    """Graph from noise to scan and points: a loop over the sampler's evaluations, then the decoding.
+    """Graph from noise to scan and points: a loop over the sampler's evaluations, then the
+    decoding.
 
-    The loop state `known` stacks the noise and the network's outputs, with zeros for evaluations not yet made.
-    `network` maps `t` (), `x` and, for a flow map, `s` () to `v`, and `decoded` maps `x_1` to `scan` and `points`; the
-    other arguments are as in `r2flow.model.export.Tableau`.
+    The loop state `known` stacks the noise and the network's outputs, with zeros for evaluations
+    not yet made. `network` maps `t` (), `x` and, for a flow map, `s` () to `v`, and `decoded` maps
+    `x_1` to `scan` and `points`; the other arguments are as in `r2flow.model.export.Tableau`.
     """
     network = add_prefix(network, "network.", rename_inputs=False, rename_outputs=False)
     decoded = add_prefix(decoded, "decoded.", rename_inputs=False, rename_outputs=False)
@@ -101,7 +102,9 @@ def sampler_graph(
 def _evaluation(
     network: onnx.ModelProto, second: Sequence[float] | None, known: list[Any]
 ) -> onnx.GraphProto:
-    """Body of the loop: evaluation j of the network, whose output becomes entry j + 1 of the loop state."""
+    """Body of the loop: evaluation j of the network, whose output becomes entry j + 1 of the loop
+    state.
+    """
     second_time = [make_node("Gather", ["second", "j"], ["s"])] if second else []
     nodes = [
         make_node("Gather", ["times", "j"], ["t"]),

@@ -14,7 +14,11 @@ from torch import Tensor
 from r2flow.registry import Registry, lazy
 
 ARCHITECTURES = Registry(
-    "published architecture", nat_hdit="hdit", hdit="hdit", adm_unet="adm_unet", efficient_unet="efficient_unet"
+    "published architecture",
+    nat_hdit="hdit",
+    hdit="hdit",
+    adm_unet="adm_unet",
+    efficient_unet="efficient_unet",
 )
 BACKBONE = "backbone."  # prefix of a flow's network in the generator
 
@@ -23,11 +27,17 @@ BACKBONE = "backbone."  # prefix of a flow's network in the generator
 class Published:
     """A generator of a published file, converted to r2flow's names."""
 
-    config: dict[str, Any]  # config for `r2flow.generators.build_generator`; the file's config is under `published`
+    config: dict[
+        str, Any
+    ]  # config for `r2flow.generators.build_generator`; the file's config is under `published`
     weights: dict[str, Tensor]  # the generator's weights by r2flow's names
     step: int = 0  # optimiser steps taken
-    sampler: Mapping[str, Any] | None = None  # published sampler, name and fields; None: the generator's default
-    elevations: Tensor | None = None  # of the rows of unfolded scans in radians, (H,); None: the sensor's
+    sampler: Mapping[str, Any] | None = (
+        None  # published sampler, name and fields; None: the generator's default
+    )
+    elevations: Tensor | None = (
+        None  # of the rows of unfolded scans in radians, (H,); None: the sensor's
+    )
     fixed: bool = False  # whether it is distilled for this sampler alone
 
 
@@ -36,21 +46,39 @@ class Format(NamedTuple):
 
     system: str  # name of the system
     holds: Callable[[Any], bool]  # whether the content of a torch file has this format
-    read: Callable[[Any, Path, bool], Published]  # convert the content, with averaged or raw weights
+    read: Callable[
+        [Any, Path, bool], Published
+    ]  # convert the content, with averaged or raw weights
 
 
 def has_keys(*keys: str, but: str | None = None) -> Callable[[Any], bool]:
     """Whether the content of a file is a dict with these keys, without another."""
-    return lambda content: isinstance(content, Mapping) and {*keys} <= content.keys() and but not in content
+    return lambda content: (
+        isinstance(content, Mapping) and {*keys} <= content.keys() and but not in content
+    )
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
-    """Read a published R2Flow checkpoint, which has averaged weights only; a k-TD draws in its k Euler steps."""
-    cfg, weights = content["cfg"], {BACKBONE + name: value for name, value in content["weights"].items()}
-    step = int(content.get("num_images", 0)) // max(int(cfg.get("training", {}).get("batch_size", 1)), 1)
+    """Read a published R2Flow checkpoint, which has averaged weights only; a k-TD draws in its k
+    Euler steps.
+    """
+    cfg, weights = (
+        content["cfg"],
+        {BACKBONE + name: value for name, value in content["weights"].items()},
+    )
+    step = int(content.get("num_images", 0)) // max(
+        int(cfg.get("training", {}).get("batch_size", 1)), 1
+    )
     config = published_config(cfg)
     k = config["stage"].get("steps")  # None: not distilled
-    return Published(config, weights, step, {"name": "euler", "steps": k}, rings_of(config, weights), k is not None)
+    return Published(
+        config,
+        weights,
+        step,
+        {"name": "euler", "steps": k},
+        rings_of(config, weights),
+        k is not None,
+    )
 
 
 def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -> dict[str, Any]:
@@ -61,7 +89,9 @@ def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -
 
 
 def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert a published checkpoint's `cfg` (data, model, flow, training, finetuning) to an r2flow config."""
+    """Convert a published checkpoint's `cfg` (data, model, flow, training, finetuning) to an r2flow
+    config.
+    """
     data, model = cfg["data"], cfg["model"]
     tuning = cfg.get("finetuning") or {}  # empty: of an older file, which does not say its stage
     k, name = tuning.get("k_distil"), "reflow" if tuning.get("init_ckpt") else "rectify"
@@ -72,7 +102,10 @@ def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
         "backbone": backbone_of(model),
         "data": {
             "name": data["dataset"],
-            "reading": {"projection": str(data["projection"]).split("-")[0], "convention": "reference"},
+            "reading": {
+                "projection": str(data["projection"]).split("-")[0],
+                "convention": "reference",
+            },
         },
         "published": dict(cfg),
     }
@@ -90,7 +123,8 @@ def backbone_of(model: Mapping[str, Any]) -> dict[str, Any]:
     }
     if common["name"] == "hdit":
         return {**common, "depths": list(blocks), "num_heads": list(heads)}
-    # The reference has one config class for all three architectures: a U-Net has a single number of heads.
+    # The reference has one config class for all three architectures: a U-Net has a single number of
+    # heads.
     return {
         **common,
         "num_residual_blocks": blocks if isinstance(blocks, int) else list(blocks),
@@ -114,7 +148,8 @@ class Inert:
         """Ignore the arguments."""
 
 
-# Classes in a pickled DictConfig and in Lightning 1.4's callback states. `weights_only` refuses all others.
+# Classes in a pickled DictConfig and in Lightning 1.4's callback states. `weights_only` refuses all
+# others.
 NAMES = (
     "omegaconf.dictconfig.DictConfig",
     "omegaconf.listconfig.ListConfig",

@@ -30,7 +30,8 @@ class HasGenerator(Protocol):
 class Samples:
     """Generated scans; tensors are on the CPU."""
 
-    images: Tensor  #: range in metres and reflectance, (B, 2 or 1, H, W); 0 for rays dropped or not requested
+    #: range in metres and reflectance, (B, 2 or 1, H, W); 0 for rays dropped or not requested
+    images: Tensor
     first: int  #: number of the first scan
     evaluations: Tensor  #: network evaluations per scan, (B,)
     converged: Tensor  #: whether the sampler converged, per scan, (B,) bool
@@ -57,25 +58,42 @@ def sample(
         sampler: Sampler or its name; None: the generator's default.
         batch_size: Scans per batch. It does not change a fixed-step result beyond rounding.
         condition: Condition of the scans, each tensor (num, ...).
-        region: Region of the image to generate. The network sees `evaluated_region` only, with the same noise as in the
-            whole image.
+        region: Region of the image to generate. The network sees `evaluated_region` only, with the
+            same noise as in the whole image.
         precision: Precision of the network, see `Generator.forward`.
         progress: Called after every network evaluation of a batch.
         changes: Fields of the sampler: steps, tolerance, grid, ...
 
     Raises:
-        InputError: num or batch_size below 1, a sampler that the generator does not have, an invalid field
-            of the sampler, a condition of the wrong length, or a region that the generator cannot be cropped to.
+        InputError: num or batch_size below 1, a sampler that the generator does not have, an
+            invalid field of the sampler, a condition of the wrong length, or a region that the
+            generator cannot be cropped to.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    if not (isinstance(num, Integral) and isinstance(batch_size, Integral) and num >= 1 and batch_size >= 1):
-        raise InputError(f"needs at least one scan and a batch of at least one; found {num!r} and {batch_size!r}.")
-    chosen = sampler.changed(**changes) if isinstance(sampler, Sampler) else generator.choose(sampler, **changes)
+    if not (
+        isinstance(num, Integral)
+        and isinstance(batch_size, Integral)
+        and num >= 1
+        and batch_size >= 1
+    ):
+        raise InputError(
+            f"needs at least one scan and a batch of at least one; found {num!r} and "
+            f"{batch_size!r}."
+        )
+    chosen = (
+        sampler.changed(**changes)
+        if isinstance(sampler, Sampler)
+        else generator.choose(sampler, **changes)
+    )
     for name, value in (condition or {}).items():
-        check(len(value) == num, f"the condition's {name} has {len(value)} scans, but num is {num}.")
+        check(
+            len(value) == num, f"the condition's {name} has {len(value)} scans, but num is {num}."
+        )
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
-        batch_condition = condition and {name: value[first : numbers.stop] for name, value in condition.items()}
+        batch_condition = condition and {
+            name: value[first : numbers.stop] for name, value in condition.items()
+        }
         drawn = draw(generator, numbers, seed, chosen, batch_condition, region, precision, progress)
         warn_unsolved(drawn.converged, first)
         yield drawn
@@ -92,34 +110,49 @@ def draw(
     precision: Precision = "32-true",
     progress: Progress = None,
 ) -> Samples:
-    """Draw the scans of these numbers as one batch (see `sample`); all generated images come from this function."""
+    """Draw the scans of these numbers as one batch (see `sample`); all generated images come from
+    this function.
+    """
     draws, space = Draws(seed, numbers), generator.space
     noise = draws.start(generator.noise_shape)
     evaluated = None if region is None or region.share == 1 else evaluated_region(generator, region)
     if evaluated is not None:
         whole = space.shape[1:]
         generator, noise = generator.part(evaluated), evaluated.crop(noise)
-        condition = condition and {n: evaluated.crop(x) if x.shape[-2:] == whole else x for n, x in condition.items()}
+        condition = condition and {
+            n: evaluated.crop(x) if x.shape[-2:] == whole else x for n, x in condition.items()
+        }
     start = time.perf_counter()
-    generated = generator(noise, condition, sampler=sampler, draws=draws, precision=precision, progress=progress)
+    generated = generator(
+        noise, condition, sampler=sampler, draws=draws, precision=precision, progress=progress
+    )
     x_1 = generated.x.cpu()  # also synchronises the GPU
     seconds = time.perf_counter() - start
     images = generator.space.decode(x_1)
     if region is not None and evaluated is not None:
         images = region.place(region.crop(evaluated.place(images)))
-    return Samples(images, numbers[0], generated.evaluations.cpu(), generated.converged.cpu(), seconds)
+    return Samples(
+        images, numbers[0], generated.evaluations.cpu(), generated.converged.cpu(), seconds
+    )
 
 
 def warn_unsolved(converged: Tensor, first: int = 0, of: str = "") -> None:
     """Warn about unconverged scans; `first` is the number of the first scan, `of` says of what."""
-    if lost := [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]:
+    if lost := [
+        str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved
+    ]:
         log.warning(
-            "not solved, so no scans of this flow: %s%s; try another solver, or for a velocity that is singular at t = "
+            "not solved, so no scans of this flow: %s%s; try another solver, or for a velocity "
+            "that is singular at t = "
             "1 a last step before it: --sampler adams3:finish=0.001.",
             ", ".join(lost), of,
         )  # fmt: skip
 
 
 def evaluated_region(generator: Generator, region: Region) -> Region:
-    """The region plus its margin, rounded outward to the generator's units; the whole image for the whole image."""
-    return region.widened(generator.unit if region.share < 1 else (1, 1))  # every generator has the whole image
+    """The region plus its margin, rounded outward to the generator's units; the whole image for the
+    whole image.
+    """
+    return region.widened(
+        generator.unit if region.share < 1 else (1, 1)
+    )  # every generator has the whole image

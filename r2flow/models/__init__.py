@@ -1,4 +1,6 @@
-"""Trained generators by name: `r2flow.load("street")`, `r2flow sample street`, `stage.parent=street`."""
+"""Trained generators by name: `r2flow.load("street")`, `r2flow sample street`,
+`stage.parent=street`.
+"""
 
 import hashlib
 from dataclasses import dataclass
@@ -46,7 +48,11 @@ def find_model(name: str) -> Path:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     same = digest == MODELS[name].sha256
-    check(same, f"{path} is not the model {name}, or damaged: its SHA-256 is {digest[:16]}...; install r2flow again.")
+    check(
+        same,
+        f"{path} is not the model {name}, or damaged: its SHA-256 is {digest[:16]}...; install "
+        "r2flow again.",
+    )
     return path
 
 

@@ -21,7 +21,8 @@ from r2flow.reports.tables import Row, print_table
 T = TypeVar("T")
 
 RULE = (
-    "MACs of convolutions, matrix products, neighbourhood attention on the padded ring and group norm; "
+    "MACs of convolutions, matrix products, neighbourhood attention on the padded ring and group "
+    "norm; "
     "scaled_dot_product_attention's products left out, as in the paper's table II"
 )
 
@@ -40,21 +41,24 @@ def count_parameters(model: nn.Module) -> int:
 
 
 def count_macs(model: Backbone) -> int:
-    """Multiply-accumulates of an evaluation for one image by the paper's rule (table II, "FLOPs"), on the meta device.
+    """Multiply-accumulates of an evaluation for one image by the paper's rule (table II, "FLOPs"),
+    on the meta device.
 
     The rule counts
 
     - convolutions, including resampling filters: taps x input channels per output value;
     - linear layers, recurrent layers and other matrix products: inputs per output value;
-    - neighbourhood attention: 2 x window x channels per token of the map padded by half a window on both sides of the
-      ring, where the published models compute it and crop;
+    - neighbourhood attention: 2 x window x channels per token of the map padded by half a window on
+      both sides of the ring, where the published models compute it and crop;
     - group norm: 5 per value with a learned scale and shift, 4 without.
 
-    It omits biases, activations, other norms, rotations and the two products of `scaled_dot_product_attention` (for
-    HDiT 0.40 GMAC of 77.8, for the base ADM U-Net 8.6 of 265.6): fused kernels that the paper's counter did not count.
-    This rule reproduces all five rows of the table to 0.02 %.
+    It omits biases, activations, other norms, rotations and the two products of
+    `scaled_dot_product_attention` (for HDiT 0.40 GMAC of 77.8, for the base ADM U-Net 8.6 of
+    265.6): fused kernels that the paper's counter did not count. This rule reproduces all five rows
+    of the table to 0.02 %.
 
-    A module may have a method `macs(inputs, output)`, which replaces what is counted in its calls outside its children.
+    A module may have a method `macs(inputs, output)`, which replaces what is counted in its calls
+    outside its children.
     """
     on_meta = {
         name: tensor.detach().to("meta")
@@ -96,9 +100,11 @@ def count_macs(model: Backbone) -> int:
 def backbone_costs(
     sensor: Sensor, names: Sequence[str] | None = None, repeats: int = 3, device: str = "cpu"
 ) -> Iterator[Row]:
-    """Parameters, GMAC and median latency in float32 of every configuration for one image of two channels.
+    """Parameters, GMAC and median latency in float32 of every configuration for one image of two
+    channels.
 
-    The latency is None without `repeats`. A configuration that does not support the size has only an `error`.
+    The latency is None without `repeats`. A configuration that does not support the size has only
+    an `error`.
     """
     table = configurations()
     for name in names or table:
@@ -113,7 +119,9 @@ def backbone_costs(
 
 
 def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> Row:
-    """Parameters, GMAC and, if `repeats`, milliseconds of one evaluation for one image of a config's backbone."""
+    """Parameters, GMAC and, if `repeats`, milliseconds of one evaluation for one image of a
+    config's backbone.
+    """
     generator = build_generator(config).eval()
     model = getattr(generator, "backbone", None)
     if not isinstance(model, Backbone):

@@ -37,8 +37,10 @@ _RESULTS = {
 }
 
 _NOTES = (
-    "Losses are those that were logged: of validation, with the averaged weights; compare them only between runs with "
-    "the same loss and the same data. Bend is the last `curvature/bend`, s(t) over the squared path length; an "
+    "Losses are those that were logged: of validation, with the averaged weights; compare them "
+    "only between runs with "
+    "the same loss and the same data. Bend is the last `curvature/bend`, s(t) over the squared "
+    "path length; an "
     "untrained flow is straight too. Several seeds: mean ± standard deviation."
 )
 
@@ -143,7 +145,8 @@ def print_comparison(groups: Groups) -> None:
     differ = [key for key in compared if len({str(run[key]) for run in runs}) > 1]
     if differ:
         print(
-            f"the runs differ in {', '.join(differ)}: compare them at equal steps, or by r2flow evaluate, not by their "
+            f"the runs differ in {', '.join(differ)}: compare them at equal steps, or by r2flow "
+            "evaluate, not by their "
             "losses"
         )
 
@@ -171,7 +174,8 @@ def compare_page(groups: Groups) -> Page:
 
 
 def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> None:
-    """Write the report of a chain: the comparison of its runs, their first scan, and scans of the last one.
+    """Write the report of a chain: the comparison of its runs, their first scan, and scans of the
+    last one.
 
     `runs` are the folders by name of the link, in order.
     """

@@ -55,8 +55,8 @@ def write_completed(
 ) -> None:
     """Complete scans; write answers, their spread, pictures and 3-D pages; print counts.
 
-    Scans whose answers are all in the folder are skipped. `about` has the other settings that affect the answers, as
-    plain values.
+    Scans whose answers are all in the folder are skipped. `about` has the other settings that
+    affect the answers, as plain values.
     """
     settings = {"num": job.num, "fill_gaps": job.fill_gaps, **about, "precision": job.precision}
     recipe = recipe_of(checkpoint, job.seed, sampler, completion=settings)
@@ -94,7 +94,8 @@ def write_completed(
             _write(checkpoint, scan, out, files[scan.name], given, completed)
             if not completed.evaluations.any():
                 print(
-                    f"{scan.name}: everything is known, so nothing was completed; see --from, --fill-gaps and --mask"
+                    f"{scan.name}: everything is known, so nothing was completed; see --from, "
+                    "--fill-gaps and --mask"
                 )
             counts += _count(scan, given)
             bar.set((done + 1) * job.num)
@@ -126,7 +127,8 @@ def _check_inputs(
     for name, paths in files.items():
         if before.get(name) != inputs[name] and any(path.exists() for path in paths):
             raise InputError(
-                f"{store.folder} holds files of another scan of the name {name}; give another --out."
+                f"{store.folder} holds files of another scan of the name {name}; give another "
+                "--out."
             )
     return inputs
 
@@ -154,13 +156,15 @@ def _print_counts(checkpoint: Checkpoint, counts: Counter[str]) -> None:
         size = "x".join(map(str, sensor.shape))
         print(
             f"measured points used: {counts['used']:,}, the nearest in each pixel of {size}; "
-            f"kept: {counts['kept']:,}, {counts['outside']:,} outside {sensor.min_range:g}-{sensor.max_range:g} m "
+            f"kept: {counts['kept']:,}, {counts['outside']:,} outside "
+            f"{sensor.min_range:g}-{sensor.max_range:g} m "
             "left out"
         )
 
 
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
-    """Whether most unknown rays of each scan lie in sectors without known rays; ignores scans without unknown rays.
+    """Whether most unknown rays of each scan lie in sectors without known rays; ignores scans
+    without unknown rays.
 
     Refuses a mixture of both kinds of scans.
     """
@@ -171,7 +175,8 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
             kinds.setdefault(share_in_sectors(state) >= 0.5, scan.name)
     if len(kinds) > 1:
         raise InputError(
-            f"{kinds[True]} lacks whole sectors (--checkpoint {DEFAULT}) and {kinds[False]} does not (--checkpoint "
+            f"{kinds[True]} lacks whole sectors (--checkpoint {DEFAULT}) and {kinds[False]} does "
+            "not (--checkpoint "
             f"{DENSIFY}): complete them apart, or give one --checkpoint for all."
         )
     return True in kinds
@@ -179,7 +184,9 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
 
 @lru_cache(maxsize=16)  # read the scans of a small folder once
 def known_rays(scan: PartialScan, job: Job, number: int) -> Partial:
-    """Known rays of scan `number` that the job's mask keeps; the mask depends only on (seed, number)."""
+    """Known rays of scan `number` that the job's mask keeps; the mask depends only on (seed,
+    number).
+    """
     given = scan.read()
     if job.fill_gaps:
         state = np.where(given.state == Ray.EMPTY, np.uint8(Ray.UNKNOWN), given.state)

@@ -109,9 +109,12 @@ def _mean_row(rows: Sequence[Row]) -> Row:
 def completion_page(rows: Sequence[Row], about: str, seed: int, device: str) -> Page:
     """Build the page: a table per task."""
     text = [
-        f"{about} Figures are of the hidden rays, means over scans and answers, unless their name says otherwise: "
-        "`MAE, all pixels` is LiDARGen's and RangeLDM's, IoU and Chamfer are of whole scans with the measured rays "
-        "pasted in. The panel is the mean distance of its lines between the completed scans and the true ones; it and "
+        f"{about} Figures are of the hidden rays, means over scans and answers, unless their name "
+        "says otherwise: "
+        "`MAE, all pixels` is LiDARGen's and RangeLDM's, IoU and Chamfer are of whole scans with "
+        "the measured rays "
+        "pasted in. The panel is the mean distance of its lines between the completed scans and "
+        "the true ones; it and "
         "`MAE where all return` are of the first answers. "
         "Coverage is the share of hidden ranges between the least and the greatest answer."
     ]

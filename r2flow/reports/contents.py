@@ -47,5 +47,6 @@ def print_known() -> None:
     ]
     print_table(rows, ("network", "distance", "installed", "published file"))
     print(
-        f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Install one: r2flow info --add NAME FILE"
+        f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Install one: r2flow info --add NAME "
+        "FILE"
     )

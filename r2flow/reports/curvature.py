@@ -38,7 +38,8 @@ def measure_paths(
 ) -> Straightness:
     """s(t) over `steps` Euler steps of scans 0 to num - 1 of a seed, and the most curved paths.
 
-    Each batch takes `steps` evaluations, with a call of `progress` after each, and keeps as many images per scan.
+    Each batch takes `steps` evaluations, with a call of `progress` after each, and keeps as many
+    images per scan.
     """
     flow = as_flow(checkpoint.generator, "curvature")
     parts = []
@@ -85,9 +86,12 @@ def curvature_text(flows: Mapping[str, Straightness]) -> list[str]:
     """Text: definition of s(t), and the table of flows."""
     first = next(iter(flows.values()))
     about = (
-        "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 6), the mean over "
-        f"{len(first.s)} scans from the same noise and {len(first.t)} Euler steps. It is 0 on a straight "
-        "path, which one step follows exactly. An untrained flow with v = 0 is straight too: compare int s dt over "
+        "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 6), the "
+        "mean over "
+        f"{len(first.s)} scans from the same noise and {len(first.t)} Euler steps. It is 0 on a "
+        "straight "
+        "path, which one step follows exactly. An untrained flow with v = 0 is straight too: "
+        "compare int s dt over "
         "the squared length |x_1 - x_0|^2."
     )
     return [about, table([summary(*flow) for flow in flows.items()], _COLUMNS)]

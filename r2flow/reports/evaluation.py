@@ -54,7 +54,9 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
 def evaluation_page(
     comparisons: Sequence[Comparison], device: str, seeds: Mapping[str, int]
 ) -> Page:
-    """Build the page of an evaluation: table, verdict, sets, protocols, and quality against speed of models."""
+    """Build the page of an evaluation: table, verdict, sets, protocols, and quality against speed
+    of models.
+    """
     columns, *lines = _table(comparisons)
     sets = [
         (c.name, side, scans.label, len(scans), words(scans.about))
@@ -85,7 +87,8 @@ def _protocol(comparisons: Sequence[Comparison]) -> str:
     top, bottom = used["elevations"]
     return (
         f"Protocol {used['name']}: real points {used['points']['real']}, generated points "
-        f"{used['points']['generated']}; images {'x'.join(map(str, used['image']))} of {used['sensor']}, "
+        f"{used['points']['generated']}; images {'x'.join(map(str, used['image']))} of "
+        f"{used['sensor']}, "
         f"{top:.2f} to {bottom:.2f} degrees."
     )
 
@@ -149,7 +152,9 @@ def sampled_rows(comparisons: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 
 def speed_figure(rows: Sequence[Row], names: Sequence[str]) -> Figure:
-    """Plot each metric's first value against evaluations (top) and seconds (bottom), one line per flow."""
+    """Plot each metric's first value against evaluations (top) and seconds (bottom), one line per
+    flow.
+    """
     first = {name.split("/")[0]: name for name in reversed(names)}
     plots = []
     for x, label in _SPEED.items():

@@ -1,4 +1,6 @@
-"""Interpolation of two real scans in noise space: the paper's figure 3, and a point cloud per frame."""
+"""Interpolation of two real scans in noise space: the paper's figure 3, and a point cloud per
+frame.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,7 +31,9 @@ def interpolation(
     out: Path,
     sampler: Sampler,
 ) -> Page:
-    """Write `frames` scans between two as `out/frames/NNN.ply` and `.npy`; return the unwritten page."""
+    """Write `frames` scans between two as `out/frames/NNN.ply` and `.npy`; return the unwritten
+    page.
+    """
     rays = checkpoint.sensor.rays()
     evaluations = frames * (sampler.evaluations(checkpoint.generator) or 0)
     with Bar("interpolating", frames, evaluations=evaluations) as bar:
@@ -52,8 +56,10 @@ def interpolation(
     errors = round_trip(checkpoint, result.ends)
     off = ", ".join(f"{error:.2g} m" for error in errors["median_m"].tolist())
     text = [
-        f"The flow of {checkpoint.path.name}, step {checkpoint.step}, inverted both scans to noise and generated the "
-        "frames from spherical interpolations (slerp) of it. The first and last frames are round trips of the scans "
+        f"The flow of {checkpoint.path.name}, step {checkpoint.step}, inverted both scans to noise "
+        "and generated the "
+        "frames from spherical interpolations (slerp) of it. The first and last frames are round "
+        "trips of the scans "
         f"(median error of the range {off}); their evaluations include both directions.",
         table(rows, {key: key for key in rows[0]}),
     ]
@@ -83,7 +89,9 @@ def interpolation_figure(
     rays: Tensor,
     names: Sequence[str],
 ) -> Figure:
-    """Contact sheet of the real scans and the frames between them; the first and last frame are round trips."""
+    """Contact sheet of the real scans and the frames between them; the first and last frame are
+    round trips.
+    """
     chosen = spread(len(frames), 8)
     between = [f"w = {weights[number]:.2f}" for number in chosen]
     titles = [f"real: {names[0]}", *between, f"real: {names[1]}"]

@@ -41,12 +41,13 @@ def write_samples(
     replace: bool = False,
     precision: Precision = "32-true",
 ) -> Sequence[str]:
-    """Sample scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D.
+    """Sample scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in
+    3-D.
 
-    Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes; `replace` deletes samples of
-    other settings in the folder. Files have the sensor's shape, 0 outside the region. Formats: `ply` and `bin` are
-    points in metres with reflectance, `npy` is the range image, float32 (2 or 1, H, W); default: all that suit the
-    model. Returns the formats.
+    Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes; `replace`
+    deletes samples of other settings in the folder. Files have the sensor's shape, 0 outside the
+    region. Formats: `ply` and `bin` are points in metres with reflectance, `npy` is the range
+    image, float32 (2 or 1, H, W); default: all that suit the model. Returns the formats.
     """
     generator = checkpoint.generator
     sampler = sampler or generator.sampler
@@ -54,7 +55,8 @@ def write_samples(
     endings = fitting if formats is None else formats
     if not set(endings) <= set(fitting):
         raise InputError(
-            f"--format {','.join(endings)!r} cannot hold these scans; give some of {','.join(fitting)}."
+            f"--format {','.join(endings)!r} cannot hold these scans; give some of "
+            f"{','.join(fitting)}."
         )
     sampler.check(generator)
     recipe = recipe_of(
@@ -110,7 +112,9 @@ def _stale_files(store: FileStore, replace: bool) -> list[Path]:
 
 
 def recipe_of(checkpoint: Checkpoint, seed: int, sampler: Sampler, **more: Any) -> dict[str, Any]:
-    """Recipe of the store of samples: settings that affect samples if not None, and how to read them."""
+    """Recipe of the store of samples: settings that affect samples if not None, and how to read
+    them.
+    """
     return {
         "reading": reading_for([], checkpoint).described(),
         "encoding": {
@@ -139,7 +143,9 @@ def _draw_samples(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: 
 
 
 def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
-    """Suggested commands after sampling a run to `out`: training on real scans, the next link, or evaluation."""
+    """Suggested commands after sampling a run to `out`: training on real scans, the next link, or
+    evaluation.
+    """
     plugins = "".join(f" --plugin {shlex.quote(name)}" for name in config.get("plugins") or ())
     quoted = shlex.quote(str(run))
     stage = config["stage"]

@@ -54,7 +54,9 @@ class Page:
 
 
 def write_page(page: Page, out: Path) -> list[Path]:
-    """Write `out/NAME.png ...`, `NAME.pdf`, `NAME.json` and `NAME.md` atomically; returns the files."""
+    """Write `out/NAME.png ...`, `NAME.pdf`, `NAME.json` and `NAME.md` atomically; returns the
+    files.
+    """
     origin = provenance(page)
     written = []
     for name, figure in page.figures.items():
@@ -117,8 +119,8 @@ class Plot(NamedTuple):
 def lines_figure(plots: Sequence[Plot], columns: int) -> Figure:
     """Draw plots in rows of `columns`; equal labels share a style.
 
-    The y axis is logarithmic if its values are positive and differ by more than three times. The legend is left out
-    if there are more labels than styles.
+    The y axis is logarithmic if its values are positive and differ by more than three times. The
+    legend is left out if there are more labels than styles.
     """
     labels = list(dict.fromkeys(label for plot in plots for label in plot.lines))
     columns = min(columns, len(plots))

@@ -1,4 +1,6 @@
-"""The paper's tables I and II and figures 6 to 8 from runs: the printed numbers next to evaluated ones."""
+"""The paper's tables I and II and figures 6 to 8 from runs: the printed numbers next to evaluated
+ones.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -53,7 +55,9 @@ _ARCHITECTURES = {
 
 @dataclass(frozen=True)
 class PaperRun:
-    """A generator and its role: "1-RF", "2-RF", "2-TD", or the method's name in table I for other systems."""
+    """A generator and its role: "1-RF", "2-RF", "2-TD", or the method's name in table I for other
+    systems.
+    """
 
     role: str
     label: str
@@ -61,7 +65,9 @@ class PaperRun:
 
 
 def role_of(checkpoint: Checkpoint, label: str) -> str:
-    """The row of table I for a checkpoint, from its config; `label` if the config does not determine it."""
+    """The row of table I for a checkpoint, from its config; `label` if the config does not
+    determine it.
+    """
     config = checkpoint.config
     generator = config.get("generator") or {}
     stage = config.get("stage") or {}
@@ -102,7 +108,8 @@ def paper_page(
         f"Generators: {names}.",
         "## Table I: methods and metrics",
         table_i(evaluated),
-        f"Evaluated rows: {protocols or 'none'}. Printed rows: {_PROTOCOL} kitti_360. Figures with * are of another "
+        f"Evaluated rows: {protocols or 'none'}. Printed rows: {_PROTOCOL} kitti_360. Figures with "
+        "* are of another "
         "protocol than printed ones, and not comparable.",
         "## Table II: velocity estimators",
         table(architectures, _ARCHITECTURES),
@@ -157,7 +164,8 @@ def read_results(files: Sequence[Path]) -> list[Row]:
 
 
 def table_i(rows: Sequence[Row]) -> str:
-    """Table I as printed, with evaluated rows below: those of equal evaluations, or the most if both are many.
+    """Table I as printed, with evaluated rows below: those of equal evaluations, or the most if
+    both are many.
 
     Evaluated rows without a printed row come last.
     """
@@ -191,7 +199,9 @@ def _evaluated_line(row: Row) -> Row:
 
 
 def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str) -> list[Row]:
-    """Table II: one row per 1-RF, with the printed row of equal parameters, and FRD of the most evaluations."""
+    """Table II: one row per 1-RF, with the printed row of equal parameters, and FRD of the most
+    evaluations.
+    """
     lines = []
     for run in runs:
         if run.role != "1-RF":
@@ -213,7 +223,9 @@ def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str
 
 
 def same_architecture(parameters: int) -> Architecture | None:
-    """The row of table II with this number of parameters, within 0.4 % (the printed 125.5 M are 125.2 M)."""
+    """The row of table II with this number of parameters, within 0.4 % (the printed 125.5 M are
+    125.2 M).
+    """
     for row in TABLE_II.values():
         if abs(parameters - row.parameters) < 4e-3 * row.parameters:
             return row

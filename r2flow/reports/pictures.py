@@ -61,7 +61,8 @@ def contact_sheet(
     titles: Sequence[str] = (),
     unmeasured: np.ndarray | None = None,
 ) -> Figure:
-    """Draw several scans, one per row: images on the left, bird's-eye view and perspective on the right.
+    """Draw several scans, one per row: images on the left, bird's-eye view and perspective on the
+    right.
 
     Rays of the first scan that were not measured, (H, W) bool, are grey.
     """
@@ -141,7 +142,8 @@ def _draw_values(
 
 
 def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
-    """Name and colour of the `most` most frequent semantic ids in labels, (N,), in order of frequency.
+    """Name and colour of the `most` most frequent semantic ids in labels, (N,), in order of
+    frequency.
 
     Names are SemanticKITTI's if it defines all ids, else numbers.
     """
@@ -193,7 +195,9 @@ def _show_names_literally(figure: Figure) -> None:
 def save_figure(
     figure: Figure, path: Path, dpi: int = 300, title: str = "", about: str = ""
 ) -> Path:
-    """Write a PNG or PDF with its title and what it is about, atomically; equal figures have equal files."""
+    """Write a PNG or PDF with its title and what it is about, atomically; equal figures have equal
+    files.
+    """
     notes: dict[str, Any] = {"Description": about}
     if path.suffix == ".pdf":
         notes = {"Subject": about, "CreationDate": None}

@@ -1,7 +1,7 @@
 """Values printed in the paper: tables I and II.
 
-*Fast LiDAR Data Generation with Rectified Flows* (R2Flow, ICRA 2025): KITTI-360, 10,000 generated scans of 64 x 1024
-against all real ones, Euler steps, NVIDIA RTX 6000 Ada.
+*Fast LiDAR Data Generation with Rectified Flows* (R2Flow, ICRA 2025): KITTI-360, 10,000 generated
+scans of 64 x 1024 against all real ones, Euler steps, NVIDIA RTX 6000 Ada.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,6 @@
-"""Error against run time of every solver, on exact problems (smooth, stiff, extreme) and on a trained flow."""
+"""Error against run time of every solver, on exact problems (smooth, stiff, extreme) and on a
+trained flow.
+"""
 
 import math
 import shlex
@@ -57,7 +59,8 @@ def configurations(
 ) -> dict[str, Row]:
     """Options of `solve` by label.
 
-    All fixed-step methods at numbers of steps that fit the budgets, all adaptive methods at the tolerances.
+    All fixed-step methods at numbers of steps that fit the budgets, all adaptive methods at the
+    tolerances.
     """
     chosen: dict[str, Row] = {}
     for method in methods:
@@ -110,7 +113,8 @@ def checkpoint_subject(
 ) -> Subject:
     """A trained flow and its reference solution: rk4 in many steps with a float64 state.
 
-    `floor` is three times the largest distance to dopri5 at a tight tolerance, inf if either did not converge.
+    `floor` is three times the largest distance to dopri5 at a tight tolerance, inf if either did
+    not converge.
     """
     flow = as_flow(checkpoint.generator, "report solvers")
     x_0 = Draws(seed, range(num)).start(flow.noise_shape).to(flow.device)
@@ -133,8 +137,8 @@ def measure(
 ) -> list[Row]:
     """Measure error, evaluations and seconds of each configuration on each subject, one row each.
 
-    Repetitions are interleaved, so that other load on the machine affects all configurations alike; errors are those of
-    the first repetition.
+    Repetitions are interleaved, so that other load on the machine affects all configurations alike;
+    errors are those of the first repetition.
     """
     rows = []
     for subject in subjects:
@@ -205,7 +209,9 @@ def _as_options(options: Row) -> str:
 
 
 def reached(row: Row) -> float:
-    """Error of a row, at least `floor`; infinite if a scan was not solved or x_0 has a smaller error."""
+    """Error of a row, at least `floor`; infinite if a scan was not solved or x_0 has a smaller
+    error.
+    """
     if row["converged"] < row["scans"] or not row["error"] < row["length"]:
         return math.inf
     return float(max(row["error"], row["floor"]))
@@ -218,7 +224,9 @@ def best_within(rows: Sequence[Row], budget: float) -> Row | None:
 
 
 def cheapest(rows: Sequence[Row], metres: float) -> Row | None:
-    """Row of fewest evaluations with a range error within a limit in metres (RMS, median over scans)."""
+    """Row of fewest evaluations with a range error within a limit in metres (RMS, median over
+    scans).
+    """
     within = [row for row in rows if math.isfinite(reached(row)) and row["range_rms_m"] <= metres]
     return min(within, key=lambda row: (row["evaluations"], reached(row)), default=None)
 
@@ -251,7 +259,8 @@ def solvers_page(
             lines.append([name, *cells])
         text += [
             "## Exact problems",
-            f"{rows[0]['scans']} scans each, in float64: the most accurate solver within a number of evaluations and "
+            f"{rows[0]['scans']} scans each, in float64: the most accurate solver within a number "
+            "of evaluations and "
             "its median RMS error; none if x_0 has a smaller error.",
             table(lines, ["problem", *(f"within {budget}" for budget in budgets)]),
         ]
@@ -272,7 +281,8 @@ def flow_text(rows: Sequence[Row], subject: Subject) -> list[str]:
         by_error.append({**(row or {}), "how": how, "wanted": f"{metres:g} m"})
     cost = {"evaluations": "evaluations", "seconds": "s a scan"}
     return [
-        f"**{subject.name}**, {len(subject.x_0)} scans, against its reference solution. Errors above "
+        f"**{subject.name}**, {len(subject.x_0)} scans, against its reference solution. Errors "
+        "above "
         f"{shown(subject.floor)} can be measured.",
         "Sampler with the fewest evaluations for an RMS error of the range:",
         table(by_error, {"wanted": "error", "how": "sampler", **cost}),

@@ -68,7 +68,8 @@ def smooth(steps: np.ndarray, values: np.ndarray) -> Curve:
 def finish(
     run: Path, samples: Mapping[str, Any], seed: int, device: str, finished: bool, kept: bool
 ) -> None:
-    """Draw the loss curve and a few scans of a run; print its files and the commands that come next.
+    """Draw the loss curve and a few scans of a run; print its files and the commands that come
+    next.
 
     `kept`: the run keeps checkpoints.
     """

@@ -7,7 +7,8 @@ from r2flow.evaluation.comparing import Comparison
 from r2flow.evaluation.sets import AS_MANY, HALVES
 
 _ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
-_MARGIN = 1.5  # 95 % of equal sets of one source differ by less: 200 splits of simulated scans, 50 to 160 a set
+# 95 % of equal sets of one source differ by less: 200 splits of simulated scans, 50 to 160 a set
+_MARGIN = 1.5
 _HEADLINE = "panel"  # metric of the verdict, if measured
 
 # Values that published tables print scaled: heading and factor, for printing only.
@@ -28,11 +29,12 @@ def heading(metric: str, figure: str) -> tuple[str, float]:
 
 
 def verdict(comparisons: Sequence[Comparison]) -> list[str]:
-    """One sentence per judged set, the nearest first: its panel next to those of real halves and the best baseline.
+    """One sentence per judged set, the nearest first: its panel next to those of real halves and
+    the best baseline.
 
-    Without the panel the first biased distance is taken: an unbiased one of equal sets is above that of the halves as
-    often as not, by any factor. As it is larger for fewer scans, a set is compared with real halves in as many scans
-    as they have, if measured.
+    Without the panel the first biased distance is taken: an unbiased one of equal sets is above
+    that of the halves as often as not, by any factor. As it is larger for fewer scans, a set is
+    compared with real halves in as many scans as they have, if measured.
     """
     biased = [name for name, larger in _distances(comparisons).items() if larger]
     metric = _HEADLINE if _HEADLINE in biased else next(iter(biased), "")
@@ -62,7 +64,9 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
 
 
 def _judge(judged: _Value, equal: _Value | None, halves: _Value, best: float) -> str:
-    """Judge a set; `equal` is its distance in as many scans as the halves have, `best` that of the best baseline."""
+    """Judge a set; `equal` is its distance in as many scans as the halves have, `best` that of the
+    best baseline.
+    """
     value, comparison = judged
     compared, pair = equal or judged
     reference, half = halves
@@ -75,7 +79,8 @@ def _judge(judged: _Value, equal: _Value | None, halves: _Value, best: float) ->
         if best < math.inf:
             clause = f", {'below' if value < best else 'not below'} the baselines"
         return (
-            f"{above} the real halves{clause}; too few scans for a verdict: {len(comparison.real)} real, "
+            f"{above} the real halves{clause}; too few scans for a verdict: {len(comparison.real)} "
+            "real, "
             f"{len(comparison.generated)} generated, {2 * _ENOUGH} and {_ENOUGH} needed"
         )
     if value >= best:
@@ -92,7 +97,9 @@ def _judge(judged: _Value, equal: _Value | None, halves: _Value, best: float) ->
 
 
 def remarks_of(comparisons: Sequence[Comparison]) -> list[str]:
-    """Remarks on distances that do not rank, and those of the metrics with the sets that they are on."""
+    """Remarks on distances that do not rank, and those of the metrics with the sets that they are
+    on.
+    """
     lines = []
     distances = _distances(comparisons)
     if any(distances.values()) and len({(len(c.real), len(c.generated)) for c in comparisons}) > 1:
@@ -105,7 +112,8 @@ def remarks_of(comparisons: Sequence[Comparison]) -> list[str]:
         ]
         if below:
             lines.append(
-                f"{metric} ranks nothing here, with baselines below the real halves: {', '.join(below)}."
+                f"{metric} ranks nothing here, with baselines below the real halves: "
+                f"{', '.join(below)}."
             )
     sets: dict[str, dict[str, None]] = {}  # by remark
     for comparison in comparisons:

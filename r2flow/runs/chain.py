@@ -1,4 +1,6 @@
-"""Chains of runs, such as 1-RF -> 2-RF -> k-TD: one after another, each from the weights of an earlier one."""
+"""Chains of runs, such as 1-RF -> 2-RF -> k-TD: one after another, each from the weights of an
+earlier one.
+"""
 
 import re
 import sys
@@ -25,35 +27,61 @@ class Link:
     parent: str | None = None  # name of the link that it starts from, if any
 
 
-def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], configs: Sequence[str] = ()) -> list[Link]:
+def links_of(
+    chain: Mapping[str, Any], folder: Path, given: Sequence[str], configs: Sequence[str] = ()
+) -> list[Link]:
     """The runs of a chain in the order of their parents; `parent` names a link's parent.
 
-    The user's command line, `given`, follows each link's own overrides, as far as it concerns the link.
-    `configs` are further folders of configs.
+    The user's command line, `given`, follows each link's own overrides, as far as it concerns the
+    link. `configs` are further folders of configs.
     """
     if any(key_of(text) == "stage.parent" for text in given):
-        raise InputError("stage.parent is each link's own: give +chain.LINK.stage.parent=RUN to one of them.")
+        raise InputError(
+            "stage.parent is each link's own: give +chain.LINK.stage.parent=RUN to one of them."
+        )
     links: list[Link] = []
     for name, difference in chain.items():
-        if not (isinstance(difference, Mapping) and isinstance(name, str) and re.fullmatch(r"[\w-][\w.-]*", name)):
-            raise InputError(f"chain.{name}: a link is a name ('1', not 1) and groups of keys; found {difference!r}.")
+        if not (
+            isinstance(difference, Mapping)
+            and isinstance(name, str)
+            and re.fullmatch(r"[\w-][\w.-]*", name)
+        ):
+            raise InputError(
+                f"chain.{name}: a link is a name ('1', not 1) and groups of keys; found "
+                f"{difference!r}."
+            )
         settings = dict(difference)
         named = settings.pop("parent", None)
         parent = None if named is None else str(named)  # a name may be a number
         own: list[str] = []
         for key, value in flatten(settings):
             if (key, value) != ("experiment", None):
-                own.append(override("stage" if key == "stage.name" else key, value))  # a choice, with its own options
+                own.append(
+                    override("stage" if key == "stage.name" else key, value)
+                )  # a choice, with its own options
         if any(key_of(text) == "plugins" for text in own):
-            raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")
-        begins = dict(flatten(difference)).keys() & {"experiment", "parent", "stage.parent"}  # a mistyped link does not
+            raise InputError(
+                f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE."
+            )
+        begins = dict(flatten(difference)).keys() & {
+            "experiment",
+            "parent",
+            "stage.parent",
+        }  # a mistyped link does not
         if parent not in (None, *(link.name for link in links)) or (links and not begins):
-            raise InputError(f"chain.{name} starts from {parent or 'nothing'}; give parent=EARLIER or an experiment.")
+            raise InputError(
+                f"chain.{name} starts from {parent or 'nothing'}; give parent=EARLIER or an "
+                "experiment."
+            )
         if parent is not None:
             own.append(override("stage.parent", str(Path(folder, parent))))
         # Overrides given for this link alone come last: they replace the link's own keys.
         prefix = f"chain.{name}."
-        alone = [text.lstrip("+").removeprefix(prefix) for text in given if text.lstrip("+").startswith(prefix)]
+        alone = [
+            text.lstrip("+").removeprefix(prefix)
+            for text in given
+            if text.lstrip("+").startswith(prefix)
+        ]
         alone = [text for text in alone if not text.startswith("parent=")]
         with naming(f"chain.{name}"):
             config = compose([*own, *alone], configs)
@@ -61,22 +89,32 @@ def links_of(chain: Mapping[str, Any], folder: Path, given: Sequence[str], confi
         concerning = ("all", "pairs" if on_pairs else "scans")
         overrides = [text for text in given if rule(key_of(text)).links in concerning] + alone
         sets = [text for text in (*own, *overrides) if key_of(text) == "data"]
-        if sets and not re.fullmatch("data='?simulated'?", sets[-1]):  # other scans have no scenes, or their own
+        if sets and not re.fullmatch(
+            "data='?simulated'?", sets[-1]
+        ):  # other scans have no scenes, or their own
             own = [text for text in own if key_of(text) != "data.scenes"]
         run_dir = Path(folder, name)
-        links.append(Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent))
+        links.append(
+            Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent)
+        )
     return links
 
 
 def train_links(links: Sequence[Link], folders: Sequence[str] = ()) -> int:
-    """Train the links that are not finished, in this process; the exit code is 0 or, if one was stopped, 75."""
+    """Train the links that are not finished, in this process; the exit code is 0 or, if one was
+    stopped, 75.
+    """
     for number, link in enumerate(links, 1):
         print(f"[{number}/{len(links)}] {link.name}: {link.run_dir}", flush=True)
         try:
             with naming(f"chain.{link.name}"):
                 finished = fit(build(compose(link.overrides, folders), link.overrides)).finished
         except Stopped:
-            print(f"the chain stopped in {link.name}; the same command resumes there", file=sys.stderr, flush=True)
+            print(
+                f"the chain stopped in {link.name}; the same command resumes there",
+                file=sys.stderr,
+                flush=True,
+            )
             raise
         if not finished:
             return LATER
@@ -91,8 +129,12 @@ def check_links(links: Sequence[Link], folders: Sequence[str] = ()) -> None:
         if link.parent is not None:
             before = configs[link.parent]
             steps = before["trainer"]["max_steps"]
-            parent = Parent(before, Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt"), steps)
+            parent = Parent(
+                before, Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt"), steps
+            )
         try:
             configs[link.name] = check(compose(link.overrides, folders), link.overrides, parent)
         except InputError as error:
-            raise InputError(f"chain.{link.name}: {error} For another link alone: +chain.LINK.KEY=VALUE.") from None
+            raise InputError(
+                f"chain.{link.name}: {error} For another link alone: +chain.LINK.KEY=VALUE."
+            ) from None

@@ -27,7 +27,12 @@ from r2flow.registry import did_you_mean, options_of
 T = TypeVar("T")
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-WRONG = (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError)  # raised for a wrong config
+WRONG = (
+    HydraException,
+    OmegaConfBaseException,
+    yaml.YAMLError,
+    UnicodeDecodeError,
+)  # raised for a wrong config
 
 # Hydra groups: the registry of each, and the options that other groups of the config set.
 REGISTRIES = {
@@ -41,13 +46,15 @@ REGISTRIES = {
 
 
 def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -> dict[str, Any]:
-    """Compose the config of a command line, as plain dicts: `compose(["data=kitti_raw", "data.root=FOLDER"])`.
+    """Compose the config of a command line, as plain dicts: `compose(["data=kitti_raw",
+    "data.root=FOLDER"])`.
 
     Args:
         folders: Additional config folders, as in `--config-dir`.
 
     Raises:
-        InputError: what Hydra, OmegaConf or YAML says of an unknown key or choice, or of a damaged file.
+        InputError: what Hydra, OmegaConf or YAML says of an unknown key or choice, or of a damaged
+            file.
     """
     search = [f"file://{Path(folder).resolve()}" for folder in folders]
     with _hydra():
@@ -62,7 +69,9 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
 
 @contextmanager
 def _hydra() -> Iterator[None]:
-    """Context with Hydra initialised on `conf/`; restores a Hydra that the process has already initialised."""
+    """Context with Hydra initialised on `conf/`; restores a Hydra that the process has already
+    initialised.
+    """
     before = GlobalHydra.instance().hydra
     config = HydraConfig.instance().cfg
     GlobalHydra.instance().clear()
@@ -88,7 +97,9 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def add_choices() -> None:
-    """Add a Hydra choice for each registry entry without a YAML file, from its constructor's options."""
+    """Add a Hydra choice for each registry entry without a YAML file, from its constructor's
+    options.
+    """
     for group, (module, table, given_elsewhere) in REGISTRIES.items():
         for name, entry in getattr(import_module(module), table).items():
             if (CONF / group / f"{name}.yaml").is_file():
@@ -101,16 +112,19 @@ def add_choices() -> None:
             else:
                 options = options_of(entry, given=1 if group == "backbone" else 0)
                 if "name" in options:
-                    raise InputError(f"{group} '{name}' has an option 'name', a key of every {group}: rename it.")
+                    raise InputError(
+                        f"{group} '{name}' has an option 'name', a key of every {group}: rename it."
+                    )
                 node |= {key: value for key, value in options.items() if key not in given_elsewhere}
             ConfigStore.instance().store(name, node, group=group)
 
 
 def with_choices(compose: Callable[[], T]) -> T:
-    """The result of a composition; if it lacks a choice that a registry has, such as a plug-in's, of a second one.
+    """The result of a composition; if it lacks a choice that a registry has, such as a plug-in's,
+    of a second one.
 
-    A name that resembles a file's is not looked up if that would import torch. All groups get their choices, since the
-    same command may name several.
+    A name that resembles a file's is not looked up if that would import torch. All groups get their
+    choices, since the same command may name several.
     """
     try:
         return compose()
@@ -129,22 +143,31 @@ def with_choices(compose: Callable[[], T]) -> T:
 def choices(group: str) -> list[str]:
     """Names of the choices of a group."""
     if GlobalHydra.instance().is_initialized():  # knows `--config-dir`, too
-        return [name for name in GlobalHydra.instance().config_loader().get_group_options(group) if name != "base"]
+        return [
+            name
+            for name in GlobalHydra.instance().config_loader().get_group_options(group)
+            if name != "base"
+        ]
     with _hydra():
         return choices(group)
 
 
-OmegaConf.register_new_resolver("choices", lambda group: ", ".join(choices(group)), replace=True)  # for --help
+OmegaConf.register_new_resolver(
+    "choices", lambda group: ", ".join(choices(group)), replace=True
+)  # for --help
 
 
 def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     """Convert two forms of overrides for Hydra.
 
-    `KEY={name: NAME, ...}` replaces the whole value, since NAME has its own options; `sensor=FILE.yaml` becomes the
-    options in the file. Of the others, the generator's name is added to the config, where it is null by default.
+    `KEY={name: NAME, ...}` replaces the whole value, since NAME has its own options;
+    `sensor=FILE.yaml` becomes the options in the file. Of the others, the generator's name is added
+    to the config, where it is null by default.
     """
     converted: list[str] = []
-    for text, parsed in zip(overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True):
+    for text, parsed in zip(
+        overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True
+    ):
         key = parsed.key_or_group
         if key == "sensor" and str(parsed.value()).lower().endswith((".yaml", ".yml")):
             converted += _sensor_of_file(str(parsed.value()), overrides)
@@ -170,4 +193,8 @@ def _sensor_of_file(path: str, overrides: Sequence[str]) -> list[str]:
 
     given = set(map(key_of, overrides))
     options = options_of_sensor(read_sensor(path)).items()
-    return [override(f"++sensor.{name}", value) for name, value in options if f"sensor.{name}" not in given]
+    return [
+        override(f"++sensor.{name}", value)
+        for name, value in options
+        if f"sensor.{name}" not in given
+    ]

@@ -28,14 +28,18 @@ def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 @contextmanager
 def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
-    """Lock a run's folder for one process. The lock is released when its process ends, even if killed."""
+    """Lock a run's folder for one process. The lock is released when its process ends, even if
+    killed.
+    """
     path, holder = Path(run, ".lock"), Path(run, ".lock.holder")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = FileLock(path, timeout=patience).acquire(poll_interval=0.2)
     except Timeout:
         owner = holder.read_text(encoding="utf-8") if holder.is_file() else "unknown"
-        raise InputError(f"{run} is trained by another process ({owner}). Wait for it, or give name=OTHER.") from None
+        raise InputError(
+            f"{run} is trained by another process ({owner}). Wait for it, or give name=OTHER."
+        ) from None
     with lock:
         # Not in the lock file itself, which other processes may truncate when they try to lock it.
         write_file(holder, f"pid {os.getpid()} on {platform.node()}")
@@ -51,7 +55,9 @@ def read_config(run: str | Path) -> dict[str, Any] | None:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
         check_tree(config)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
-        raise InputError(f"{path} is damaged ({str(error).splitlines()[0]}); the checkpoints are usable.") from None
+        raise InputError(
+            f"{path} is damaged ({str(error).splitlines()[0]}); the checkpoints are usable."
+        ) from None
     return dict(config) or None
 
 
@@ -69,44 +75,70 @@ def has_ended(run: str | Path, last: Path | None = None) -> bool:
 
 
 def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) -> Path | None:
-    """The newest readable checkpoint to resume a run from, or None for a new run; writes if its folder is `locked`."""
+    """The newest readable checkpoint to resume a run from, or None for a new run; writes if its
+    folder is `locked`.
+    """
     for leftover in Path(run, FOLDER).glob(".*.part") if locked else ():  # of killed writers
         leftover.unlink(missing_ok=True)
     old = read_config(run)
     last = next((path for path, _ in _readable(run, RESUMED)), None)
     if last is not None and old is None:
-        raise InputError(f"{run} has checkpoints without their {CONFIG}: give name=OTHER stage.parent={last}.")
+        raise InputError(
+            f"{run} has checkpoints without their {CONFIG}: give name=OTHER stage.parent={last}."
+        )
     if old is not None and last is not None:
         _refuse_another_config(run, old, config)
-        samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]
+        samplers = [
+            text for key, text in differences(old, config).items() if key.startswith("sampler.")
+        ]
         if samplers and has_ended(run, last):
             raise InputError(
-                f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the setting, and draw with "
+                f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the "
+                "setting, and draw with "
                 f"another sampler by r2flow sample {run} --sampler NAME --steps N."
             )
-    if locked and (old != dict(config) or not Path(run, CONFIG).is_file()):  # free keys may have changed
+    if locked and (
+        old != dict(config) or not Path(run, CONFIG).is_file()
+    ):  # free keys may have changed
         write_file(Path(run, CONFIG), yaml.safe_dump(dict(config), sort_keys=False))
     return last
 
 
 def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
-    """Refuse a run folder of another config, ignoring keys that depend on the data or a trained parent."""
+    """Refuse a run folder of another config, ignoring keys that depend on the data or a trained
+    parent.
+    """
     old = read_config(run)
     if old is None or not checkpoints_of(run):
         return
-    later = ("scans.", "stage.parent.", "encoding.reflectance.", "encoding.levels.", "data.pairs.parent.")
-    there, here = ({k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config))
+    later = (
+        "scans.",
+        "stage.parent.",
+        "encoding.reflectance.",
+        "encoding.levels.",
+        "data.pairs.parent.",
+    )
+    there, here = (
+        {k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config)
+    )
     _refuse_another_config(run, there, here, alone=False)
 
 
-def _refuse_another_config(run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any], alone: bool = True) -> None:
+def _refuse_another_config(
+    run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any], alone: bool = True
+) -> None:
     if differing := contradictions(old, new):
         length = alone and all(text.startswith("trainer.max_steps=") for text in differing)
-        last = next((path for path, _ in _readable(run)), run)  # not the folder: the run may not be finished
-        more_steps = f", stage.parent={last} name=OTHER to learn on from its weights" if length else ""
+        last = next(
+            (path for path, _ in _readable(run)), run
+        )  # not the folder: the run may not be finished
+        more_steps = (
+            f", stage.parent={last} name=OTHER to learn on from its weights" if length else ""
+        )
         raise InputError(
             f"{run} holds a run of another config: {at_most_three(differing)}. "
-            f"Give the same settings and scans to resume it{more_steps}, or name=OTHER for a new one."
+            f"Give the same settings and scans to resume it{more_steps}, or name=OTHER for a new "
+            "one."
         )
 
 

@@ -1,7 +1,7 @@
 """`r2flow train`: Hydra, sweeps, chains, exit codes.
 
-Exit codes: 0 for a finished run, 2 for a user error, 75 if the same command resumes (`trainer.max_time`, SLURM's time
-limit), 129 after a hang-up, 130 after Ctrl-C, 143 after SIGTERM.
+Exit codes: 0 for a finished run, 2 for a user error, 75 if the same command resumes
+(`trainer.max_time`, SLURM's time limit), 129 after a hang-up, 130 after Ctrl-C, 143 after SIGTERM.
 """
 
 import hashlib
@@ -25,7 +25,15 @@ from omegaconf import DictConfig, OmegaConf
 from r2flow.config import key_of, override
 from r2flow.errors import InputError
 from r2flow.plugins import load_plugins
-from r2flow.runs.composing import CONF, WRONG, add_choices, as_hydra_takes, in_one_line, plain, with_choices
+from r2flow.runs.composing import (
+    CONF,
+    WRONG,
+    add_choices,
+    as_hydra_takes,
+    in_one_line,
+    plain,
+    with_choices,
+)
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, handling_signals, run_process
 
 
@@ -34,20 +42,31 @@ class JobEnded(RuntimeError):
 
 
 def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str] = ()) -> int:
-    """Compose a command line's config and execute it: a run, a chain of runs or a sweep; return the exit code.
+    """Compose a command line's config and execute it: a run, a chain of runs or a sweep; return the
+    exit code.
 
-    Arguments are Hydra's overrides and flags. `command` starts this program, for the processes of sweeps.
+    Arguments are Hydra's overrides and flags. `command` starts this program, for the processes of
+    sweeps.
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself, over many lines, and exits with 1
+    os.environ["HYDRA_FULL_ERROR"] = (
+        "1"  # otherwise Hydra prints errors itself, over many lines, and exits with 1
+    )
     codes: list[int] = []  # of jobs
     errors: list[Exception] = []
     # SLURM signals every process of a job: a run handles the signal, a chain waits for the run.
     ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
     try:
         with handling_signals(signal.SIG_IGN, ignored):
-            _run_hydra(_parsed(_with_plugins(arguments, plugins) or ["experiment=demo"]), command, codes, errors)
+            _run_hydra(
+                _parsed(_with_plugins(arguments, plugins) or ["experiment=demo"]),
+                command,
+                codes,
+                errors,
+            )
             if errors:  # jobs have printed theirs
-                raise next((error for error in errors if not isinstance(error, JobEnded)), errors[0])
+                raise next(
+                    (error for error in errors if not isinstance(error, JobEnded)), errors[0]
+                )
             return max(codes, default=0)
     except SystemExit as end:
         if end.code:
@@ -72,7 +91,11 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
 def _with_plugins(arguments: Sequence[str], plugins: Sequence[str]) -> list[str]:
     """Load the plug-ins of a command line, in any form, and collect them into one `plugins=[...]`."""
     given = [text for text in arguments if text.lstrip("+").startswith("plugins=")]
-    listed = [name.strip(" '\"") for text in given for name in text.partition("=")[2].strip("[]").split(",")]
+    listed = [
+        name.strip(" '\"")
+        for text in given
+        for name in text.partition("=")[2].strip("[]").split(",")
+    ]
     others = [text for text in arguments if text not in given]
     names = list(filter(None, [*plugins, *listed]))
     if not names:
@@ -93,17 +116,26 @@ def _parsed(arguments: Sequence[str]) -> Namespace:
     parsed = parser.parse_intermixed_args(arguments)  # flags may stand between them
     if sum(map(bool, (parsed.run, parsed.multirun, parsed.cfg, parsed.info))) > 1:
         raise InputError("give one of --run, --multirun, --cfg and --info.")
-    for text in parsed.overrides if parsed.multirun or "hydra.mode=MULTIRUN" in parsed.overrides else ():
+    for text in (
+        parsed.overrides if parsed.multirun or "hydra.mode=MULTIRUN" in parsed.overrides else ()
+    ):
         # A sweep over several names is valid.
         if key_of(text) == "run_dir" or (key_of(text) == "name" and "," not in text):
-            raise InputError(f"a sweep names its runs' folders: leave {text} out, or give hydra.sweep.dir=FOLDER.")
+            raise InputError(
+                f"a sweep names its runs' folders: leave {text} out, or give "
+                "hydra.sweep.dir=FOLDER."
+            )
     parsed.flags = [text for text in arguments if text not in parsed.overrides]
     parsed.overrides = as_hydra_takes(parsed.overrides)
     return parsed
 
 
-def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], errors: list[Exception]) -> None:
-    """Run the command line's job, or those of its sweep; collects exit codes, and errors, which Hydra would print."""
+def _run_hydra(
+    parsed: Namespace, command: Sequence[str], codes: list[int], errors: list[Exception]
+) -> None:
+    """Run the command line's job, or those of its sweep; collects exit codes, and errors, which
+    Hydra would print.
+    """
     folders = [os.path.abspath(parsed.config_dir)] if parsed.config_dir else []
     for folder in folders:
         command = [*command, "--config-dir", folder]
@@ -114,10 +146,15 @@ def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], erro
         sys.argv = original  # Lightning starts the processes of other devices by it
         try:
             given = list(HydraConfig.get().overrides.task)
-            # Check the command line, not the overrides: a config file can make a sweeper add overrides.
-            if config["plugins"] and not any(text.startswith("plugins=") for text in parsed.overrides):
+            # Check the command line, not the overrides: a config file can make a sweeper add
+            # overrides.
+            if config["plugins"] and not any(
+                text.startswith("plugins=") for text in parsed.overrides
+            ):
                 named = " ".join(f"--plugin {name}" for name in config["plugins"])
-                raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
+                raise InputError(
+                    f"plug-ins are named on the command line, never in a file: give {named}."
+                )
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 return _sweep_job(command, given)
             settings = plain(config)
@@ -136,7 +173,9 @@ def _run_hydra(parsed: Namespace, command: Sequence[str], codes: list[int], erro
         sys.argv = [original[0], *parsed.flags, *parsed.overrides]
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(job)()
 
-    OmegaConf.register_new_resolver("job_folder", partial(job_folder, parsed.overrides), replace=True)
+    OmegaConf.register_new_resolver(
+        "job_folder", partial(job_folder, parsed.overrides), replace=True
+    )
     try:
         with_choices(composed)
     finally:
@@ -154,7 +193,9 @@ def job_folder(given: Sequence[str], overrides: str) -> str:
 
 
 def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
-    """Run a job of a sweep in its own process, so that its failure or DDP relaunch does not affect other jobs."""
+    """Run a job of a sweep in its own process, so that its failure or DDP relaunch does not affect
+    other jobs.
+    """
     run_dir = HydraConfig.get().runtime.output_dir
     code = run_process([*command, *given, override("run_dir", str(run_dir))])
     if code in map(code_of, STOPPING):
@@ -168,7 +209,9 @@ def _chain(settings: dict[str, Any], given: Sequence[str], folders: Sequence[str
     from r2flow.runs.folder import has_ended
 
     if settings["trainer"]["fast_dev_run"]:
-        raise InputError("a chain's links start from earlier runs, and trainer.fast_dev_run leaves none.")
+        raise InputError(
+            "a chain's links start from earlier runs, and trainer.fast_dev_run leaves none."
+        )
     folder = Path(settings["run_dir"])
     links = links_of(settings["chain"], folder, given, folders)
     finished = all(has_ended(link.run_dir) for link in links)

@@ -37,43 +37,54 @@ Options = Mapping[str, Any]
 class Stage(L.LightningModule):
     """Trains a generator. A subclass defines `training_step`.
 
-    A batch has the keys `x_1`, scans in model space, (B, C, H, W); `x_0`, noise, (B, *noise_shape); `u`, uniform draws
-    in [0, 1), (B,); and `k`, the number of each image in the run, (B,), which seeds further draws (`r2flow.noise`).
-    Of a batch without noise, or scans alone, the others are drawn by torch's global generator.
+    A batch has the keys `x_1`, scans in model space, (B, C, H, W); `x_0`, noise, (B, *noise_shape);
+    `u`, uniform draws in [0, 1), (B,); and `k`, the number of each image in the run, (B,), which
+    seeds further draws (`r2flow.noise`). Of a batch without noise, or scans alone, the others are
+    drawn by torch's global generator.
 
-    A stage with several losses and optimisers sets `automatic_optimization = False`, creates the optimisers by
-    `optimizers_for` and, in every `training_step`, calls `take_step(optimizer, loss)` for each of `own_optimizers()`.
+    A stage with several losses and optimisers sets `automatic_optimization = False`, creates the
+    optimisers by `optimizers_for` and, in every `training_step`, calls `take_step(optimizer, loss)`
+    for each of `own_optimizers()`.
 
     Args:
-        backbone: Name or options of the network, as in conf/backbone; None: the parent's, else `hdit_tiny`.
+        backbone: Name or options of the network, as in conf/backbone; None: the parent's, else
+            `hdit_tiny`.
         sensor: Sensor of the images, its name, file or options; None: the parent's, else `hdl64e`.
-        encoding: Encoding of the images, a name in conf/encoding, or options; None: the parent's, else `logscale`.
-        generator: Name and options in `GENERATORS`, or a generator, which replaces the three options above; None: the
-            stage's, the parent's, or a rectified flow.
+        encoding: Encoding of the images, a name in conf/encoding, or options; None: the parent's,
+            else `logscale`.
+        generator: Name and options in `GENERATORS`, or a generator, which replaces the three
+            options above; None: the stage's, the parent's, or a rectified flow.
         parent: Run folder, checkpoint or model to start from, with its averaged weights.
         sampler: Name and options of the default sampler; None: the generator's.
         few: Likewise for fewer steps than `sampler` has.
         seed: Seed of the first weights and of draws in training.
         learning_rate: AdamW's learning rate; linear warm-up, then a cosine to 0 at the last step.
         betas, weight_decay: AdamW's.
-        muon: Learning rate of the weight matrices by `Muon`, with the same schedule; None: AdamW for all weights.
+        muon: Learning rate of the weight matrices by `Muon`, with the same schedule; None: AdamW
+            for all weights.
         warmup_images: Images seen during the warm-up.
 
     Attributes:
         generator: The generator in training.
-        gradient_clip_val: Gradient clipping of a stage with manual optimisation, which Lightning leaves to it.
+        gradient_clip_val: Gradient clipping of a stage with manual optimisation, which Lightning
+            leaves to it.
 
     Raises:
-        InputError: an unknown name or option, a parent that is missing, unfinished, or of another model.
+        InputError: an unknown name or option, a parent that is missing, unfinished, or of another
+            model.
     """
 
     learns: ClassVar[type[Generator]] = Generator  # class of the generators that it can train
-    generator_name: ClassVar[str | None] = None  # generator to train; None: the parent's, or a rectified flow
+    generator_name: ClassVar[str | None] = (
+        None  # generator to train; None: the parent's, or a rectified flow
+    )
     needs_pairs: ClassVar[bool] = False  # whether it trains on pairs of x_0 and x_1
     takes_pairs: ClassVar[bool] = False  # whether it can
     takes_scans: ClassVar[bool] = False  # whether it can on scans next to pairs
     needs_parent: ClassVar[bool] = False  # whether it must start from another run
-    several_sensors: ClassVar[bool] = False  # whether the parts of a mixture may be scans of different sensors
+    several_sensors: ClassVar[bool] = (
+        False  # whether the parts of a mixture may be scans of different sensors
+    )
     anneals: ClassVar[bool] = True  # whether the learning rate decays to 0 at the last step
 
     def __init__(
@@ -96,19 +107,30 @@ class Stage(L.LightningModule):
         super().__init__()
         self.save_hyperparameters(ignore=["parent", "sensor", "encoding", "generator"])
         source = None if parent is None or isinstance(parent, Mapping) else find_parent(parent)
-        if parent is None and not isinstance(generator, Generator) and (self.needs_parent or self.needs_pairs):
+        if (
+            parent is None
+            and not isinstance(generator, Generator)
+            and (self.needs_parent or self.needs_pairs)
+        ):
             raise InputError(f"{type(self).__name__} starts from a trained model: give parent=RUN.")
         if isinstance(generator, Generator):
             self.generator = generator
             options: dict[str, Any] = dict.fromkeys(MODEL)
         else:
-            given = {"backbone": backbone, "sensor": sensor, "encoding": encoding, "generator": generator}
+            given = {
+                "backbone": backbone,
+                "sensor": sensor,
+                "encoding": encoding,
+                "generator": generator,
+            }
             options = model_options(given, source, self.generator_name, self.needs_pairs)
             seed_torch(seed, "weights")  # also of networks that a subclass adds
             self.generator = build_generator(options)
         if not isinstance(self.generator, self.learns):
             learned, found = self.learns.__name__, type(self.generator).__name__
-            raise InputError(f"{type(self).__name__} learns a {learned}, found a {found}: give another stage.")
+            raise InputError(
+                f"{type(self).__name__} learns a {learned}, found a {found}: give another stage."
+            )
         if not hasattr(self.generator, "backbone"):  # it has its own network
             options["backbone"] = None
         if source and source.checkpoint:
@@ -117,7 +139,9 @@ class Stage(L.LightningModule):
         chosen = {"name": sampler} if isinstance(sampler, str) else dict(sampler or {})
         own = self.generator.choose(**chosen)
         if own.completes:
-            raise InputError(f"sampler {own.name} completes scans: give it to r2flow complete by --sampler.")
+            raise InputError(
+                f"sampler {own.name} completes scans: give it to r2flow complete by --sampler."
+            )
         if few is not None:
             self.generator.few = build_sampler(few)
             self.generator.few.check(self.generator)
@@ -128,7 +152,9 @@ class Stage(L.LightningModule):
         self.gradient_clip_val: float | None = None
 
     def prepare_generator(self) -> None:
-        """Set the sampler that this stage trains the generator for; it may be replaced by the options `sampler`."""
+        """Set the sampler that this stage trains the generator for; it may be replaced by the
+        options `sampler`.
+        """
 
     @property
     def space(self) -> ModelSpace:
@@ -148,7 +174,9 @@ class Stage(L.LightningModule):
     @property
     def item_format(self) -> ItemFormat:
         """What the items of a batch are, as `ScanDataModule` makes them."""
-        return ItemFormat(self.encoding, self.generator.noise_shape, several_sensors=self.several_sensors)
+        return ItemFormat(
+            self.encoding, self.generator.noise_shape, several_sensors=self.several_sensors
+        )
 
     @property
     def images_per_step(self) -> int:
@@ -172,7 +200,9 @@ class Stage(L.LightningModule):
         return min(self.global_step / self.total_steps, 1.0)
 
     def whole_batch(self, batch: Any) -> Batch:
-        """A batch with all its keys; torch's global generator draws those that a loader did not give."""
+        """A batch with all its keys; torch's global generator draws those that a loader did not
+        give.
+        """
         if isinstance(batch, list | tuple):
             batch = batch[0]
         if isinstance(batch, Tensor):
@@ -190,35 +220,47 @@ class Stage(L.LightningModule):
 
         name = STAGES.name_of(type(self)) or type(self).__name__
         if self.needs_pairs and data.pairs is None:
-            raise InputError(f"stage={name} learns from pairs: give data=pairs, not {data.options.name}.")
+            raise InputError(
+                f"stage={name} learns from pairs: give data=pairs, not {data.options.name}."
+            )
         if data.pairs is not None and not self.takes_pairs:
             raise InputError(f"stage={name} learns from scans, not data=pairs; give stage=reflow.")
         if data.plan.scans is not None and not self.takes_scans:
             raise InputError(f"stage={name} learns from pairs alone: leave data.scans out.")
         if data.augment.roll and self.generator.learns_directions:
             raise InputError(
-                "data.augment.roll makes all directions alike, but backbone.position=learnable (the paper's APE) "
-                "learns one vector per direction; give backbone.position=none, whose attention sees only differences "
+                "data.augment.roll makes all directions alike, but backbone.position=learnable "
+                "(the paper's APE) "
+                "learns one vector per direction; give backbone.position=none, whose attention "
+                "sees only differences "
                 "in azimuth, or leave roll out."
             )
 
     def setup(self, stage: str) -> None:
-        data = self.trainer.datamodule
+        data = getattr(self.trainer, "datamodule", None)
         if stage == "fit" and isinstance(data, ScanDataModule):
             self.check_data(data)
 
     def on_train_start(self) -> None:
         if any(COMPILED in name for name, _ in self.generator.named_parameters()):
-            raise InputError("torch.compile(module) renames the weights in checkpoints: use module.compile() instead.")
+            raise InputError(
+                "torch.compile(module) renames the weights in checkpoints: use module.compile() "
+                "instead."
+            )
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        # Dropout uses torch's global generator: seeding it by position makes a resumed run draw the same numbers.
+        # Dropout uses torch's global generator: seeding it by position makes a resumed run draw the
+        # same numbers.
         parts = self.trainer.accumulate_grad_batches
         position = self.global_step * parts + batch_idx % parts
-        seed_torch(self.hparams["seed"], "dropout", position * self.trainer.world_size + self.global_rank)
+        seed_torch(
+            self.hparams["seed"], "dropout", position * self.trainer.world_size + self.global_rank
+        )
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Scans of the numbers `k`: range in metres and reflectance, (B, 2 or 1, H, W), 0 without a return."""
+        """Scans of the numbers `k`: range in metres and reflectance, (B, 2 or 1, H, W), 0 without a
+        return.
+        """
         numbers = self.whole_batch(batch)["k"].tolist()
         return draw(self.generator, numbers, self.hparams["seed"]).images
 
@@ -238,30 +280,39 @@ class Stage(L.LightningModule):
         return self.optimizers_for(self.parameters())
 
     def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
-        """AdamW or `Muon` with a schedule for each group of parameters, in the format of `configure_optimizers`."""
+        """AdamW or `Muon` with a schedule for each group of parameters, in the format of
+        `configure_optimizers`.
+        """
         options = self.hparams
         adam: dict[str, Any] = {"lr": options["learning_rate"], "betas": tuple(options["betas"])}
         adam["weight_decay"] = options["weight_decay"]
         optimizers: list[torch.optim.Optimizer] = []
         for group in groups:
             muon = options["muon"]
-            optimizers.append(torch.optim.AdamW(group, **adam) if muon is None else Muon(group, muon, **adam))
+            optimizers.append(
+                torch.optim.AdamW(group, **adam) if muon is None else Muon(group, muon, **adam)
+            )
         warmup = options["warmup_images"] // self.images_per_step
 
         def factor(step: int) -> float:
             if step < warmup:
                 return step / warmup
-            if step == 0 or not self.anneals:  # the number of steps is known when training has begun
+            if (
+                step == 0 or not self.anneals
+            ):  # the number of steps is known when training has begun
                 return 1.0
             return learning_rate_factor(step, warmup, self.total_steps)
 
-        schedules = [torch.optim.lr_scheduler.LambdaLR(optimizer, factor) for optimizer in optimizers]
+        schedules = [
+            torch.optim.lr_scheduler.LambdaLR(optimizer, factor) for optimizer in optimizers
+        ]
         return optimizers, [{"scheduler": schedule, "interval": "step"} for schedule in schedules]
 
     def own_optimizers(self) -> list[LightningOptimizer]:
         """The optimisers of a stage with manual optimisation, in the order of `optimizers_for`.
 
-        Only steps of the first one advance `global_step`, since a run resumes by it and it must count batches.
+        Only steps of the first one advance `global_step`, since a run resumes by it and it must
+        count batches.
         """
         optimizers = self.optimizers()
         as_list = optimizers if isinstance(optimizers, list) else [optimizers]
@@ -270,16 +321,21 @@ class Stage(L.LightningModule):
         return as_list
 
     def take_step(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
-        """Take one step of one of `own_optimizers` on a loss, with the run's gradient clipping and schedule.
+        """Take one step of one of `own_optimizers` on a loss, with the run's gradient clipping and
+        schedule.
 
-        Gradients of other optimisers' parameters are not cleared here, but before those optimisers' steps.
+        Gradients of other optimisers' parameters are not cleared here, but before those optimisers'
+        steps.
         """
         optimizer.zero_grad()
         model = self.trainer.strategy.model
-        # DDP waits for gradients of all parameters in every backward pass; a loss may have gradients of some only.
+        # DDP waits for gradients of all parameters in every backward pass; a loss may have
+        # gradients of some only.
         with model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext():
             self.manual_backward(loss)
-        average_gradients(parameter for group in optimizer.param_groups for parameter in group["params"])
+        average_gradients(
+            parameter for group in optimizer.param_groups for parameter in group["params"]
+        )
         optimizer.step()
         for config in self.trainer.lr_scheduler_configs:
             if config.scheduler.optimizer is optimizer.optimizer:
@@ -318,21 +374,32 @@ class SingleLoss(Stage):
         batch = self.whole_batch(batch)
         loss = self.regression_loss(batch, batch["u"])
         if not (isinstance(loss, Tensor) and loss.numel() == 1 and loss.requires_grad):
-            raise InputError(f"regression_loss of a {type(self).__name__} must be one number with a gradient.")
+            raise InputError(
+                f"regression_loss of a {type(self).__name__} must be one number with a gradient."
+            )
         part = batch_idx % (self._trainer.accumulate_grad_batches if self._trainer else 1)
         self._sum = loss.detach() + (self._sum if part else 0.0)
-        self.log("train/loss", self._sum / (part + 1), prog_bar=True, sync_dist=True, batch_size=len(batch["x_1"]))
+        self.log(
+            "train/loss",
+            self._sum / (part + 1),
+            prog_bar=True,
+            sync_dist=True,
+            batch_size=len(batch["x_1"]),
+        )
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        # A low-discrepancy sequence over [0, 1) instead of random times reduces the variance over few scans.
+        # A low-discrepancy sequence over [0, 1) instead of random times reduces the variance over
+        # few scans.
         batch = self.whole_batch(batch)
         loss = self.regression_loss(batch, golden_sequence(batch["k"]))
         self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)
 
 
 def learning_rate_factor(step: int, warmup: int, total: float) -> float:
-    """step / warmup during the warm-up, then (1 + cos(pi s)) / 2 with s from 0 to 1 over the remaining steps."""
+    """step / warmup during the warm-up, then (1 + cos(pi s)) / 2 with s from 0 to 1 over the
+    remaining steps.
+    """
     if step < warmup:
         return step / warmup
     return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(total - warmup, 1)))

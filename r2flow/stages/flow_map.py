@@ -20,14 +20,16 @@ from r2flow.stages.rectify import Reflow
 class LearnFlowMap(Reflow):
     """Flow map: regress u(x_t, t, s) onto the target of an objective of `r2flow.flow.maps`.
 
-    The data are scans, or pairs of a 1-RF or 2-RF. With additional scans (`data.scans`) and the objective `straight`,
-    velocities (s = t) are learned from the scans, as in `Rectify`, and jumps from the pairs.
+    The data are scans, or pairs of a 1-RF or 2-RF. With additional scans (`data.scans`) and the
+    objective `straight`, velocities (s = t) are learned from the scans, as in `Rectify`, and jumps
+    from the pairs.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
         jumps: Options of `r2flow.flow.maps.JumpTimes`.
-        rho: Final value of rho, the share of the path in the target of a bootstrapped objective; it decays
-            exponentially from 1 over the run. rho is always 1 for s = t and, on pairs, for the jump from 0 to 1.
+        rho: Final value of rho, the share of the path in the target of a bootstrapped objective; it
+            decays exponentially from 1 over the run. rho is always 1 for s = t and, on pairs, for
+            the jump from 0 to 1.
     """
 
     learns = FlowMap
@@ -47,7 +49,9 @@ class LearnFlowMap(Reflow):
     ) -> None:
         super().__init__(*model, **options)
         if options.get("time") is not None:
-            raise InputError("a flow map learns jumps between times: give jumps and leave time out.")
+            raise InputError(
+                "a flow map learns jumps between times: give jumps and leave time out."
+            )
         self.objective = OBJECTIVES[objective]
         self.rho = rho
 
@@ -64,7 +68,8 @@ class LearnFlowMap(Reflow):
         super().check_data(data)
         if data.plan.scans is not None and self.objective is not straight:
             raise InputError(
-                f"objective={self.hparams['objective']} learns jumps from velocities of pairs, which are not those of "
+                f"objective={self.hparams['objective']} learns jumps from velocities of pairs, "
+                "which are not those of "
                 "scans: leave data.scans out, or give stage.objective=straight."
             )
 

@@ -13,20 +13,28 @@ LEAST_CHANNELS = 8  # fewer: input or output layer of an image
 class Muon(torch.optim.AdamW):
     """AdamW whose steps for weight matrices are orthogonal matrices (Jordan et al. 2024, "Muon").
 
-    With the gradient G of a weight matrix, (rows, columns), a convolution's flattened to (out, in x height x width):
+    With the gradient G of a weight matrix, (rows, columns), a convolution's flattened to (out, in x
+    height x width):
 
-        M <- m M + (1 - m) G,    W <- W - rate sqrt(max(1, rows / columns)) orthogonalised((1 - m) G + m M)
+        M <- m M + (1 - m) G,    W <- W - rate sqrt(max(1, rows / columns)) orthogonalised((1 - m) G
+        + m M)
 
-    All singular directions of the momentum are learned at the same speed, instead of the few large ones first. AdamW,
-    with `options`, trains biases, norms and matrices with fewer than 8 rows or columns, such as those of an image's
-    channels.
+    All singular directions of the momentum are learned at the same speed, instead of the few large
+    ones first. AdamW, with `options`, trains biases, norms and matrices with fewer than 8 rows or
+    columns, such as those of an image's channels.
     """
 
-    def __init__(self, parameters: Iterable[Tensor], rate: float, momentum: float = 0.95, **options: Any) -> None:
+    def __init__(
+        self, parameters: Iterable[Tensor], rate: float, momentum: float = 0.95, **options: Any
+    ) -> None:
         weights = list(parameters)
         groups: list[dict[str, Any]] = [
             {"params": [p for p in weights if not is_hidden_matrix(p)], "momentum": None},
-            {"params": [p for p in weights if is_hidden_matrix(p)], "lr": rate, "momentum": momentum},
+            {
+                "params": [p for p in weights if is_hidden_matrix(p)],
+                "lr": rate,
+                "momentum": momentum,
+            },
         ]
         super().__init__([group for group in groups if group["params"]], **options)
 
@@ -66,9 +74,11 @@ def is_hidden_matrix(p: Tensor) -> bool:
 
 
 def orthogonalised(matrix: Tensor) -> Tensor:
-    """Approximate U V^T of a matrix U S V^T, (rows, columns): singular values become 0.68 to 1.14, tiny ones less.
+    """Approximate U V^T of a matrix U S V^T, (rows, columns): singular values become 0.68 to 1.14,
+    tiny ones less.
 
-    Newton-Schulz iteration: each step is the polynomial a X + (b A + c A A) X with A = X X^T, in bfloat16.
+    Newton-Schulz iteration: each step is the polynomial a X + (b A + c A A) X with A = X X^T, in
+    bfloat16.
     """
     a, b, c = 3.4445, -4.7750, 2.0315
     x = matrix.T if matrix.shape[0] > matrix.shape[1] else matrix

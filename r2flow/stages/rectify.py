@@ -1,4 +1,6 @@
-"""Velocity regression on straight lines from noise to data: 1-RF, and k-RF and k-TD on pairs of an earlier flow."""
+"""Velocity regression on straight lines from noise to data: 1-RF, and k-RF and k-TD on pairs of an
+earlier flow.
+"""
 
 from typing import Any, ClassVar
 
@@ -16,7 +18,8 @@ from r2flow.stages.base import Batch, Options, SingleLoss
 
 
 class Rectify(SingleLoss):
-    """1-RF: regress v(t, x_t) onto x_1 - x_0 for independent x_0 ~ N(0, I) and x_1 a scan (paper, eq. 2).
+    """1-RF: regress v(t, x_t) onto x_1 - x_0 for independent x_0 ~ N(0, I) and x_1 a scan (paper,
+    eq. 2).
 
     Args:
         model: Backbone, sensor, encoding and generator, as in `Stage`.
@@ -33,7 +36,9 @@ class Rectify(SingleLoss):
     default_time: ClassVar[Options] = {"name": "uniform"}
     generator: Flow
 
-    def __init__(self, *model: Any, loss: str | None = None, time: Options | None = None, **options: Any) -> None:
+    def __init__(
+        self, *model: Any, loss: str | None = None, time: Options | None = None, **options: Any
+    ) -> None:
         super().__init__(*model, **options)
         if self.generator.takes_condition and type(self).condition is Rectify.condition:
             name = type(self.generator).__name__
@@ -48,20 +53,26 @@ class Rectify(SingleLoss):
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         t = self.time(u)
         x_t, u_t = interpolate(batch["x_0"], batch["x_1"], t)
-        return self.loss_of_each(self.loss, self.generator.velocity(t, x_t, self.condition(batch)), u_t).mean()
+        return self.loss_of_each(
+            self.loss, self.generator.velocity(t, x_t, self.condition(batch)), u_t
+        ).mean()
 
     def loss_of_each(self, loss: Loss, v_t: Tensor, u_t: Tensor) -> Tensor:
         """The loss of each scan of a batch, (B,); InputError: a loss of another shape."""
         each = loss(v_t, u_t)
         if each.shape != (len(v_t),):
-            raise InputError(f"a loss must give one value a scan, ({len(v_t)},), found {tuple(each.shape)}.")
+            raise InputError(
+                f"a loss must give one value a scan, ({len(v_t)},), found {tuple(each.shape)}."
+            )
         return each
 
 
 class Reflow(Rectify):
-    """k-RF: regress v(t, x_t) onto x_1 - x_0 with x_1 the end of the earlier flow's path from x_0 (paper, eq. 3).
+    """k-RF: regress v(t, x_t) onto x_1 - x_0 with x_1 the end of the earlier flow's path from x_0
+    (paper, eq. 3).
 
-    It starts from the earlier flow's averaged weights (`parent`). Its pairs (x_0, x_1) are those of `data=pairs`.
+    It starts from the earlier flow's averaged weights (`parent`). Its pairs (x_0, x_1) are those of
+    `data=pairs`.
     """
 
     needs_pairs = True
@@ -75,17 +86,24 @@ class Reflow(Rectify):
 
 
 class Distill(Reflow):
-    """k-TD: the reflow regression at t in {0, 1/k, ..., (k-1)/k}, the times that k Euler steps visit.
+    """k-TD: the reflow regression at t in {0, 1/k, ..., (k-1)/k}, the times that k Euler steps
+    visit.
 
     Args:
         steps: k, the number of sampling steps.
-        grid: Time grid: uniform as in the paper, or another one of `r2flow.flow.solvers.fixed.named_grid`.
+        grid: Time grid: uniform as in the paper, or another one of
+            `r2flow.flow.solvers.fixed.named_grid`.
     """
 
-    def __init__(self, *model: Any, steps: Count = 1, grid: str = "uniform", **options: Any) -> None:
+    def __init__(
+        self, *model: Any, steps: Count = 1, grid: str = "uniform", **options: Any
+    ) -> None:
         super().__init__(*model, **options)
         if options.get("time") is not None:
-            raise InputError(f"a distilled flow trains at the {steps} times that its steps visit; leave time out.")
+            raise InputError(
+                f"a distilled flow trains at the {steps} times that its steps visit; leave time "
+                "out."
+            )
         self.time = build_density({"name": "discrete", "k": steps, "grid": grid})
 
     def prepare_generator(self) -> None:

@@ -26,27 +26,36 @@ from r2flow.stages.base import Batch, Options, SingleLoss
 class Tasks:
     """Draws a crop and a mask of known rays for each image of a run.
 
-    Masks: the rows of a sparser sensor (every 2nd to 8th, mostly every 4th or 2nd), a random share of the rows, or a
-    random share of the rays (3 to 80 %).
+    Masks: the rows of a sparser sensor (every 2nd to 8th, mostly every 4th or 2nd), a random share
+    of the rows, or a random share of the rays (3 to 80 %).
     """
 
     rows: Count = 32  # of a crop, at most those of the run's sensor
     columns: Count = 256  # likewise
-    halved: Portion = 0.3  # share of crops at half the rows and a quarter of the columns, for coarser images
+    halved: Portion = (
+        0.3  # share of crops at half the rows and a quarter of the columns, for coarser images
+    )
     silent: Portion = 0.05  # share of crops with unknown reflectance
-    unnumbered: Portion = 0.1  # share of crops without the vectors learned per row, for other sensors
+    unnumbered: Portion = (
+        0.1  # share of crops without the vectors learned per row, for other sensors
+    )
 
     def size(self, space: ModelSpace) -> tuple[int, int]:
         """Rows and columns of a crop, for the space of the run's sensor."""
         return min(self.rows, space.shape[1]), min(self.columns, space.shape[2])
 
-    def __call__(self, own: ModelSpace, x_1: Tensor, sensor: Sensor, draws: np.random.Generator) -> Batch:
-        """`x_1`, `image` and `known` of a crop in model space, (C, h, w); `elevations` (h,), `steps` (2,).
+    def __call__(
+        self, own: ModelSpace, x_1: Tensor, sensor: Sensor, draws: np.random.Generator
+    ) -> Batch:
+        """`x_1`, `image` and `known` of a crop in model space, (C, h, w); `elevations` (h,),
+        `steps` (2,).
 
         `own`, the generator's space, determines the size of the crops; x_1 is a scan of `sensor`.
         """
         space = own if sensor == own.sensor else own.through(sensor)
-        if sensor.name != own.sensor.name and space.encoding.reflectance:  # as in use: intensities of sensors differ
+        if (
+            sensor.name != own.sensor.name and space.encoding.reflectance
+        ):  # as in use: intensities of sensors differ
             x_1 = scaled(x_1[None], gain_of(space, x_1[None], torch.ones_like(x_1[None])))[0]
         halve, silent, unnumbered, top, left = draws.random(5)
         elevations = space.rays[0, :, 0]
@@ -70,10 +79,20 @@ class Tasks:
 
 
 def coarser(space: ModelSpace, x: Tensor) -> Tensor:
-    """Downsample a scan in model space, (C, H, W), by 2 rows and 4 columns, keeping the nearest return of a block."""
-    blocks = space.decode(x[None])[0].unflatten(1, (-1, 2)).unflatten(3, (-1, 4)).movedim(2, 3).flatten(3)
+    """Downsample a scan in model space, (C, H, W), by 2 rows and 4 columns, keeping the nearest
+    return of a block.
+    """
+    blocks = (
+        space.decode(x[None])[0]
+        .unflatten(1, (-1, 2))
+        .unflatten(3, (-1, 4))
+        .movedim(2, 3)
+        .flatten(3)
+    )
     r = torch.where(blocks[:1] > 0, blocks[:1], torch.inf)
-    return space.encoding.encode(blocks.gather(3, r.argmin(3, keepdim=True).expand(len(blocks), -1, -1, 1))[..., 0])
+    return space.encoding.encode(
+        blocks.gather(3, r.argmin(3, keepdim=True).expand(len(blocks), -1, -1, 1))[..., 0]
+    )
 
 
 def _measured(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
@@ -91,7 +110,8 @@ def _measured(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
 class Transfer(SingleLoss):
     """Train a `TransferFlow` on the negative log-likelihood of hidden rays.
 
-    Half of the images are trained at t = 0, for sampling in one evaluation, the others at uniform t.
+    Half of the images are trained at t = 0, for sampling in one evaluation, the others at uniform
+    t.
 
     Args:
         tasks: Options of `Tasks`.
@@ -109,10 +129,14 @@ class Transfer(SingleLoss):
     @property
     def item_format(self) -> ItemFormat:
         smallest = self.tasks.size(self.generator.space)
-        return super().item_format._replace(further=partial(self.tasks, self.generator.space), smallest=smallest)
+        return super().item_format._replace(
+            further=partial(self.tasks, self.generator.space), smallest=smallest
+        )
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Scans completed from every fourth row: range in metres and reflectance, (B, 2 or 1, H, W)."""
+        """Scans completed from every fourth row: range in metres and reflectance, (B, 2 or 1, H,
+        W).
+        """
         images = self.space.decode(batch["x_1"]).cpu()
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.EMPTY))
         state[:, torch.arange(images.shape[2]) % 4 != 0] = int(Ray.UNKNOWN)

@@ -28,6 +28,7 @@ from r2flow.systems.diffusion.process import (
     step,
     walk,
 )
+from r2flow.systems.diffusion.schedules import DISCRETE, SCHEDULES, Cosine
 from r2flow.systems.diffusion.stage import LearnDiffusion
 from tests.reference import assert_near, assert_norms, assert_published, backbone_of, load_case
 

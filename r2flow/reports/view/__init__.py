@@ -1,11 +1,11 @@
 """Scans in 3-D as a self-contained HTML page: `r2flow view`.
 
     rays = flow.sensor.rays()
-    panels = [Panel(f"sample {i}", image[None], rays) for i, image in enumerate(flow.sample(4).numpy())]
-    write_viewer(Path("scans.html"), panels)
+    panels = [Panel(f"sample {i}", image[None], rays) for i, image in
+    enumerate(flow.sample(4).numpy())] write_viewer(Path("scans.html"), panels)
 
-The page stores two bytes of range and one of reflectance per pixel, compressed by zlib, and the rays once; the browser
-computes the points.
+The page stores two bytes of range and one of reflectance per pixel, compressed by zlib, and the
+rays once; the browser computes the points.
 """
 
 import base64
@@ -45,8 +45,8 @@ class Panel(NamedTuple):
 def page(panels: Sequence[Panel], title: str = "r2flow") -> str:
     """One HTML page with a point cloud and a range image per panel, under a shared camera.
 
-    Panels may differ in size and number of frames. The page takes about 50 kB and 130 kB for each image of 64 x 1024.
-    Texts in it are never read as HTML.
+    Panels may differ in size and number of frames. The page takes about 50 kB and 130 kB for each
+    image of 64 x 1024. Texts in it are never read as HTML.
     """
     # Only "<" could end the script element.
     data = json.dumps(_contents(panels), separators=(",", ":"), allow_nan=False)
@@ -70,7 +70,8 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
     pixels = sum(panel.images[:, 0].size for panel in panels)
     if not 0 < pixels <= MOST:
         raise InputError(
-            f"a page holds 1 to 256 images of 64 x 1024 (33 MB), or {MOST:,} pixels; found {count} images with "
+            f"a page holds 1 to 256 images of 64 x 1024 (33 MB), or {MOST:,} pixels; found {count} "
+            "images with "
             f"{pixels:,}. Take fewer scans or frames (--num)."
         )
     sensors: dict[bytes, int] = {}
@@ -133,8 +134,8 @@ def most_images(shape: Sequence[int]) -> int:
 def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = None) -> str:
     """Encode an image, (2 or 1, H, W), as byte planes of H W each, compressed by zlib, in base64.
 
-    Planes: high and low bytes of range codes, as differences along each row modulo 2^16; optionally reflectance in 255
-    levels; optionally class numbers. Code c means c `step` metres, 0 no return.
+    Planes: high and low bytes of range codes, as differences along each row modulo 2^16; optionally
+    reflectance in 255 levels; optionally class numbers. Code c means c `step` metres, 0 no return.
     """
     r = np.nan_to_num(image[0].astype(np.float64), posinf=0, neginf=0)
     codes = np.where(r > 0, np.clip(np.rint(r / step), 1, _CODES - 1), 0).astype(np.int32)

@@ -38,7 +38,9 @@ def list_scans(path: Path, most: int) -> tuple[list[Path], int]:
 
 
 def share_scale(readings: Mapping[str, Reading], most: int) -> dict[str, Reading]:
-    """Readings of sets shown together: those without full reflectance take one estimate from all of them."""
+    """Readings of sets shown together: those without full reflectance take one estimate from all of
+    them.
+    """
     unknown = [spec for spec, reading in readings.items() if reading.reflectance_scale is None]
     paths = []
     for options, file in map(parse, unknown):
@@ -55,8 +57,8 @@ def scan_panels(
 ) -> Iterator[tuple[str, Panel]]:
     """Sets and a panel for each of up to `most` scans of them, evenly spread; `labelled`: with ids.
 
-    The caption is the file name, with folders if names are ambiguous. Files not written by r2flow are opened one by
-    one, since sizes of range images and reflectance may differ.
+    The caption is the file name, with folders if names are ambiguous. Files not written by r2flow
+    are opened one by one, since sizes of range images and reflectance may differ.
     """
     views: list[tuple[str, Path, ScanSet, int]] = []
     for spec, reading in readings.items():
@@ -102,7 +104,8 @@ def as_frames(panels: Sequence[Panel], caption: str) -> Panel:
         same_image = panel.images.shape == images[0].shape and torch.equal(panel.rays, rays[0])
         if not (same_labels and same_image):
             raise InputError(
-                f"{panel.caption} and {captions[0]} differ in size, sensor, reflectance or labels: they cannot be "
+                f"{panel.caption} and {captions[0]} differ in size, sensor, reflectance or labels: "
+                "they cannot be "
                 "frames of one sequence; leave --sequence out."
             )
     numbers = None if classes[0] is None else np.concatenate(classes)
@@ -112,7 +115,9 @@ def as_frames(panels: Sequence[Panel], caption: str) -> Panel:
 def sample_panels(
     flow: Checkpoint, label: str, num: int, seed: int = 0, steps: Sequence[int] = ()
 ) -> list[Panel]:
-    """Samples 0 to num - 1 of a seed, a panel each; with `steps`, a panel per number of steps, samples as frames."""
+    """Samples 0 to num - 1 of a seed, a panel each; with `steps`, a panel per number of steps,
+    samples as frames.
+    """
     generator = flow.generator
     samplers = [generator.choose(steps=count) for count in steps] or [generator.sampler]
     rays = flow.sensor.rays()

@@ -131,7 +131,9 @@ class LearnAutoencoder(Stage):
         self.automatic_optimization = False
         self.autoencoder = self.generator.first_stage_model
         channels = self.space.shape[0] + self.autoencoder.mask
-        self.discriminator = construct("stage.discriminator", PatchDiscriminator, discriminator, channels)
+        self.discriminator = construct(
+            "stage.discriminator", PatchDiscriminator, discriminator, channels
+        )
         self.adversarial_weight = adversarial_weight
         self.codebook_weight = codebook_weight
         self.adversarial_start = adversarial_start
@@ -174,7 +176,8 @@ class LearnAutoencoder(Stage):
 
 
 class LearnLatentDiffusion(SingleLoss):
-    """Mean squared error of the noise in the latents of a trained and frozen autoencoder, at steps drawn uniformly.
+    """Mean squared error of the noise in the latents of a trained and frozen autoencoder, at steps
+    drawn uniformly.
 
     Args:
         options: Those of `Stage`. The learning rate does not fall.
