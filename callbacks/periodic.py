@@ -87,7 +87,7 @@ class SamplePictures(Periodic):
         self.steps = steps
 
     def sampler(self, generator: Generator) -> Sampler:
-        """The sampler of the pictures; refuses `steps` that the generator's sampler does not have."""
+        """The sampler of the pictures; refuses `steps` that the generator does not take."""
         return generator.choose(steps=None if generator.fixed else self.steps)
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:

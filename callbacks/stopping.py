@@ -1,4 +1,4 @@
-"""Stopping a run by a signal: writes a checkpoint and exits; under SLURM, requeues the job first."""
+"""Stop of a run by a signal: writes a checkpoint and exits; SLURM requeues the job first."""
 
 import logging
 import os

@@ -54,10 +54,26 @@ def check_folder(folder: Path) -> None:
 # System errors of files, disks and limits, for the user to act on; others (a lost connection) keep
 # their traceback.
 MENDABLE = {
-    errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
-    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP, errno.ESTALE, errno.EIO,
-    errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM,
-}  # fmt: skip
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOENT,
+    errno.EEXIST,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.ENOTEMPTY,
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EROFS,
+    errno.EFBIG,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+    errno.ESTALE,
+    errno.EIO,
+    errno.EAGAIN,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOMEM,
+}
 
 
 @contextmanager
@@ -88,7 +104,7 @@ def warn_odd(path: Path, kind: str, points: int = 0) -> None:
 
 
 def explain_mistake(error: InputError | OSError) -> str:
-    """One line for an InputError or a system error that a user can fix; raises other system errors."""
+    """One line for an InputError or a system error that a user can fix; raises others."""
     if isinstance(error, OSError):
         if error.errno not in MENDABLE:
             raise error

@@ -17,9 +17,19 @@ from torch import Tensor
 from r2flow.errors import InputError
 
 PURPOSES = (
-    "training", "validation", "pairs", "evaluation", "simulator", "shuffle", "mixture", "augmentation", "dropout",
-    "weights", "condition", "beside",
-)  # fmt: skip
+    "training",
+    "validation",
+    "pairs",
+    "evaluation",
+    "simulator",
+    "shuffle",
+    "mixture",
+    "augmentation",
+    "dropout",
+    "weights",
+    "condition",
+    "beside",
+)
 
 
 def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.Generator:

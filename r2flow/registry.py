@@ -207,7 +207,7 @@ def check_options(
 def construct(
     what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any
 ) -> T:
-    """Call a constructor with `args` and a config's options, which are checked; None: its defaults."""
+    """Call a constructor with `args` and checked options of a config; None: its defaults."""
     checked = check_options(what, constructor, options or {}, given=len(args))
     with _in_one_line(
         what, constructor, checked, len(args)
@@ -290,7 +290,8 @@ def _first_problem(
     if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _keys_below(constructor, given, path)
         hint = did_you_mean(str(last), known)
-        return f"no option '{'.'.join(map(str, [*path, last]))}'; it has {', '.join(known) or 'none'}.{hint}"
+        option = ".".join(map(str, [*path, last]))
+        return f"no option '{option}'; it has {', '.join(known) or 'none'}.{hint}"
     if problem["type"] in ("missing", "missing_argument"):
         return f"needs the option '{'.'.join(map(str, [*path, last]))}'."
     keys: list[str] = []
@@ -307,7 +308,7 @@ def _first_problem(
 def _keys_below(
     constructor: Callable[..., Any], given: int, path: Sequence[int | str]
 ) -> list[str]:
-    """The options of a constructor, or of an `options_class` that is the annotation of one of them."""
+    """The options of a constructor, or of an options class that annotates one of them."""
     parameters = _by_keyword(constructor, given)
     for part in path:
         annotation = parameters[str(part)].annotation if part in parameters else None

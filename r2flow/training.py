@@ -27,14 +27,14 @@ from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.model_helpers import is_overridden
 
-from r2flow.callbacks import Progress, build_callbacks
+from r2flow.callbacks import Progress, SamplePictures, build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.loggers import LOGGERS, LearningRates, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.options import PAIRS, SIMULATED, DataOptions
-from r2flow.errors import InputError, check_folder, one_line
+from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions
+from r2flow.errors import InputError, check_folder, naming, one_line
 from r2flow.model.checkpoint import MODEL, checkpoints_of, config_of, step_of
 from r2flow.model.lineage import Parent, find_parent, model_options
 from r2flow.plugins import loaded_plugins, made_with
@@ -61,7 +61,10 @@ EXPECTED_WARNINGS = (
 )
 
 # Errors of gloo and NCCL after a peer process has ended.
-PEER_LOST = r"(?i)connection .*(close|reset)|broken pipe|process exited|gloo.*(timed out|(read|write) error)|NCCL"
+PEER_LOST = (
+    r"(?i)connection .*(close|reset)|broken pipe|process exited|gloo.*"
+    r"(timed out|(read|write) error)|NCCL"
+)
 
 Named = Annotated[Mapping[str, Any], Bound("a group with a name", lambda group: "name" in group)]
 InRuns = Annotated[
@@ -203,7 +206,7 @@ def check(
 def _given(
     config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None
 ) -> dict[str, Any]:
-    """Options of the model for `model_options`; next to a parent's, only those of the command line."""
+    """Options of the model; next to a parent's, only those of the command line."""
     given = {group: config.get(group) for group in MODEL}
     if parent is None:
         return given
@@ -223,6 +226,7 @@ def _build_data(
     """The DataModule of a config, for the model's sensor and encoding."""
     data = dict(run.data)
     chosen = construct("data", DataOptions, data)
+    _refuse_unread(data["name"], [key_of(text) for text in asked])
     of_simulated = all(part.get("name") == SIMULATED for part in chosen.parts or [data])
     drawer = parent
     if data["name"] == PAIRS:
@@ -264,6 +268,17 @@ def _build_data(
     return module
 
 
+def _refuse_unread(name: str, asked: Sequence[str]) -> None:
+    """Refuse keys of the command line that this kind of data does not read."""
+    given = {".".join(key.split(".")[:2]) for key in asked}
+    if name not in (SIMULATED, MIXED, PAIRS) and "data.scenes" in given:
+        raise InputError("scans in files are no simulated scenes: leave data.scenes out.")
+    if name == SIMULATED and "data.reading" in given:
+        raise InputError("simulated scans are not read from files: leave data.reading out.")
+    if name != PAIRS and "data.pairs" in given:
+        raise InputError(f"data={name} has no pairs (data=pairs has): leave data.pairs out.")
+
+
 def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
     options = dict(run.trainer)
     if options["accelerator"] == "auto" and not torch.cuda.is_available():
@@ -278,6 +293,11 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
         stage.gradient_clip_val = options["gradient_clip_val"]
         options["gradient_clip_val"] = None
     interval = options["val_check_interval"]
+    if interval == 0:
+        raise InputError(
+            "trainer.val_check_interval must be above 0; "
+            "trainer.limit_val_batches=0 leaves validation out."
+        )
     if isinstance(interval, int) and options["check_val_every_n_epoch"] is None:
         if options["max_steps"] > 0:  # a short run is validated once, at its end
             interval = min(interval, options["max_steps"])
@@ -285,6 +305,10 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
     callbacks: list[L.Callback] = [Progress()]
     if not options["fast_dev_run"]:
         callbacks = build_callbacks(run.callbacks)
+    for callback in callbacks:
+        if isinstance(callback, SamplePictures) and stage.generator.unconditional:
+            with naming("callbacks.pictures"):
+                callback.sampler(stage.generator)  # refuses wrong steps before there is a folder
     for key, kind in (("enable_checkpointing", Checkpoint), ("enable_progress_bar", ProgressBar)):
         if not options[key]:
             callbacks = [callback for callback in callbacks if not isinstance(callback, kind)]
@@ -379,20 +403,16 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     if first:
         log_config(run.trainer.loggers, run.config)
     try:
-        if (
-            last is None
-            and run.stage.hparams["parent"]
-            and is_overridden("validation_step", run.stage)
-        ):
-            run.trainer.validate(
-                run.stage, run.data, verbose=False
-            )  # what the end of the run is compared with
+        validates = is_overridden("validation_step", run.stage)
+        if last is None and run.stage.hparams["parent"] and validates:
+            # What the end of the run is compared with.
+            run.trainer.validate(run.stage, run.data, verbose=False)
         run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
-    except (
-        MisconfigurationException,
-        ValueError,
-    ) as error:  # as of limit_val_batches, with few scans
-        lightnings = isinstance(error, MisconfigurationException) or "trainer" in str(error).lower()
+    except (MisconfigurationException, ValueError) as error:
+        # As of limit_val_batches, with few scans.
+        lightnings = isinstance(error, MisconfigurationException) or re.search(
+            "(?i)trainer|val_check", str(error)
+        )
         if isinstance(error, InputError) or not lightnings:
             raise
         raise InputError(f"trainer: {one_line(str(error))}") from None

@@ -128,7 +128,8 @@ def test_entries_of_another_kind_are_refused_in_one_line(saved, changed: dict):
     path, _ = saved
     content = torch.load(path, weights_only=True)
     for key, value in changed.items():
-        content[key] = {**content[key], **value} if isinstance(value, dict) and value and key in ("hyper_parameters", "r2flow") else value
+        part_of = key in ("hyper_parameters", "r2flow") and isinstance(value, dict) and value
+        content[key] = {**content[key], **value} if part_of else value
     torch.save(content, path)
     with refused(path):
         load_checkpoint(path)

@@ -40,13 +40,13 @@ class LearnStreetMap(LearnFlowMap):
 
     def __init__(
         self,
-        generator: Generator,
+        *model: Any,
         end_loss: str = "gradient_matching",
         ends_from: Portion = 0.5,
         objective: str = "straight",
         **options: Any,
     ) -> None:
-        super().__init__(generator, objective, **options)
+        super().__init__(*model, objective=objective, **options)
         self.end_loss, self.ends_from = LOSSES[end_loss], ends_from
 
     def check_data(self, name: str, data: Any) -> None:

@@ -88,13 +88,15 @@ def prepare(
     replaces damaged shards. Train on them with python train.py data=prepared data.root=FOLDER.
     """
     from r2flow.data import prepared
-    from r2flow.data.opening import SOURCES, parse
+    from r2flow.data.opening import describe
 
-    options, file = parse(scans)
-    if file is not None:
+    described = describe(scans)
+    if described.file is not None:
         raise InputError(f"{scans} is one scan; give the folder of a data set.")
-    options = replace(options, split=split, drives=[*drives.split(",")] if drives else None)
-    found = SOURCES[options.name].find_drives(options)
+    options = replace(
+        described.options, split=split, drives=[*drives.split(",")] if drives else None
+    )
+    found = described.kind.find_drives(options)
     how = reading.reading([scans])
     store = prepared.plan_files(out, options.name, options.folder, found, how, shard_scans)
     left_out, made = prepared.prepare(store, on_bad_scan, workers or cores())
@@ -156,11 +158,12 @@ def sensor(
     height = f"{mine.height:.2f} m above the ground"
     rows = {
         "beams": f"{len(degrees)}: {beams.order}",
-        "elevations": f"{degrees[0]:+.2f} to {degrees[-1]:+.2f} degrees; points lie {off:.2f} from their beams",
+        "elevations": f"{degrees[0]:+.2f} to {degrees[-1]:+.2f} degrees; "
+        f"points lie {off:.2f} from their beams",
         "nearest sensor": f"{nearest}, its beams {distance:.2f} degrees off" if nearest else "none",
         "resolution": f"{steps:,.0f} steps a turn; images of {mine.columns} columns",
-        "range "
-        "seen": f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle is visible",
+        "range seen": f"{mine.min_range:g} to {mine.max_range:g} m; "
+        "raise min_range if the vehicle is visible",
         "height": height if ground else f"not found, {mine.height:g} m assumed",
         "reflectance": f"reflectance_scale={scale:g}"
         if scale

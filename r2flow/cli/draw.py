@@ -128,7 +128,7 @@ def _region(checkpoint: "Checkpoint", sector: Any, rows: Any) -> "Region":
 
 @app.command(
     rich_help_panel="Draw",
-    epilog="Example: r2flow interpolate 0000000100.bin 0000000250.bin -c runs/NAME --frames 6 --out between",
+    epilog="Example: r2flow interpolate 100.bin 250.bin -c runs/NAME --frames 6 --out between",
 )
 @grouped
 def interpolate(
@@ -245,8 +245,8 @@ def complete(
         Option(
             "--checkpoint",
             "-c",
-            help="A checkpoint file, a run folder or a model. Default: densify; street for sectors without rays or a "
-            "--sampler for flows from noise.",
+            help="A checkpoint file, a run folder or a model. Default: densify; street for sectors "
+            "without rays or a --sampler for flows from noise.",
         ),
     ] = None,
     precision: PrecisionOption = "32-true",

@@ -20,7 +20,8 @@ _REAL = "the real scans"
 
 @app.command(
     rich_help_panel="Measure",
-    epilog="Example: r2flow evaluate kitti_360:/data/KITTI-360 runs/1rf runs/2rf others/ --split test --json e.json",
+    epilog="Example: r2flow evaluate kitti_360:/data/KITTI-360 runs/1rf runs/2rf "
+    "--split test --json e.json",
 )
 @grouped
 def evaluate(

@@ -1,4 +1,4 @@
-"""Options shared by verbs, and their parsing; a verb takes a dataclass of options as one parameter."""
+"""Options shared by verbs, and their parsing; a verb takes a dataclass of them as one."""
 
 import inspect
 import os
@@ -68,7 +68,8 @@ ColumnsOption = Annotated[
     Option(
         parser=parse_columns,
         metavar="NAMES",
-        help="Columns of scan files without column names, such as x,y,z,intensity,_. Default: the format's.",
+        help="Columns of scan files without column names, such as x,y,z,intensity,_. "
+        "Default: the format's.",
     ),
 ]
 
@@ -173,9 +174,9 @@ class SamplerOptions:
     sampler: Annotated[
         str | None,
         Option(
-            help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: dopri5, torchdiffeq; "
-            "stochastic: sde; flow maps: jump, renoise, refine; completion: transport, mmps, "
-            "replace, repaint. "
+            help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: "
+            "dopri5, torchdiffeq; stochastic: sde; flow maps: jump, renoise, refine; completion: transport, "
+            "mmps, replace, repaint. "
             "For other systems see docs/systems.md."
         ),
     ] = None

@@ -218,8 +218,8 @@ def completion(
 def _completers(
     real: str, models: list[str], sensor: str | None, size: Any, device: str
 ) -> "dict[str, Checkpoint]":
-    """Models by name, those that complete any sensor for the sensor of the others, or of the scans."""
-    from r2flow.data.opening import own_reading
+    """Models by name; those of any sensor take the sensor of the others, or of the scans."""
+    from r2flow.data.opening import describe
     from r2flow.generators import TransferFlow
     from r2flow.lidar.sensors import named_sensor
     from r2flow.model.checkpoint import load_checkpoint
@@ -227,7 +227,7 @@ def _completers(
 
     names = short_names([Path(name) for name in models])
     loaded = {name: load_checkpoint(path, device) for name, path in zip(names, models, strict=True)}
-    stored = own_reading(real)
+    stored = describe(real).stored
     fixed = [m.sensor for m in loaded.values() if not isinstance(m.generator, TransferFlow)]
     known = [*fixed, *([stored.sensor] if stored else [])]
     for name, model in loaded.items():
@@ -239,9 +239,7 @@ def _completers(
     return loaded
 
 
-@report.command(
-    epilog="Example: r2flow report paper runs/1rf runs/2rf --results e.json --real kitti360/test -o paper"
-)
+@report.command(epilog="Example: r2flow report paper runs/1rf runs/2rf --results e.json -o paper")
 def paper(
     models: Annotated[
         list[str],

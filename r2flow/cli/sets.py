@@ -41,8 +41,8 @@ class EvaluateOptions:
     metrics: Annotated[
         str | None,
         Option(
-            help="Metrics, separated by commas, or all available here: all. Default: panel, KID and Frechet distance "
-            "of hand-made features, JSD, MMD."
+            help="Metrics, separated by commas, or all available here: all. Default: panel, KID and "
+            "Frechet distance of hand-made features, JSD, MMD."
         ),
     ] = None
     protocol: Annotated[
@@ -106,7 +106,7 @@ def reading_of(
     """How points become images, whatever the order of models and samples: with all returns that any
     of them has.
     """
-    from r2flow.data.opening import PREPARED, own_reading, parse, reading_for
+    from r2flow.data.opening import PREPARED, describe, reading_for
     from r2flow.metrics.scans import MASK
 
     sensors = {(flow.sensor.shape, flow.sensor.elevations) for flow in flows}
@@ -116,8 +116,9 @@ def reading_of(
         )
     reading = how.reading(specs, next(iter(flows), None))
     sets = [reading_for([], flow) for flow in flows]
-    sets += filter(None, map(own_reading, specs[1:]))
-    prepared = any(parse(spec)[0].name == PREPARED for spec in specs)
+    named = [describe(spec) for spec in specs]
+    sets += [scans.stored for scans in named[1:] if scans.stored]
+    prepared = any(scans.options.name == PREPARED for scans in named)
     if (how.sensor and not flows) or not sets or prepared:
         return reading  # as chosen, or as the prepared scans were projected
     near = min(other.sensor.min_range for other in sets)
@@ -128,10 +129,11 @@ def reading_of(
 
 
 def open_set(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
-    from r2flow.data.opening import open_scans, refuse_parts
+    from r2flow.data.opening import describe, open_scans
 
-    scans = open_scans(text, reading, split, num)
-    refuse_parts(text)
+    described = describe(text)
+    scans = open_scans(described, reading, split, num)
+    described.refuse_parts()
     _ = scans.source[0]  # fail before the other set is read
     return scans
 

@@ -47,12 +47,14 @@ def show(
     """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write
     range images.
     """
-    from r2flow.data.opening import parse
+    from r2flow.data.opening import describe
     from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure
     from r2flow.reports.view.panels import scan_panels, share_scale
 
-    if format == "npy" and out.resolve() in {parse(spec)[0].folder.resolve() for spec in scans}:
+    if format == "npy" and out.resolve() in {
+        describe(spec).options.folder.resolve() for spec in scans
+    }:
         raise InputError(f"{out} is the folder of the scans; give another --out.")
     names: set[str] = set()
     readings = {spec: how.reading([spec], estimate_scale=True) for spec in scans}
@@ -95,7 +97,8 @@ def view(
         Option(
             min=1,
             max=256,
-            help=f"Maximum number of scans per folder, evenly spread ({_SCANS}); samples per model ({_SAMPLES}).",
+            help=f"Maximum number of scans per folder, evenly spread ({_SCANS}); "
+            f"samples per model ({_SAMPLES}).",
         ),
     ] = None,
     sequence: Annotated[
@@ -109,7 +112,7 @@ def view(
 
     The cursor links points and range image; labels next to the scans are shown.
     """
-    from r2flow.data.opening import own_reading
+    from r2flow.data.opening import describe
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.files import write_file
     from r2flow.model.checkpoint import load_checkpoint
@@ -122,7 +125,7 @@ def view(
     readings = {}
     for spec in what:
         if spec not in models:
-            model = None if own_reading(spec) else first
+            model = None if describe(spec).stored else first
             readings[spec] = how.reading([spec], model, estimate_scale=True)
     readings = share_scale(readings, num or _SCANS)
     drawn = [] if sequence else list(scan_panels(readings, num or _SCANS))

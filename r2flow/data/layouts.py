@@ -61,7 +61,7 @@ class SourceKind(ABC):
         """
 
     def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
-        """Reason why the scans count as scans without reflectance; None if they have reflectance."""
+        """Reason why the scans count as without reflectance; None if they have it."""
         return None
 
     def levels_of(self, scans: "Described") -> int | None:
@@ -82,7 +82,7 @@ class SourceKind(ABC):
     def chosen(
         self, drives: list[Drive], split: str | None, names: Sequence[str | int] | None
     ) -> list[Drive]:
-        """Select drives by a part of the standard split, then by names or numbers; None takes all."""
+        """Select drives by a part of the split, then by names or numbers; None takes all."""
         if split is not None:
             if split not in self.splits:
                 splits = (

@@ -418,16 +418,3 @@ def read(
         open_scans(scans, replace(reading, on_bad_scan="error", within_limits=True)).source[0]
     )
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
-
-
-def own_reading(spec: Spec) -> Reading | None:
-    return describe(spec).stored
-
-
-def parse(text: str) -> tuple[SourceOptions, Path | None]:
-    scans = describe(text)
-    return scans.options, scans.file
-
-
-def refuse_parts(spec: Spec) -> None:
-    describe(spec).refuse_parts()

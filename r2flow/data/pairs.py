@@ -53,11 +53,16 @@ class PairStore(Store):
         size = options.batch_size * 2 * math.prod(shape)
         self.shard_batches = max(round(options.shard_mib * 2**20 / size), 1)
         recipe = {
-            "parent": options.parent or "", "shape": shape, "seed": options.seed, "first": self.first,
-            "sampler": self.sampler.asdict(), "batch_size": options.batch_size, "shard_batches": self.shard_batches,
+            "parent": options.parent or "",
+            "shape": shape,
+            "seed": options.seed,
+            "first": self.first,
+            "sampler": self.sampler.asdict(),
+            "batch_size": options.batch_size,
+            "shard_batches": self.shard_batches,
             "noise_shape": None if self.noise_shape == shape else self.noise_shape,
             "precision": options.precision,
-        }  # fmt: skip
+        }
         super().__init__(folder, "pairs", recipe)
         self.check()
         self.shards = range(-(-options.num // (self.shard_batches * options.batch_size)))

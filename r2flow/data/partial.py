@@ -275,7 +275,8 @@ def _read_points(
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     stored = read_numbers(path)
-    other = f"{path} must be a range image of floats (2 or 1, H, W), found {stored.dtype} {stored.shape}."
+    found = f"found {stored.dtype} {stored.shape}"
+    other = f"{path} must be a range image of floats (2 or 1, H, W), {found}."
     check(stored.dtype.kind == "f" and len(stored) in (1, 2) and stored.size, other)
     wrong = wrong_with(torch.from_numpy(stored.astype(np.float32)), max(FAR, target.max_range))
     check(not wrong, f"{path}: {wrong}; --mask FILE.npy names what was not measured.")
@@ -294,7 +295,8 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     if source is not None or image.shape[1:] != target.shape:
         size, model = ("x".join(map(str, shape)) for shape in (image.shape[1:], target.shape))
         found = f" ({source.name} has {source.shape[0]})" if source else ""
-        advice = f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone with densify"
+        advice = f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone with "
+        advice += "densify"
         raise InputError(
             f"{path} is a range image of {size}, those of the model are {model}: {advice}."
         )

@@ -47,7 +47,7 @@ def range_codes(min_range: float, max_range: float) -> Codes:
 
 
 def reflectance_codes(levels: int) -> Codes:
-    """uint8 codes of reflectance in [0, 1], n / levels; with 256 levels the maximum is 255 / 256."""
+    """uint8 codes of reflectance in [0, 1], n / levels; 256 levels end at 255 / 256."""
     highest = min(levels, 255)
     return Codes([0, highest / levels], [0, highest], np.uint8)
 

@@ -19,7 +19,10 @@ from r2flow.store import manifest_of
 
 AUTO = "auto"
 FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
-DIVIDED = "reflectance is divided by %g; --reflectance-scale (of r2flow.read reflectance_scale) names another value"
+DIVIDED = (
+    "reflectance is divided by %g; --reflectance-scale (of r2flow.read reflectance_scale) "
+    "names another value"
+)
 DARK = (
     "reflectance stays below a tenth of full reflectance: give its value as --reflectance-scale, "
     "in training as "

@@ -27,7 +27,7 @@ IGNORED = dict.fromkeys((SIMULATED, PAIRS, MIXED), ("split", "drives")) | {
 
 @dataclass(frozen=True)
 class DataPlan:
-    """The sets of scans of a run, complete: each `reading` has all fields, each sensor all options."""
+    """The sets of scans of a run, complete: each reading and sensor has all its options."""
 
     sets: tuple[PartOptions, ...]  # to train on; empty for pairs
     held_out: SourceOptions | None  # to validate on; None: a share of `sets`
@@ -43,9 +43,6 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
         InputError: an unknown data set or option, or one that would be ignored.
     """
     _refuse_ignored("data", options.name, options)
-    if options.name in SOURCES and isinstance(SOURCES[options.name], Layout | Prepared):
-        if options.scenes != DataOptions.scenes:
-            raise InputError("scans in files are no simulated scenes: leave data.scenes out.")
     usual = {
         key: value for key, value in options.chosen.items() if key in ("projection", "convention")
     }
@@ -89,7 +86,9 @@ def _complete(source: Any, usual: Mapping[str, Any], sensor: Sensor) -> Any:
 
 def _parts(run: DataOptions, sensor: Sensor) -> list[PartOptions]:
     if not run.parts:
-        example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
+        example = (
+            "[{name: kitti_360, root: FOLDER, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
+        )
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
     parts: list[PartOptions] = []
     for number, given in enumerate(run.parts):

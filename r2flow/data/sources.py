@@ -157,7 +157,7 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Do
 
 
 def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
-    """Warn, once per folder, of scans that are not in one sensor's own frame; whether they are not."""
+    """Warn, once per folder, of scans not in one sensor's own frame; whether they are not."""
     if unclear := is_unclear(scans):
         warn_odd(
             Path(path),
@@ -179,7 +179,8 @@ def warn_of_other_sensor(
         return
     seen, name, hopeless = mismatch[:3]
     check(not (hopeless and reading.within_limits), f"{root}: {seen}.")
-    advice = f"; give the right one, or estimate it: r2flow sensor {shlex.quote(str(root))} --out mine.yaml"
+    folder = shlex.quote(str(root))
+    advice = f"; give the right one, or estimate it: r2flow sensor {folder} --out mine.yaml"
     if name is not None and name != sensor.name:
         advice = (
             f"; they fit '{name}': sensor={name} in training, --sensor {name} in verbs that have it"

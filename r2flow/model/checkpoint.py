@@ -76,7 +76,8 @@ class Checkpoint:
     def __repr__(self) -> str:
         kind = (self.config.get("generator") or {}).get("name", "rectified_flow")
         size = "x".join(map(str, self.sensor.shape))
-        return f"Checkpoint({title_of(self.path)}, {kind}, {size} {self.sensor.name}, step {self.step})"
+        sensor = f"{size} {self.sensor.name}"
+        return f"Checkpoint({title_of(self.path)}, {kind}, {sensor}, step {self.step})"
 
     @property
     def sensor(self) -> Sensor:
@@ -103,9 +104,15 @@ class Checkpoint:
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
     def complete(
-        self, images: Tensor | np.ndarray | str | Path, state: Tensor | None = None, num: int = 1, seed: int = 0, *,
-        sensor: Sensor | str | None = None, **how: Any,
-    ) -> Tensor:  # fmt: skip
+        self,
+        images: Tensor | np.ndarray | str | Path,
+        state: Tensor | None = None,
+        num: int = 1,
+        seed: int = 0,
+        *,
+        sensor: Sensor | str | None = None,
+        **how: Any,
+    ) -> Tensor:
         """Complete partial scans, (B, num, 2 or 1, H, W), in the format of `sample`.
 
         Args:
@@ -250,7 +257,9 @@ def find_checkpoint(path: str | Path) -> Path:
         return find_model(name)
     problem = f"no checkpoint at {path}."
     known = [*MODELS, *(folder.name for folder in path.parent.glob("*/"))]
-    hint = f"Give a checkpoint file, a run folder or a model ({', '.join(MODELS)}).{did_you_mean(path.name, known)}"
+    models = ", ".join(MODELS)
+    hint = f"Give a checkpoint file, a run folder or a model ({models})."
+    hint += did_you_mean(path.name, known)
     if path.is_dir():
         problem = f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt)."
         runs = sorted(
@@ -290,7 +299,8 @@ def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
             raise
         code = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
         size = file.seek(0, os.SEEK_END)
-        problem = f"is not a checkpoint, or a damaged one ({size} bytes). Give a .ckpt of r2flow or a published file."
+        problem = f"is not a checkpoint, or a damaged one ({size} bytes). "
+        problem += "Give a .ckpt of r2flow or a published file."
         if code is not None and isinstance(error, pickle.UnpicklingError):
             problem = (
                 f"is refused: it holds objects that would run code when loaded ({code[1]}), not "
@@ -301,7 +311,7 @@ def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
 
 
 def _refuse_unpacking(file: IO[bytes], name: object) -> None:
-    """Refuse zip archives with compressed entries (zip bombs): torch writes storages uncompressed."""
+    """Refuse zip archives with compressed entries (zip bombs): torch writes none."""
     try:
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()

@@ -209,8 +209,8 @@ def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[
         "evaluations": len(steps.times),
         "times": {"t": steps.times, "s": steps.second},
         "outputs": {
-            "scan": "(batch, 2 or 1, H, W): range in metres, reflectance of [0, 1]; 0 without a return",
-            "points": "(batch, 3, H, W): x ahead, y left, z up in metres; the origin without a return",
+            "scan": "(batch, 2 or 1, H, W): range in metres, reflectance of [0, 1]; 0: no return",
+            "points": "(batch, 3, H, W): x ahead, y left, z up in metres; origin: no return",
         },
     }
 

@@ -1,4 +1,4 @@
-"""Sampling: scan i depends on (seed, i) alone, up to the network's rounding in different batches."""
+"""Sampling: scan i depends on (seed, i) alone, up to rounding in different batches."""
 
 import logging
 import time

@@ -75,11 +75,13 @@ def configuration(config: Row) -> str:
     kept = {
         key: value
         for key, value in settings.items()
-        if key not in ignored and not key.startswith("parent.")
+        if key not in ignored and not key.startswith("stage.parent.")
     }
     given = dict(flatten(config))  # a run may resume with other values of these
-    kept |= {key: given.get(key) for key in ("trainer.precision", "parent.step", "data.pairs.of")}
-    parent = config.get("parent")
+    kept |= {
+        key: given.get(key) for key in ("trainer.precision", "stage.parent.step", "data.pairs.of")
+    }
+    parent = config["stage"].get("parent")
     if parent:
         before = read_config(Path(parent["path"]).parent.parent)
         kept["parent"] = configuration(before) if before else parent["weights"]
@@ -87,7 +89,7 @@ def configuration(config: Row) -> str:
 
 
 def group_rows(groups: Groups) -> list[Row]:
-    """One row per group: means of the runs that have a value, with standard deviation for several."""
+    """One row per group: means of the runs with a value, and the deviation of several."""
     rows = []
     for label, runs in groups.items():
         row: Row = {"name": label, "n": len(runs)}
@@ -191,7 +193,8 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     learned = last.config | {"data": next(iter(loaded.values())).config.get("data", {})}
     print(
         f"""
-pictures      {out / "steps.png"} (every link, in one step and in many), {out / "samples.png"} ({name})
+pictures      {out / "steps.png"} (every link, in one step and in many)
+              {out / "samples.png"} ({name})
 in 3-D        {out / "samples.html"}, in a browser
 point clouds  {out / "000000.ply"} ...
 table         {text}

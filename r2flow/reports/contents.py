@@ -11,7 +11,7 @@ from r2flow.reports.tables import print_table
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Generator, parameters, sensor, encoding, step and config of a checkpoint file or run folder."""
+    """Generator, parameters, sensor, encoding, step and config of a checkpoint."""
     loaded = load_checkpoint(path)
     model = name_of(loaded.path)
     config = {key: value for key, value in loaded.config.items() if key != "published"}
@@ -38,7 +38,7 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def print_known() -> None:
-    """List the models, and the feature networks with their distances and where they are published."""
+    """List the models, and the feature networks with their distances and sources."""
     print_table([(name, model.about) for name, model in MODELS.items()], ("model", "samples"))
     print()
     rows = [

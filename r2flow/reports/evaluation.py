@@ -37,7 +37,7 @@ def value_rows(comparisons: Sequence[Comparison]) -> list[Row]:
 
 
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
-    """Print the protocol, a table and remarks. Sets in columns are numbered, since names are long."""
+    """Print the protocol, a table and remarks. Columns are numbered, since names are long."""
     columns, *lines = _table(comparisons)
     print(_protocol(comparisons))
     if columns[0] != "set":
@@ -94,7 +94,7 @@ def _protocol(comparisons: Sequence[Comparison]) -> str:
 
 
 def _table(comparisons: Sequence[Comparison]) -> list[list[str]]:
-    """Headings and lines, with published scaling; the longer of comparisons and values runs down."""
+    """Headings and lines, with published scaling; the longer of the two runs down."""
     lines = []
     for comparison in comparisons:
         line = {
@@ -140,8 +140,8 @@ def sampled_rows(comparisons: Sequence[Mapping[str, Any]]) -> list[Row]:
         row = {
             "flow": generated["set"],
             "weights": generated["weights"],
-            "protocol": f"{protocol['name']}, {generated['scans']} scans of {size} against {real['scans']} of "
-            f"{' in '.join([*parts, real['set']])}",
+            "protocol": f"{protocol['name']}, {generated['scans']} scans of {size} against "
+            f"{real['scans']} of {' in '.join([*parts, real['set']])}",
         }
         for metric in comparison["metrics"]:
             prefix = "" if metric["metric"] == "speed" else f"{metric['metric']}/"

@@ -133,7 +133,7 @@ def recipe_of(checkpoint: Checkpoint, seed: int, sampler: Sampler, **more: Any) 
 
 
 def _draw_samples(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str) -> None:
-    """Write a picture per image, `samples.png` of the first 8, and `samples.html` of all that fit."""
+    """Write a picture per image, `samples.png` of 8, and `samples.html` of all that fit."""
     for index, image in enumerate(track(images, "drawing", "pages", least=3)):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     save_figure(contact_sheet(images[:8], rays), out / "samples.png")

@@ -77,7 +77,7 @@ def role_of(checkpoint: Checkpoint, label: str) -> str:
             system = f"{system} + APE"
         return system if checkpoint.encoding.reflectance else f"{system}, range"
     role, learned_from = _ROLES.get(stage.get("name", ""), (label, None))
-    if (config.get("parent") or {}).get("stage") not in (None, learned_from):
+    if (stage.get("parent") or {}).get("stage") not in (None, learned_from):
         return label
     return role.format(stage.get("steps"))
 

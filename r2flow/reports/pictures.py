@@ -220,7 +220,7 @@ def figure_pixels(figure: Figure, dpi: int = 160) -> np.ndarray:
 
 @cache
 def colours(what: str) -> Any:
-    """Colour map of range, height or reflectance from low to high values; black for missing ones."""
+    """Colour map of range, height or reflectance, low to high; black for missing values."""
     if what == "reflectance":
         scale = colormaps["cividis"]
     elif what == "height":

@@ -37,12 +37,14 @@ WRONG = (
 # Hydra groups: the registry of each, and the options that other groups of the config set.
 REGISTRIES = {
     "stage": (
-        "r2flow.stages", "STAGES", ("backbone", "sensor", "encoding", "generator", "sampler", "few", "seed"),
+        "r2flow.stages",
+        "STAGES",
+        ("backbone", "sensor", "encoding", "generator", "sampler", "few", "seed"),
     ),
     "backbone": ("r2flow.backbones", "BACKBONES", ("in_channels", "out_channels", "second_time")),
     "data": ("r2flow.data.opening", "SOURCES", ()),
     "sensor": ("r2flow.lidar.sensors", "SENSORS", ()),
-}  # fmt: skip
+}
 
 
 def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -> dict[str, Any]:

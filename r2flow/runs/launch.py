@@ -89,7 +89,7 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
 
 
 def _with_plugins(arguments: Sequence[str], plugins: Sequence[str]) -> list[str]:
-    """Load the plug-ins of a command line, in any form, and collect them into one `plugins=[...]`."""
+    """Load the plug-ins of a command line and collect them into one `plugins=[...]`."""
     given = [text for text in arguments if text.lstrip("+").startswith("plugins=")]
     listed = [
         name.strip(" '\"")

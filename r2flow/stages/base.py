@@ -273,7 +273,7 @@ class Stage(L.LightningModule):
         self.panel.update(self.predict_step(batch, batch_idx).cpu(), real=False)
 
     def on_test_epoch_end(self) -> None:
-        """Log the panel's distances between held-out and generated scans, `test/panel` their mean."""
+        """Log the panel's distances of held-out to generated scans, `test/panel` their mean."""
         self.log_dict({f"test/{name}": value for name, value in self.panel.compute().items()})
 
     def configure_optimizers(self) -> Any:

@@ -1,4 +1,4 @@
-"""Muon: momentum with equalised singular values for weight matrices, AdamW for all other weights."""
+"""Muon: momentum with equalised singular values for matrices, AdamW for other weights."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -69,7 +69,7 @@ class Muon(torch.optim.AdamW):
 
 
 def is_hidden_matrix(p: Tensor) -> bool:
-    """Whether a weight has at least `LEAST_CHANNELS` rows and columns (output and input channels)."""
+    """Whether a weight has at least `LEAST_CHANNELS` output and input channels."""
     return p.ndim >= 2 and min(p.shape[:2]) >= LEAST_CHANNELS
 
 

@@ -7,16 +7,18 @@ import pytest
 import torch
 from torch import nn
 
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.errors import InputError
 from r2flow.flow.losses import LOSSES
 from r2flow.flow.solvers import solve
-from r2flow.generators import USUAL
+from r2flow.generators import USUAL, build_generator
 from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler
 from r2flow.stages import STAGES
 from r2flow.stages.base import learning_rate_factor
 from r2flow.stages.rectify import Distill, Rectify, Reflow
 from r2flow.training import build, compose
+from tests.conftest import CONFIG, SENSOR, quiet_trainer
 from tests.fields import Field
 
 
@@ -90,7 +92,8 @@ X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
     ("stage", "options", "steps"), [(Reflow, {}, 1), *((Distill, {"steps": k}, k) for k in (1, 4))]
 )
 def test_a_reflowed_gaussian_takes_one_step_and_a_distilled_one_its_own_number(stage, options: dict, steps: int):
-    end = solve(fitted(stage(generator=affine(), **options), pairs, 1200).generator.velocity, X_0, steps=steps).x.detach()
+    flow = fitted(stage(generator=affine(), **options), pairs, 1200).generator
+    end = solve(flow.velocity, X_0, steps=steps).x.detach()
     torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
 
 
@@ -127,7 +130,7 @@ def test_the_paper_s_loss_and_times_are_the_defaults():
     ("options", "message"),
     [
         *(({"name": name, "learning_rat": 1.0}, r"Did you mean 'learning_rate'\?") for name in STAGES),
-        ({"name": "distill", "steps": 0}, "stage 'distill': steps: input should be greater than or equal to 1, found 0"),
+        ({"name": "distill", "steps": 0}, "stage 'distill': steps: input should be greater than or equal to 1"),
         ({"name": "distill", "steps": 2, "time": {"name": "uniform"}}, "leave time out"),
     ],
 )
@@ -142,6 +145,12 @@ def test_stage_and_data_belong_together(stage: str, data: str, saved):
     config = compose([one for one in given if one])
     with pytest.raises(InputError, match=f"stage={stage} learns from"):
         build(config)
+
+
+def test_stage_and_data_belong_together_in_lightning_too(tmp_path):
+    trainer, data = quiet_trainer(tmp_path, max_steps=1), ScanDataModule(sensor=SENSOR)
+    with pytest.raises(InputError, match="stage=reflow learns from pairs: give data=pairs, not simulated"):
+        trainer.fit(Reflow(generator=build_generator(CONFIG)), data)
 
 
 def test_a_straightened_generator_is_drawn_without_fresh_noise():

@@ -408,7 +408,7 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
     [
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1, 2], [2, 2]]}}, "needs 1 strides"),
         ({"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}}, r"\) halves images 4"),
-        ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "position: input should be 'none' or 'learnable', found 'polar'"),
+        ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "'none' or 'learnable', found 'polar'"),
         ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers must be 1 integers"),
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
         ({"schedule": {"name": "cosine", "steps": 1}}, "steps: must be at least 2, found 1"),

@@ -1,4 +1,4 @@
-"""Panels of a page of `r2flow.reports.view`: scans of files and sets, and samples of a generator."""
+"""Panels of a page of `r2flow.reports.view`: scans of sets, and samples of a generator."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from r2flow.data.opening import find_drives, open_scans, own_reading, parse
+from r2flow.data.opening import describe, find_drives, open_scans
 from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import Reading, estimated_scale, read_labelled_scan
 from r2flow.data.sets import ScanSet
@@ -63,9 +63,10 @@ def scan_panels(
     views: list[tuple[str, Path, ScanSet, int]] = []
     for spec, reading in readings.items():
         reading = replace(reading, on_bad_scan="error")
-        options, file = parse(spec)
-        if own_reading(spec) is None and options.name == FOLDER:
-            chosen, total = list_scans(file or options.folder, most)
+        described = describe(spec)
+        options = described.options
+        if described.stored is None and options.name == FOLDER:
+            chosen, total = list_scans(described.file or options.folder, most)
             warn_of_other_sensor(chosen, reading, spec)
             views += [(spec, path, open_scans(path, reading, own_size=True), 0) for path in chosen]
         else:
