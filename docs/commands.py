@@ -20,7 +20,7 @@ from r2flow.cli.verbs import USAGE_ERROR, app
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.plugins import take_plugins
-from r2flow.runs.composing import compose, explain
+from r2flow.runs.composing import compose, in_one_line
 
 DOCS = Path(__file__).resolve().parent
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.M | re.S)
@@ -83,7 +83,7 @@ def main() -> None:
                 try:
                     check(words)
                 except (InputError, HydraException, argparse.ArgumentError, USAGE_ERROR) as error:
-                    said = explain(error) if isinstance(error, HydraException) else error
+                    said = in_one_line(error) if isinstance(error, HydraException) else error
                     wrong.append(f"{page.relative_to(DOCS.parent)}: r2flow {shlex.join(words)}\n    {said}")
     print("\n".join(wrong) or f"{count} commands parse.")
     sys.exit(bool(wrong))

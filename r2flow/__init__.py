@@ -9,11 +9,11 @@ Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     import torch
 
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from r2flow.stages import STAGES, Distill, LearnFlowMap, Rectify, Reflow, Stage, Transfer
 
 __version__ = "0.2.0"
+
+# The folders callbacks/ and conf/ of a checkout lie beside this package; a wheel has them in it.
+if not Path(__file__).with_name("conf").is_dir():
+    __path__.append(str(Path(__file__).parents[1]))
 
 # Imported at their first use, so that `import r2flow` is fast.
 _PLACES = {

@@ -173,7 +173,7 @@ def presets(group: str) -> dict[str, dict[str, Any]]:
     """Options of each file of a folder of conf/, by its name, with those of the files in its
     `defaults`.
     """
-    folder = files("r2flow") / "conf" / group
+    folder = files("r2flow.conf") / group
     read: dict[str, Any] = {}
     for file in folder.iterdir() if folder.is_dir() else ():
         if file.name.endswith(".yaml"):
@@ -302,6 +302,7 @@ def _first_problem(
         keys.append(str(part))
         options = options[part]
     words = problem["msg"].removeprefix("Value error, ")
+    words = words.replace("an instance of Sequence", "a list")
     return f"{'.'.join(keys)}: {words[:1].lower()}{words[1:]}, found {problem['input']!r}."
 
 

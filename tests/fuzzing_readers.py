@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.data.opening import SOURCES, own_reading
+from r2flow.data.opening import SOURCES, Described, describe
 from r2flow.data.options import PairOptions, SourceOptions
 from r2flow.data.pairs import PairStore
 from r2flow.data.prepared import PreparedScans
@@ -50,7 +50,7 @@ def in_folder(name: str) -> Callable[[Path], Path]:
 
 def prepared(path: Path) -> bytes:
     folder = in_folder("prepared")(path)
-    source = SOURCES["prepared"].open(SourceOptions("prepared", str(folder)), Reading(SENSOR, reflectance=True))
+    source = SOURCES["prepared"].open(Described("it", SourceOptions("prepared", str(folder))), Reading(SENSOR, reflectance=True))
     assert isinstance(source, PreparedScans)
     for shard in source.rows[:, 1]:
         try:
@@ -77,7 +77,7 @@ def checkpoint(path: Path) -> bytes | None:
 
 
 def samples(path: Path) -> None:
-    own_reading(in_folder("samples")(path))
+    describe(in_folder("samples")(path)).stored
 
 
 def config(path: Path) -> None:

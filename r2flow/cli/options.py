@@ -175,9 +175,8 @@ class SamplerOptions:
         str | None,
         Option(
             help="NAME or NAME:FIELD=VALUE:...: adams3, euler, midpoint, heun2, rk4; adaptive: "
-            "dopri5, torchdiffeq; stochastic: sde; flow maps: jump, renoise, refine; completion: transport, "
-            "mmps, replace, repaint. "
-            "For other systems see docs/systems.md."
+            "dopri5, torchdiffeq; stochastic: sde; flow maps: jump, renoise, refine; "
+            "completion: transport, mmps, replace, repaint. For other systems see docs/systems.md."
         ),
     ] = None
     steps: StepsOption = None

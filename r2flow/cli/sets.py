@@ -41,8 +41,8 @@ class EvaluateOptions:
     metrics: Annotated[
         str | None,
         Option(
-            help="Metrics, separated by commas, or all available here: all. Default: panel, KID and "
-            "Frechet distance of hand-made features, JSD, MMD."
+            help="Metrics, separated by commas, or all available here: all. Default: panel, KID "
+            "and Frechet distance of hand-made features, JSD, MMD."
         ),
     ] = None
     protocol: Annotated[

@@ -8,6 +8,7 @@ Layout(find_mine))` for scan files listed by `find_mine(root)`, or a subclass of
 """
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from r2flow.data import layouts
 from r2flow.data.layouts import Drive, Layout, SourceKind
-from r2flow.data.options import FOLDER, PREPARED, SIMULATED, SourceOptions
+from r2flow.data.options import FOLDER, PREPARED, SIMULATED, ReadingOptions, SourceOptions
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
@@ -31,7 +32,7 @@ from r2flow.data.sources import (
     mismatch_of,
     warn_of_other_sensor,
 )
-from r2flow.errors import InputError
+from r2flow.errors import InputError, check
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS, Sensor, named_sensor
 from r2flow.models import MODELS
@@ -298,7 +299,7 @@ def open_scans(
     if scans.file is None:
         if split or simulated or reading.columns:
             scans = scans.part(
-                split=split, scenes=num or SCENES, reading={"columns": reading.columns}
+                split=split, scenes=num or SCENES, reading=ReadingOptions(columns=reading.columns)
             )
         seed = int(scans.options.root or 0) if simulated else 0
         return ScanSet(scans.label, scans.open(reading, seed), reading.sensor).limited(num)
@@ -362,6 +363,9 @@ def reading_for(
             f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out."
         )
     reading = replace(reading, sensor=reading.sensor if model else chosen)
+    if "reflectance_scale" in given:
+        scale = given["reflectance_scale"]
+        check(0 < scale < math.inf, f"reflectance_scale must be above 0, found {scale!r}.")
     if "reflectance_scale" in given or not described:
         return reading
     trained = reading.reflectance_scale  # 1: also of scans that were scaled before the training

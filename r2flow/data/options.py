@@ -36,7 +36,7 @@ class ReadingOptions:
     projection: Projection | None = None
     convention: Convention | None = None
     reflectance_scale: Positive | None = None
-    columns: list[str] | None = None
+    columns: Sequence[str] | None = None
     on_bad_scan: Literal["error", "skip"] | None = None
 
     def __post_init__(self) -> None:

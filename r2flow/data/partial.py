@@ -295,8 +295,10 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     if source is not None or image.shape[1:] != target.shape:
         size, model = ("x".join(map(str, shape)) for shape in (image.shape[1:], target.shape))
         found = f" ({source.name} has {source.shape[0]})" if source else ""
-        advice = f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone with "
-        advice += "densify"
+        advice = (
+            f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone "
+        )
+        advice += "with densify"
         raise InputError(
             f"{path} is a range image of {size}, those of the model are {model}: {advice}."
         )

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,7 +27,7 @@ from r2flow.registry import did_you_mean, options_of
 
 T = TypeVar("T")
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
+CONF = Path(str(files("r2flow.conf")))
 WRONG = (
     HydraException,
     OmegaConfBaseException,

@@ -31,7 +31,7 @@ def test_resampling_keeps_a_constant_ring_constant(window):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"base_channels": 2}, "base_channels must be .* of at least 4 that is even, found 2"),
+        ({"base_channels": 2}, "base_channels: must be even and at least 4, found 2"),
         ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
         ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
         ({"position": "learnable"}, "no position named 'learnable'; known: fourier_features, none"),

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from r2flow.data.augment import Augmentation
-from r2flow.data.loader import FlowDataset
+from r2flow.data.loader import FlowDataset, ItemFormat
 from r2flow.data.sources import InMemory
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points, project
@@ -48,8 +48,9 @@ def test_a_rolled_image_is_the_image_of_the_turned_scan():
 def test_switching_one_on_changes_no_other_draw(kind: str):
     assert [bool(Augmentation()), bool(Augmentation(**{kind: KINDS[kind]}))] == [False, True]
     encoding = Encoding(SENSOR)
-    plain = FlowDataset(SLOPE, encoding, 0, "training")[(7, 0)]
-    changed = FlowDataset(SLOPE, encoding, 0, "training", Augmentation(**{kind: KINDS[kind]}))[(7, 0)]
+    item = ItemFormat(encoding, encoding.shape)
+    plain = FlowDataset(SLOPE, item, 0, "training")[(7, 0)]
+    changed = FlowDataset(SLOPE, item, 0, "training", Augmentation(**{kind: KINDS[kind]}))[(7, 0)]
     assert torch.equal(plain["x_0"], changed["x_0"])
     assert torch.equal(plain["u"], changed["u"])
     # Both together are one, then the other, each with the draws that it has alone.

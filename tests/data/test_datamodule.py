@@ -8,7 +8,7 @@ import torch
 
 from r2flow import noise
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.options import SourceOptions
+from r2flow.data.opening import describe
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.resolving import reflectance_levels
 from r2flow.data.sources import InMemory, ScanFiles
@@ -219,11 +219,11 @@ class TestPrepared:
         assert isinstance(prepared.training_source.parts[0], PreparedScans)  # mapped, not copied
 
     def test_samples_get_the_levels_that_sets_share(self, prepared_360: Path, numbered: Path):
-        prepared, simulated = SourceOptions("prepared", str(prepared_360)), SourceOptions()
+        prepared, simulated = describe(prepared_360), describe("simulated:0")
         assert reflectance_levels([prepared]) == 256  # as prepare found them
         assert reflectance_levels([simulated]) == 100
         assert reflectance_levels([prepared, simulated]) is None
-        assert reflectance_levels([SourceOptions("folder", str(numbered))]) is None
+        assert reflectance_levels([describe(numbered)]) is None
 
     def test_they_mix_with_others(self, prepared_360: Path, numbered: Path):
         parts = [{"name": "prepared", "root": str(prepared_360), "split": "train"},

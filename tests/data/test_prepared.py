@@ -15,7 +15,7 @@ import yaml
 from safetensors.numpy import load_file
 
 from r2flow.data.layouts import Drive
-from r2flow.data.opening import SOURCES, find_drives
+from r2flow.data.opening import SOURCES, Described, find_drives
 from r2flow.data.options import SourceOptions
 from r2flow.data.prepared import PreparedStore, plan_files, prepare, refuse_other_images
 from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
@@ -61,8 +61,8 @@ def make(folder: Path, plan: PreparedStore, **options) -> Path:
 
 
 def prepared_in(folder: Path, sensor: Sensor = SMALL, split=None, drives=None, reflectance=True, **how):
-    options = SourceOptions("prepared", str(folder), split, drives)
-    return SOURCES["prepared"].open(options, Reading(sensor, reflectance=reflectance, **how))
+    scans = Described(str(folder), SourceOptions("prepared", str(folder), split, drives))
+    return scans.kind.open(scans, Reading(sensor, reflectance=reflectance, **how))
 
 
 def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options) -> ScanFiles:
@@ -329,11 +329,11 @@ def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path, monkeypatch):
     monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))  # no pause
     out = tmp_path / "out"
     typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 2)
-    assert f"{out}: 6 scans in 3 shards, 0.0 MiB; reflectance as n/256" in r2flow(*typed, "--workers", 1).said
+    assert f"{out}: 6 scans in 3 shards, 0.0 MiB, reflectance as n/256" in r2flow(*typed, "--workers", 1).said
     for shard in (1, 2):
         (out / f"scans-{shard:06d}.safetensors").unlink()
     done = r2flow(*typed, "--workers", 1)
-    assert "6 scans in 3 shards (1 there already), 0.0 MiB" in done.said
+    assert "6 scans in 3 shards, 0.0 MiB, reflectance as n/256, 1 there already" in done.said
     assert "preparing 2/2 shards" in done.stderr
     source = prepared_in(out)
     assert np.abs(source[5] - read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))).max() <= 1e-3
@@ -385,4 +385,4 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
 def test_a_run_is_told_the_columns_too(wide, tmp_path):
     given = [*TINY, f"data.root={wide}", "trainer.max_steps=1", "trainer.fast_dev_run=true"]
     in_process(tmp_path, [*given, "data.reading.columns=[_,z,y,x,intensity,_]"])
-    assert "6 columns without names" in in_process(tmp_path, given, check=False).refusal
+    assert "6 columns, no" in in_process(tmp_path, given, check=False).refusal

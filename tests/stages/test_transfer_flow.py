@@ -326,10 +326,10 @@ def test_what_it_learns_from_lowers_the_loss(scans, monkeypatch):
     assert losses[-1] < losses[0] - 0.5
     assert all(p.grad is not None and p.grad.isfinite().all() for p in learner.parameters())
     counts: list[torch.Tensor] = []
-    monkeypatch.setattr("r2flow.generators.transfer.averaged", lambda count: counts.append(count) or count)
+    monkeypatch.setattr("r2flow.generators.transfer.mean_over_processes", lambda count: counts.append(count) or count)
     whole = learner.regression_loss(batch, u).item()
     halves = iter([count / 2 for count in counts] * 2)  # the mean over two devices, one with a scan, one with two
-    monkeypatch.setattr("r2flow.generators.transfer.averaged", lambda count: next(halves))
+    monkeypatch.setattr("r2flow.generators.transfer.mean_over_processes", lambda count: next(halves))
     parts = [learner.regression_loss({n: v[at] for n, v in batch.items()}, u[at]) for at in (slice(1), slice(1, 3))]
     assert sum(parts).item() / 2 == pytest.approx(whole, rel=1e-5)
 

@@ -413,7 +413,6 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
         ({"schedule": {"name": "cosine", "steps": 1}}, "steps: must be at least 2, found 1"),
         ({"schedule": {"name": "square_root_linear", "last": 2.0}}, r"last: must be in \(0, 1\), found 2"),
-        ({"schedule": {"name": "sigmoid", "start": 3.0}}, "log-SNRs must lie within 80 of 0"),
     ],
 )
 def test_sizes_that_cannot_work_are_one_line(change: dict[str, Any], said: str):
@@ -440,6 +439,8 @@ FULL = {"lidargen": 29_694_082, "lidm_autoencoder": 15_070_361, "r2dm": 31_099_6
 @pytest.mark.parametrize("name", FULL)
 def test_a_published_recipe_is_built(name: str, tmp_path: Path):
     options = ["data.root=/nowhere", "trainer.accelerator=cpu", f"run_dir={tmp_path}"]
+    if name != "lidm_autoencoder":
+        options.append("encoding.reflectance=true")  # or the scans decide it
     config = check(compose([f"experiment={name}", *options]))
     with torch.device("meta"):
         assert sum(p.numel() for p in build_generator({**config}).parameters()) == FULL[name]

@@ -43,8 +43,8 @@ def share_scale(readings: Mapping[str, Reading], most: int) -> dict[str, Reading
     """
     unknown = [spec for spec, reading in readings.items() if reading.reflectance_scale is None]
     paths = []
-    for options, file in map(parse, unknown):
-        paths += list_scans(file or options.folder, most)[0]
+    for scans in map(describe, unknown):
+        paths += list_scans(scans.file or scans.options.folder, most)[0]
     if not paths:
         return dict(readings)
     scale = estimated_scale(paths[0], readable(paths, readings[unknown[0]].columns))
