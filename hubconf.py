@@ -1,12 +1,26 @@
-"""torch.hub: `torch.hub.load("OWNER/r2flow", "street")`, or `torch.hub.load(FOLDER, "street", source="local")`."""
+"""torch.hub: `torch.hub.load("OWNER/r2flow", "street")`, or `torch.hub.load(FOLDER, "street",
+source="local")`.
+"""
 
 from pathlib import Path
 
-dependencies = ["torch", "numpy", "safetensors", "pydantic", "omegaconf", "yaml", "filelock", "rich"]
+dependencies = [
+    "torch",
+    "numpy",
+    "safetensors",
+    "pydantic",
+    "omegaconf",
+    "yaml",
+    "scipy",
+    "filelock",
+    "rich",
+]
 
 
 def street(device: str = "cpu"):
-    """The model that comes with the package; `.sample(4)` draws scans, `.generator` is the torch module."""
+    """The model that comes with the package; `.sample(4)` draws scans, `.generator` is the torch
+    module.
+    """
     return flow("street", device)
 
 

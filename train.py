@@ -1,4 +1,5 @@
-"""Train what the command line describes, as `r2flow train` does. With no arguments: the demo, `experiment=demo`.
+"""Train what the command line describes, as `r2flow train` does. With no arguments: the demo,
+`experiment=demo`.
 
     python train.py
     python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small
@@ -8,7 +9,8 @@
     python train.py -m backbone=hdit_tiny,hdit_small seed=1,2,3
     python train.py --plugin my.module stage=my_stage
 
-The same command again resumes from the run's last checkpoint. `--cfg job` shows every key, `--help` the choices.
+The same command again resumes from the run's last checkpoint. `--cfg job` shows every key, `--help`
+the choices.
 """
 
 from pathlib import Path

@@ -1,14 +1,17 @@
-"""How near the backbones come to this machine's matrix products: the share of their rate that each one reaches.
+"""How near the backbones come to this machine's matrix products: the share of their rate that each
+one reaches.
 
-A share is (2 x MACs / time) over the rate of a plain matrix product of the same type, measured next to it, so that
-it means the same on any machine and does not move with what else runs there. MACs by the rule of
-r2flow/backbones/cost.py, three times as many for forward and backward. Medians, one process.
+A share is (2 x MACs / time) over the rate of a plain matrix product of the same type, measured next
+to it, so that it means the same on any machine and does not move with what else runs there. MACs by
+the rule of r2flow/backbones/cost.py, three times as many for forward and backward. Medians, one
+process.
 
-python benchmarks/backbones.py                                  # forward and backward, eager, the three base models
-python benchmarks/backbones.py --backbone hdit --mode compiled-bfloat16
-python benchmarks/backbones.py --backbone hdit --mode float32 bfloat16 --threads 1 --profile  # and where the time goes
-python benchmarks/backbones.py --experiment dusty2 --options data.batch_size=4  # a step of training, on simulated scans
-python benchmarks/backbones.py --device cuda --batch 1 8 64 --attention flex tiles --mode compiled-bfloat16
+python benchmarks/backbones.py                                  # forward and backward, eager, the
+three base models python benchmarks/backbones.py --backbone hdit --mode compiled-bfloat16
+python benchmarks/backbones.py --backbone hdit --mode float32 bfloat16 --threads 1 --profile  # and
+where the time goes python benchmarks/backbones.py --experiment dusty2 --options data.batch_size=4
+# a step of training, on simulated scans python benchmarks/backbones.py --device cuda --batch 1 8 64
+--attention flex tiles --mode compiled-bfloat16
 """
 
 import argparse
@@ -29,7 +32,14 @@ from r2flow.lidar.sensors import build_sensor
 from r2flow.reports.backbones import RULE, count_macs, count_parameters
 from r2flow.training import build, compose, fit
 
-MODES = ("float32", "bfloat16", "compiled-float32", "compiled-bfloat16", "training-float32", "training-bfloat16")
+MODES = (
+    "float32",
+    "bfloat16",
+    "compiled-float32",
+    "compiled-bfloat16",
+    "training-float32",
+    "training-bfloat16",
+)
 ORDER = {"cpu": 2048, "cuda": 8192}  # of the square matrices whose product sets the rate
 
 
@@ -43,7 +53,9 @@ def seconds(work: Callable[[], object], device: str) -> float:
 
 
 def built(config: str, rows: int, columns: int, attention: str, device: str) -> Backbone:
-    """The backbone of a configuration on the paper's sensor; weights that start at zero are drawn instead."""
+    """The backbone of a configuration on the paper's sensor; weights that start at zero are drawn
+    instead.
+    """
     options = configurations()[config]
     if options["name"] == "hdit":
         options["attention"] = attention
@@ -58,9 +70,11 @@ def built(config: str, rows: int, columns: int, attention: str, device: str) -> 
 def measured(
     model: Backbone, mode: str, batch: int, repeats: int, device: str, profile: bool = False
 ) -> dict[str, Any]:
-    """Median milliseconds of one call and median share of the matrix product's rate timed beside it.
+    """Median milliseconds of one call and median share of the matrix product's rate timed beside
+    it.
 
-    With `profile` the share of its time of each operation too, by torch's profiler, of one more call.
+    With `profile` the share of its time of each operation too, by torch's profiler, of one more
+    call.
     """
     kind, _, name = mode.rpartition("-")
     dtype = getattr(torch, name)
@@ -124,9 +138,11 @@ class Stopwatch(L.Callback):
 
 
 def trained(experiment: str, repeats: int, more: list[str]) -> dict[str, Any]:
-    """Processor seconds of a step of an experiment as published but for its scans, and the process's peak memory.
+    """Processor seconds of a step of an experiment as published but for its scans, and the
+    process's peak memory.
 
-    The first step, which warms up, is left out. Give one thread, and one experiment a process: memory is its peak.
+    The first step, which warms up, is left out. Give one thread, and one experiment a process:
+    memory is its peak.
     """
     with tempfile.TemporaryDirectory() as folder:
         options = [
@@ -150,19 +166,29 @@ def trained(experiment: str, repeats: int, more: list[str]) -> dict[str, Any]:
 
 def main() -> None:
     """Print the table, or the same as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--backbone", nargs="+", default=["hdit", "efficient_unet", "adm_unet"])
     parser.add_argument("--experiment", help="time a step of this experiment's training instead")
-    parser.add_argument("--options", nargs="*", default=[], help="and these config keys, as data.batch_size=4")
-    parser.add_argument("--mode", nargs="+", choices=MODES, default=["float32", "bfloat16", "training-float32"])
-    parser.add_argument("--attention", nargs="+", default=["auto"], help="hdit's attention backends")
+    parser.add_argument(
+        "--options", nargs="*", default=[], help="and these config keys, as data.batch_size=4"
+    )
+    parser.add_argument(
+        "--mode", nargs="+", choices=MODES, default=["float32", "bfloat16", "training-float32"]
+    )
+    parser.add_argument(
+        "--attention", nargs="+", default=["auto"], help="hdit's attention backends"
+    )
     parser.add_argument("--batch", nargs="+", type=int, default=[1])
     parser.add_argument("--rows", type=int, default=64)
     parser.add_argument("--columns", type=int, default=1024)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--device", choices=list(ORDER), default="cpu")
-    parser.add_argument("--profile", action="store_true", help="and where the time goes, by operation")
+    parser.add_argument(
+        "--profile", action="store_true", help="and where the time goes, by operation"
+    )
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -172,7 +198,9 @@ def main() -> None:
     found = []
     if not options.json:
         print(f"{RULE}\ntorch {torch.__version__}, {options.device}, {options.threads} threads")
-        print(f"{'backbone':22s} {'mode':18s} {'attention':9s} batch {'ms':>9s} {'share':>6s} {'first s':>8s} peak GiB")
+        print(
+            f"{'backbone':22s} {'mode':18s} {'attention':9s} batch {'ms':>9s} {'share':>6s} {'first s':>8s} peak GiB"
+        )
     for config in options.backbone:
         for attention in options.attention:
             model = built(config, options.rows, options.columns, attention, options.device)
@@ -181,7 +209,9 @@ def main() -> None:
                     row = {"name": config, "mode": mode, "attention": attention, "batch": batch}
                     try:
                         model.train("training" in mode)
-                        row |= measured(model, mode, batch, options.repeats, options.device, options.profile)
+                        row |= measured(
+                            model, mode, batch, options.repeats, options.device, options.profile
+                        )
                     except InputError as error:
                         row["error"] = str(error)
                     row |= {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9}
@@ -189,7 +219,11 @@ def main() -> None:
                     if not options.json:
                         print(line(row), flush=True)
                         spent = sorted(row.get("operations", {}).items(), key=lambda one: -one[1])
-                        print("".join(f"    {share:6.1%}  {name}\n" for name, share in spent[:12]), end="", flush=True)
+                        print(
+                            "".join(f"    {share:6.1%}  {name}\n" for name, share in spent[:12]),
+                            end="",
+                            flush=True,
+                        )
     if options.json:
         print(json.dumps(found, indent=2))
 

@@ -1,9 +1,11 @@
 """How far the methods of completion are from the posterior, on problems whose posterior is known.
 
-The prior is a Gaussian with a dense covariance, 32 values on a ring with a standard deviation of 0.5, with its exact
-velocity. A method is then affine in all noise that it draws: its mean and its covariance are computed, not sampled.
-Columns: evaluations of a scan. Figures: Wasserstein-2 distance of the Gaussians, over the root of the posterior's
-total variance; in brackets the error of the mean by the same measure, and the spread (1 is right).
+The prior is a Gaussian with a dense covariance, 32 values on a ring with a standard deviation of
+0.5, with its exact velocity. A method is then affine in all noise that it draws: its mean and its
+covariance are computed, not sampled.
+Columns: evaluations of a scan. Figures: Wasserstein-2 distance of the Gaussians, over the root of
+the posterior's total variance; in brackets the error of the mean by the same measure, and the
+spread (1 is right).
 
 python benchmarks/completion.py                        # some minutes on one core
 python benchmarks/completion.py --cases sector --methods mmps,replace
@@ -33,7 +35,8 @@ def ring(width: int = WIDTH, std: float = 0.5, length: float = 3.0) -> Tensor:
 
 
 class Correlated:
-    """x_1 from a mixture of Gaussians with dense covariances S_i: what is measured of some elements says of others.
+    """x_1 from a mixture of Gaussians with dense covariances S_i: what is measured of some elements
+    says of others.
 
     As in `GaussianMixture`, with matrices: in component i, x_t has mean t m_i and covariance
     C_i = (1 - t)^2 + t^2 S_i, and x_1 - x_0 the mean m_i + (t S_i - (1 - t)) C_i^-1 (x - t m_i).
@@ -46,14 +49,20 @@ class Correlated:
 
     def __init__(self, means: Tensor, covariances: Tensor, weights: Tensor | None = None) -> None:
         self.means, self.covariances = means, covariances
-        self.weights = torch.full((len(means),), 1 / len(means)).to(means) if weights is None else weights
+        self.weights = (
+            torch.full((len(means),), 1 / len(means)).to(means) if weights is None else weights
+        )
         self.values, self.vectors = torch.linalg.eigh(covariances)
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         t, offset, (means, values, vectors) = self._offset(t, x)
         variance = (1 - t) ** 2 + t**2 * values  # (K, B, D), as all that follows
-        slopes = means + torch.einsum("kbi,kji->kbj", (t * values - (1 - t)) / variance * offset, vectors)
-        scores = self.weights.to(x).log()[:, None] - 0.5 * (variance.log() + offset**2 / variance).sum(-1)
+        slopes = means + torch.einsum(
+            "kbi,kji->kbj", (t * values - (1 - t)) / variance * offset, vectors
+        )
+        scores = self.weights.to(x).log()[:, None] - 0.5 * (
+            variance.log() + offset**2 / variance
+        ).sum(-1)
         return (scores.softmax(0)[..., None] * slopes).sum(0).view(x.shape)
 
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
@@ -77,9 +86,13 @@ class Correlated:
         spread = forward @ seen + torch.diag_embed(torch.as_tensor(sigma).to(y).expand(len(y)) ** 2)
         gain = torch.linalg.solve(spread, seen.mT).mT
         off = y - self.means @ forward.T
-        likelihood = torch.distributions.MultivariateNormal(torch.zeros_like(y), spread).log_prob(off)
+        likelihood = torch.distributions.MultivariateNormal(torch.zeros_like(y), spread).log_prob(
+            off
+        )
         means = self.means + torch.einsum("kdm,km->kd", gain, off)
-        return Correlated(means, self.covariances - gain @ seen.mT, (self.weights.log() + likelihood).softmax(0))
+        return Correlated(
+            means, self.covariances - gain @ seen.mT, (self.weights.log() + likelihood).softmax(0)
+        )
 
     def sample(self, count: int, draws: torch.Generator) -> Tensor:
         """x_1, (count, D)."""
@@ -89,7 +102,9 @@ class Correlated:
         return self.means[chosen] + torch.einsum("bi,bji->bj", scaled, self.vectors[chosen])
 
     def _offset(self, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """t (1, B or 1, 1), x_t - t m_i along the eigenvectors, (K, B, D), and the components in x's type."""
+        """t (1, B or 1, 1), x_t - t m_i along the eigenvectors, (K, B, D), and the components in
+        x's type.
+        """
         means, values, vectors = (part.to(x) for part in (self.means, self.values, self.vectors))
         t = t.to(x).reshape(1, -1, 1)
         offset = torch.einsum("kbj,kji->kbi", x.flatten(1) - t * means[:, None], vectors)
@@ -142,7 +157,9 @@ def map_of(prior: Correlated) -> MeanVelocity:
     return u
 
 
-def moments(u: MeanVelocity, method: str, case: Case, y: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+def moments(
+    u: MeanVelocity, method: str, case: Case, y: Tensor, times: Tensor
+) -> tuple[Tensor, Tensor]:
     """Means (B, D) for measurements (B, M), and the covariance (D, D), exact for a linear u."""
     drawn = [0]
     nothing = torch.zeros(len(y), case.width, dtype=torch.float64)
@@ -160,7 +177,9 @@ def moments(u: MeanVelocity, method: str, case: Case, y: Tensor, times: Tensor) 
         e[j * case.width : (j + 1) * case.width] = unit
         return e
 
-    x_1 = build_sampler(method).given(u, noise(0), *case.measurement(y[:1].expand(rows, -1)), times, noise)
+    x_1 = build_sampler(method).given(
+        u, noise(0), *case.measurement(y[:1].expand(rows, -1)), times, noise
+    )
     effect = x_1 - means[:1]
     return means, effect.T @ effect
 
@@ -176,8 +195,12 @@ def bures(a: Tensor, b: Tensor) -> Tensor:
     return (torch.trace(a + b) - 2 * torch.trace(root(root(a) @ b @ root(a)))).clamp(min=0)
 
 
-def distance(means: Tensor, covariance: Tensor, posteriors: list[Correlated], case: Case) -> tuple[float, float, float]:
-    """Wasserstein-2 distance and the mean's error over the root of the posterior's total variance, and the spread."""
+def distance(
+    means: Tensor, covariance: Tensor, posteriors: list[Correlated], case: Case
+) -> tuple[float, float, float]:
+    """Wasserstein-2 distance and the mean's error over the root of the posterior's total variance,
+    and the spread.
+    """
     k, exact = case.unknown, posteriors[0].covariances[0][case.unknown][:, case.unknown]
     total = torch.trace(exact)
     off = (means - torch.cat([p.means for p in posteriors]))[:, k].square().sum(1).mean()
@@ -213,13 +236,17 @@ def table(name: str, methods: list[str], evaluations: list[int], grid: str) -> N
                     cells.append(f"{'-':19s}")
                     continue
                 times = named_grid(grid)(0.0, 1.0, steps)
-                whole, mean, spread = distance(*moments(u, method, case, y, times), posteriors, case)
+                whole, mean, spread = distance(
+                    *moments(u, method, case, y, times), posteriors, case
+                )
                 cells.append(f"{whole:5.3f} ({mean:5.3f}, {spread:4.2f})")
             print(f"  {method + kind:20s}" + "  ".join(cells), flush=True)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--methods", default=METHODS_SHOWN)
     parser.add_argument("--evaluations", default="8,16,32,64,256")

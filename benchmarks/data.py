@@ -3,8 +3,8 @@
 python benchmarks/data.py
 python benchmarks/data.py --layout kitti_360 --root /data/KITTI-360 --split test
 
-Every way is measured in this one process, all of them by turns, medians of the processor's time (all files lie in the
-page cache): a ratio holds on a busy machine, too.
+Every way is measured in this one process, all of them by turns, medians of the processor's time
+(all files lie in the page cache): a ratio holds on a busy machine, too.
 """
 
 import argparse
@@ -33,7 +33,9 @@ HDL64E = SENSORS["hdl64e"]
 
 
 def by_turns(ways: dict[str, Callable[[int], object]], times: int, pieces: int) -> dict[str, float]:
-    """Median milliseconds of way(piece) on the processor, the ways by turns, after one unmeasured round of all."""
+    """Median milliseconds of way(piece) on the processor, the ways by turns, after one unmeasured
+    round of all.
+    """
     taken: dict[str, list[float]] = {name: [] for name in ways}
     for turn in range(-pieces, times):
         for name, way in ways.items():
@@ -45,7 +47,8 @@ def by_turns(ways: dict[str, Callable[[int], object]], times: int, pieces: int) 
 
 
 def plain_projection(path: str | Path) -> np.ndarray:
-    """The published image of a .bin the plain way: all points sorted by depth, the nearest written last.
+    """The published image of a .bin the plain way: all points sorted by depth, the nearest written
+    last.
 
     Rows and columns are clamped, ranges outside 1.45 to 80 m zeroed afterwards.
     """
@@ -55,7 +58,9 @@ def plain_projection(path: str | Path) -> np.ndarray:
     elevation = np.arcsin(z[:, None] / (depth + 1e-8)) + np.deg2rad(25.0)
     h = 1 - elevation / np.deg2rad(28.0)
     w = (-np.arctan2(y, x)[:, None] / np.pi + 1) / 2 % 1
-    grid = np.concatenate([np.clip(np.floor(h * 64), 0, 63), np.clip(np.floor(w * 1024), 0, 1023)], axis=1)
+    grid = np.concatenate(
+        [np.clip(np.floor(h * 64), 0, 63), np.clip(np.floor(w * 1024), 0, 1023)], axis=1
+    )
     valid = (depth >= 1.45) & (depth <= 80.0)
     channels = np.concatenate([points, depth, valid], axis=1)
     order = np.argsort(-depth.squeeze(1))
@@ -66,7 +71,9 @@ def plain_projection(path: str | Path) -> np.ndarray:
 
 
 def simulated_files(folder: Path, num: int) -> list[Path]:
-    """Simulated scans as KITTI .bin files, of twice the image's resolution, so that pixels compete as in real ones."""
+    """Simulated scans as KITTI .bin files, of twice the image's resolution, so that pixels compete
+    as in real ones.
+    """
     fine = HDL64E.resized(64, 2048)
     paths = [folder / f"{index:06d}.bin" for index in range(num)]
     for index, path in enumerate(paths):
@@ -91,7 +98,9 @@ def measure_projection(paths: Sequence[Path], times: int) -> None:
     points = int(np.mean([path.stat().st_size // 16 for path in paths]))
     print(f"\nread and project a scan of about {points} points ({len(paths)} scans, {times} turns)")
     show(taken, "plain numpy")
-    print(f"pixels in which the plain way and the reference convention differ: {1 - np.mean(same):.4%}")
+    print(
+        f"pixels in which the plain way and the reference convention differ: {1 - np.mean(same):.4%}"
+    )
 
 
 def measure_shards(paths: Sequence[Path], folder: Path, times: int) -> None:
@@ -101,7 +110,11 @@ def measure_shards(paths: Sequence[Path], folder: Path, times: int) -> None:
     chosen.mkdir()
     for number, path in enumerate(paths):
         (chosen / f"{number:06d}.bin").symlink_to(path.resolve())
-    prepare(plan_files(folder / "prepared", "folder", chosen, find_drives("folder", chosen), Reading(HDL64E)))
+    prepare(
+        plan_files(
+            folder / "prepared", "folder", chosen, find_drives("folder", chosen), Reading(HDL64E)
+        )
+    )
     options = SourceOptions("prepared", str(folder / "prepared"))
     prepared = SOURCES["prepared"].open(options, Reading(HDL64E, reflectance=True))
     arrays = [folder / f"{i}.npy" for i in range(len(paths))]
@@ -131,13 +144,20 @@ def show(taken: dict[str, float], against: str) -> None:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", type=Path, help="a data set of KITTI .bin scans; simulated ones if left out")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--root", type=Path, help="a data set of KITTI .bin scans; simulated ones if left out"
+    )
     parser.add_argument("--layout", default="folder", help="its layout")
     parser.add_argument("--split", help="a part of the layout's split; all if left out")
     parser.add_argument("--scans", type=int, default=8, help="scans of it to measure")
     parser.add_argument(
-        "--times", type=int, default=40, help="turns of the projection; ten times as many of the shards"
+        "--times",
+        type=int,
+        default=40,
+        help="turns of the projection; ten times as many of the shards",
     )
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -146,7 +166,12 @@ def main() -> None:
         root, layout = options.root or folder / "simulated", options.layout
         if options.root is None:
             simulated_files(root, options.scans)
-        found = [Path(p) for d in find_drives(layout, root, options.split) for p in d.scans if p.endswith(".bin")]
+        found = [
+            Path(p)
+            for d in find_drives(layout, root, options.split)
+            for p in d.scans
+            if p.endswith(".bin")
+        ]
         paths = [found[i] for i in spread(len(found), options.scans)]
         measure_projection(paths, options.times)
         measure_shards(paths, folder, options.times)

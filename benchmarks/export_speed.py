@@ -1,4 +1,5 @@
-"""Seconds a scan of an exported flow, beside the flow itself and its network compiled: medians, taken in turns.
+"""Seconds a scan of an exported flow, beside the flow itself and its network compiled: medians,
+taken in turns.
 
 python benchmarks/export_speed.py street --sampler jump --steps 2 --repeats 7
 """
@@ -21,7 +22,9 @@ from r2flow.noise import Draws
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("flow")
-    parser.add_argument("--sampler", help="one that can be exported; the flow's for that many steps if left out")
+    parser.add_argument(
+        "--sampler", help="one that can be exported; the flow's for that many steps if left out"
+    )
     parser.add_argument("--steps", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--threads", type=int, default=2)
@@ -41,7 +44,8 @@ def main() -> None:
             start = time.perf_counter()
             written = export(loaded, Path(folder, f"flow.{kind}"), sampler)
             print(
-                f"{kind}: written in {time.perf_counter() - start:.0f} s, {compare(loaded, written, sampler)}",
+                f"{kind}: written in {time.perf_counter() - start:.0f} s, "
+                f"{compare(loaded, written, sampler)}",
                 flush=True,
             )
             ways[kind] = runner(written.path, noise)

@@ -1,4 +1,5 @@
-"""How fast the simulator is: scans per second on one core (it uses no more), and where the time goes.
+"""How fast the simulator is: scans per second on one core (it uses no more), and where the time
+goes.
 
 Times are the process's own, so that what else runs on the machine counts for little.
 
@@ -31,7 +32,9 @@ def milliseconds(work: Callable[[int], object], times: int) -> float:
 
 
 def parts(sensor: Sensor, times: int) -> dict[str, float]:
-    """Median milliseconds of drawing the scene, of casting its rays and of what the sensor makes of them."""
+    """Median milliseconds of drawing the scene, of casting its rays and of what the sensor makes of
+    them.
+    """
     rays = Rays(lasers_of(sensor), sensor.columns, sensor.height)
     scenes = [draw_scene(generator(0, "simulator", index)) for index in range(times)]
     rng = np.random.default_rng(0)
@@ -39,13 +42,17 @@ def parts(sensor: Sensor, times: int) -> dict[str, float]:
     return {
         "scene": milliseconds(lambda index: draw_scene(generator(0, "simulator", index)), times),
         "rays": milliseconds(lambda index: cast(scenes[index], rays, rng), times),
-        "returns": milliseconds(lambda index: report(sensor, rays, hits[index], scenes[index].rig, rng), times),
+        "returns": milliseconds(
+            lambda index: report(sensor, rays, hits[index], scenes[index].rig, rng), times
+        ),
     }
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--scans", type=int, default=40, help="scans per measurement")
     times = parser.parse_args().scans
     sensors = [sensor for _, sensor in SENSORS.items()]

@@ -1,9 +1,10 @@
-"""The adaptive solvers beside torchdiffeq, scipy and diffrax: error at t = 1 against evaluations of the velocity.
+"""The adaptive solvers beside torchdiffeq, scipy and diffrax: error at t = 1 against evaluations of
+the velocity.
 
-Mixed batch: 16 scenes of exact problems (8 straight, 4 smooth, 3 two-mode, 1 ray-drop), evaluations summed over scenes,
-against torchdiffeq's dopri5 on the batch as one state. Single scenes: scipy and diffrax, which get the same relative
-and absolute tolerance and choose their own first step. Errors are RMS in model space, against the exact end; for a
-trained flow against dopri5 at 1e-6.
+Mixed batch: 16 scenes of exact problems (8 straight, 4 smooth, 3 two-mode, 1 ray-drop), evaluations
+summed over scenes, against torchdiffeq's dopri5 on the batch as one state. Single scenes: scipy and
+diffrax, which get the same relative and absolute tolerance and choose their own first step. Errors
+are RMS in model space, against the exact end; for a trained flow against dopri5 at 1e-6.
 
 python -m pip install scipy diffrax
 python benchmarks/solvers.py                                        # exact problems alone, a minute
@@ -27,12 +28,18 @@ from r2flow.reports.tables import table
 
 ELEMENTS = 256
 TOLERANCES = (1e-2, 1e-3, 1e-4)
-PROBLEMS: dict[str, Problem] = {"Gaussian": Gaussian(), "two modes": TwoModes(), "ray-drop": RayDrop()}
-Solve = Callable[[Velocity, Tensor, float], tuple[Tensor, int]]  # of (velocity, x_0, tolerance): x_1 and evaluations
+PROBLEMS: dict[str, Problem] = {
+    "Gaussian": Gaussian(),
+    "two modes": TwoModes(),
+    "ray-drop": RayDrop(),
+}
+# of (velocity, x_0, tolerance): x_1 and evaluations
+Solve = Callable[[Velocity, Tensor, float], tuple[Tensor, int]]
 
 
 class Mixed(Problem):
-    """A batch in which every scene has a problem of its own; `select` is for solvers whose scenes leave the batch.
+    """A batch in which every scene has a problem of its own; `select` is for solvers whose scenes
+    leave the batch.
 
     Args:
         problems: One for each scene.
@@ -93,7 +100,9 @@ def by_torchdiffeq(velocity: Velocity, x: Tensor, tolerance: float) -> tuple[Ten
     def flat(t: Tensor, y: Tensor) -> Tensor:
         return torch.as_tensor(field(float(t), y)).to(y)
 
-    end = torchdiffeq.odeint(flat, x.reshape(-1), span, rtol=tolerance, atol=tolerance, method="dopri5")[-1]
+    end = torchdiffeq.odeint(
+        flat, x.reshape(-1), span, rtol=tolerance, atol=tolerance, method="dopri5"
+    )[-1]
     return end.reshape(x.shape), field.calls * len(x)
 
 
@@ -117,7 +126,9 @@ def by_diffrax(solver: str) -> Solve:
 
         jax.config.update("jax_enable_x64", True)
         field, shape = Counted(velocity, x), jax.ShapeDtypeStruct((x.numel(),), jnp.float64)
-        term = diffrax.ODETerm(lambda t, y, _: jax.pure_callback(lambda t, y: field(t, np.array(y)), shape, t, y))
+        term = diffrax.ODETerm(
+            lambda t, y, _: jax.pure_callback(lambda t, y: field(t, np.array(y)), shape, t, y)
+        )
         end = diffrax.diffeqsolve(
             term, getattr(diffrax, solver)(), 0.0, 1.0, None, jnp.asarray(x.reshape(-1).double().numpy()),
             stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance), max_steps=None,
@@ -143,15 +154,22 @@ def errors(x: Tensor, exact: Tensor) -> Tensor:
 
 
 def mixed_batch(last: list[Problem], seeds: int) -> list[list[str]]:
-    """Share of torchdiffeq's evaluations, and the error of the hardest scene, medians over the seeds."""
+    """Share of torchdiffeq's evaluations, and the error of the hardest scene, medians over the
+    seeds.
+    """
     batch = Mixed([Straight()] * 8 + [Gaussian()] * 4 + [TwoModes()] * (4 - len(last)) + last)
     rows = []
     for tolerance in (1e-3, 1e-5):
         shares, pairs = [], []
         for seed in range(seeds):
-            x_0 = torch.stack([standard_normal((ELEMENTS,), seed, "evaluation", scene) for scene in range(16)])
+            x_0 = torch.stack(
+                [standard_normal((ELEMENTS,), seed, "evaluation", scene) for scene in range(16)]
+            )
             exact = batch.solution(x_0, 1.0)
-            (a, spent), (b, usual) = ours("dopri5")(batch, x_0, tolerance), by_torchdiffeq(batch, x_0, tolerance)
+            (a, spent), (b, usual) = (
+                ours("dopri5")(batch, x_0, tolerance),
+                by_torchdiffeq(batch, x_0, tolerance),
+            )
             shares.append(spent / usual)
             pairs.append([errors(x, exact).max().item() for x in (a, b)])
         hardest = [f"{statistics.median(side):.1e}" for side in zip(*pairs, strict=True)]
@@ -160,7 +178,9 @@ def mixed_batch(last: list[Problem], seeds: int) -> list[list[str]]:
 
 
 def single_scenes(velocity: Velocity, scenes: list[tuple[Tensor, Tensor]]) -> list[list[str]]:
-    """Evaluations and error of each solver at each tolerance, medians over (start, end) of each scene."""
+    """Evaluations and error of each solver at each tolerance, medians over (start, end) of each
+    scene.
+    """
     rows = []
     for name, run in SOLVERS.items():
         cells = []
@@ -174,17 +194,31 @@ def single_scenes(velocity: Velocity, scenes: list[tuple[Tensor, Tensor]]) -> li
 
 @torch.no_grad()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--checkpoint", type=Path, default=None)
     parser.add_argument("--num", type=int, default=8, help="Scenes.")
     parser.add_argument("--seeds", type=int, default=20, help="Of the mixed batch.")
     given = parser.parse_args()
-    heading = ["solver", "tolerance", "evaluations / torchdiffeq's", "error of the hardest scene", "torchdiffeq's"]
-    for name, last in {"mixed batch": [RayDrop()], "with a jump in time": [RayDrop(), Discontinuous()]}.items():
+    heading = [
+        "solver",
+        "tolerance",
+        "evaluations / torchdiffeq's",
+        "error of the hardest scene",
+        "torchdiffeq's",
+    ]
+    for name, last in {
+        "mixed batch": [RayDrop()],
+        "with a jump in time": [RayDrop(), Discontinuous()],
+    }.items():
         print(f"\n{name}\n{table(mixed_batch(last, given.seeds), heading)}", flush=True)
     heading = ["solver", *(f"{tolerance:g}, evaluations: error" for tolerance in TOLERANCES)]
     for name, problem in PROBLEMS.items():
-        starts = [standard_normal((ELEMENTS,), 0, "evaluation", k)[None].double() for k in range(given.num)]
+        starts = [
+            standard_normal((ELEMENTS,), 0, "evaluation", k)[None].double()
+            for k in range(given.num)
+        ]
         rows = single_scenes(problem, [(x, problem.solution(x, 1.0)) for x in starts])
         print(f"\n{name}\n{table(rows, heading)}", flush=True)
     if given.checkpoint:
@@ -192,7 +226,9 @@ def main() -> None:
         velocity: Velocity = flow.velocity  # type: ignore[assignment]
         starts = [Draws(0, range(k, k + 1)).start(flow.noise_shape) for k in range(given.num)]
         scenes = [(x, solve(velocity, x, method="dopri5", tolerance=1e-6).x) for x in starts]
-        print(f"\n{given.checkpoint}\n{table(single_scenes(velocity, scenes), heading)}", flush=True)
+        print(
+            f"\n{given.checkpoint}\n{table(single_scenes(velocity, scenes), heading)}", flush=True
+        )
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""Checks that every command of the README and of the pages still parses: its verb and options, or the config that its
-overrides compose. Nothing is run: python docs/commands.py
+"""Checks that every command of the README and of the pages still parses: its verb and options, or
+the config that its overrides compose. Nothing is run: python docs/commands.py
 """
 
 import argparse
@@ -27,7 +27,9 @@ BLOCK = re.compile(r"^```sh\n(.*?)^```", re.M | re.S)
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """The words of each command of this project in the sh blocks of a page, without what launches it."""
+    """The words of each command of this project in the sh blocks of a page, without what launches
+    it.
+    """
     for block in BLOCK.findall(text):
         for line in block.replace("\\\n", " ").splitlines():
             for one in re.split(r"&&|\|", line):
@@ -84,7 +86,9 @@ def main() -> None:
                     check(words)
                 except (InputError, HydraException, argparse.ArgumentError, USAGE_ERROR) as error:
                     said = in_one_line(error) if isinstance(error, HydraException) else error
-                    wrong.append(f"{page.relative_to(DOCS.parent)}: r2flow {shlex.join(words)}\n    {said}")
+                    wrong.append(
+                        f"{page.relative_to(DOCS.parent)}: r2flow {shlex.join(words)}\n    {said}"
+                    )
     print("\n".join(wrong) or f"{count} commands parse.")
     sys.exit(bool(wrong))
 

@@ -1,7 +1,7 @@
 """The site: python -m sphinx -W -b html docs site
 
-Sphinx with furo, and not mkdocs: its search works from a folder on disk, no page loads anything from elsewhere, and one
-tool holds links, docstrings and the executed notebook to account.
+Sphinx with furo, and not mkdocs: its search works from a folder on disk, no page loads anything
+from elsewhere, and one tool holds links, docstrings and the executed notebook to account.
 """
 
 import importlib
@@ -46,13 +46,19 @@ def write_api() -> None:
     PAGES.mkdir(exist_ok=True)
     for room in ROOMS:
         top = importlib.import_module(".".join(filter(None, ("r2flow", room))))
-        below = pkgutil.walk_packages(top.__path__, f"{top.__name__}.") if room and hasattr(top, "__path__") else ()
+        below = (
+            pkgutil.walk_packages(top.__path__, f"{top.__name__}.")
+            if room and hasattr(top, "__path__")
+            else ()
+        )
         names = [
             top.__name__,
             *(module.name for module in below if module.name not in EXTRAS),
         ]
         parts = [f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n```\n" for name in names]
-        (PAGES / f"{top.__name__}.md").write_text("\n".join([f"# {top.__name__}\n", *parts]), encoding="utf-8")
+        (PAGES / f"{top.__name__}.md").write_text(
+            "\n".join([f"# {top.__name__}\n", *parts]), encoding="utf-8"
+        )
 
 
 write_api()
@@ -61,7 +67,9 @@ NAME = re.compile(r"[A-Za-z_][\w.]*")
 
 
 def from_markdown(_app, _what, _name, _object, _options, lines):
-    """Docstrings are Markdown, autodoc reads reStructuredText: `names` become links, the rest loses its stars."""
+    """Docstrings are Markdown, autodoc reads reStructuredText: `names` become links, the rest loses
+    its stars.
+    """
 
     def part(text):
         if text.startswith("`"):

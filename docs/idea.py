@@ -1,7 +1,7 @@
 """Draws docs/images/idea.svg, a rectified flow of one number: python docs/idea.py
 
-The data are two groups of numbers, so that the velocity of the 1-RF and its paths are known by formula. Paths of a
-number cannot cross, and so the 2-RF is exactly straight.
+The data are two groups of numbers, so that the velocity of the 1-RF and its paths are known by
+formula. Paths of a number cannot cross, and so the 2-RF is exactly straight.
 """
 
 from pathlib import Path
@@ -20,23 +20,32 @@ NOISE, DATA, PATH, STEP = "#4a7fc1", "#2f9e62", "#9aa5b1", "#d9480f"
 FLOW = TwoModes(apart=1.6, std=0.3)
 START = 0.22  # of the path that is followed in steps
 
-plt.rcParams.update({"svg.hashsalt": "r2flow", "svg.fonttype": "none", "font.size": 11, "axes.titlesize": 12.5})
+plt.rcParams.update(
+    {"svg.hashsalt": "r2flow", "svg.fonttype": "none", "font.size": 11, "axes.titlesize": 12.5}
+)
 
 
 def euler(x: float, steps: int) -> list[float]:
     """States after 0, 1, ..., `steps` even steps along the velocity."""
     states = [x]
     for i in range(steps):
-        t, state = torch.tensor(i / steps, dtype=torch.float64), torch.tensor([states[-1]], dtype=torch.float64)
+        t, state = (
+            torch.tensor(i / steps, dtype=torch.float64),
+            torch.tensor([states[-1]], dtype=torch.float64),
+        )
         states.append(states[-1] + float(FLOW(t, state)) / steps)
     return states
 
 
 def main() -> None:
-    figure, (learn, draw, straight) = plt.subplots(1, 3, figsize=(11, 3.7), sharey=True, layout="constrained")
+    figure, (learn, draw, straight) = plt.subplots(
+        1, 3, figsize=(11, 3.7), sharey=True, layout="constrained"
+    )
     generator = torch.Generator().manual_seed(3)
     noise = torch.randn(24, generator=generator, dtype=torch.float64)
-    data = 0.3 * torch.randn(24, generator=generator, dtype=torch.float64) + torch.tensor([-1.6, 1.6]).repeat(12)
+    data = 0.3 * torch.randn(24, generator=generator, dtype=torch.float64) + torch.tensor(
+        [-1.6, 1.6]
+    ).repeat(12)
     starts = torch.linspace(-1.9, 1.9, 20, dtype=torch.float64)
     times = torch.linspace(0, 1, 49)
     paths = torch.stack([FLOW.solution(starts, float(t)) for t in times])
@@ -49,7 +58,9 @@ def main() -> None:
     lines(learn, times[[0, -1]], torch.stack([noise, data]))
     learn.set_title("1. Learn from straight lines")
     lines(draw, times, paths)
-    exact = [float(FLOW.solution(torch.tensor([START], dtype=torch.float64), float(t))) for t in times]
+    exact = [
+        float(FLOW.solution(torch.tensor([START], dtype=torch.float64), float(t))) for t in times
+    ]
     draw.plot(times, exact, color=STEP, lw=1.5, ls=":")
     draw.plot([0, 0.5, 1], euler(START, 2), color=STEP, marker="o", lw=2)
     draw.text(0.97, -0.1, "2 steps miss the end", ha="right", va="center", color=STEP)

@@ -1,4 +1,6 @@
-"""Checks how the pages are written: sentences, lines, dates and seeds, words to avoid. python docs/prose.py"""
+"""Checks how the pages are written: sentences, lines, dates and seeds, words to avoid. python
+docs/prose.py
+"""
 
 import re
 import sys
@@ -8,10 +10,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RESULTS = {"results.md", "street.md", "densify.md", "CHANGELOG.md"}  # where measurements belong
-WORDS, TABLE, LINE = 30, 120, 200  # of a sentence; characters of a row of a table and of another line
+# of a sentence; characters of a row of a table and of another line
+WORDS, TABLE, LINE = 30, 120, 200
 DATE = re.compile(r"\b20\d\d-\d\d-\d\d\b|\bseeds? \d")
 AVOID = re.compile(
-    r"\b(twin|goes on|go on|mended|knows nothing|has no [a-z]+ of its own|of which nothing|is none|are none)\b", re.I
+    r"\b(twin|goes on|go on|mended|knows nothing|has no [a-z]+ of its own|of which nothing|is "
+    r"none|are none)\b",
+    re.I,
 )
 
 

@@ -17,9 +17,9 @@ import pytest
 import torch
 from hydra._internal.hydra import Hydra
 from matplotlib.figure import Figure
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
 from r2flow import cli, errors
-from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.data.opening import find_drives
 from r2flow.data.prepared import plan_files, prepare
 from r2flow.data.reading import Reading
@@ -33,9 +33,11 @@ from r2flow.stages import STAGES
 from r2flow.stages.base import Stage
 
 ROOT = Path(__file__).resolve().parent.parent
-Hydra.get_mode = lambda *_, **__: None  # it would compose each config twice, to read the null of hydra.mode
+# it would compose each config twice, to read the null of hydra.mode
+Hydra.get_mode = lambda *_, **__: None
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # a worker for each core: more threads would wait for each other
+# a worker for each core: more threads would wait for each other
+if "PYTEST_XDIST_WORKER" in os.environ:
     torch.set_num_threads(1)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -43,7 +45,13 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a worker for each core: more threads 
 CONFIG: dict[str, Any] = {  # a flow of 8 x 64
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 64, "rays": "centre"},
     "encoding": {"format": "logscale", "reflectance": True},
-    "backbone": {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
+    "backbone": {
+        "name": "hdit",
+        "base_channels": 8,
+        "depths": [1, 1],
+        "num_heads": [1, 2],
+        "time_channels": 16,
+    },
     "data": {"name": "simulated", "batch_size": 4},
     "stage": {"name": "rectify"},
     "seed": 0,
@@ -52,7 +60,12 @@ SENSOR = SENSORS["hdl64e"].resized(8, 64)  # of that flow
 
 TINY: dict[str, dict[str, Any]] = {
     "hdit": {"base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
-    "adm_unet": {"base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": 1, "num_heads": 2},
+    "adm_unet": {
+        "base_channels": 8,
+        "channel_multiplier": [1, 2],
+        "num_residual_blocks": 1,
+        "num_heads": 2,
+    },
     "local": {"channels": 8, "dilations": [1, 2]},
 }
 TINY["efficient_unet"] = TINY["adm_unet"]
@@ -81,7 +94,10 @@ def write_checkpoint(path: Path, config: dict[str, Any]) -> Path:
     stage = make_stage(config)
     state = stage.state_dict()
     content = {"state_dict": state, "current_model_state": state, "global_step": 7}
-    content |= {"hyper_parameters": dict(stage.hparams), "datamodule_hyper_parameters": config["data"]}
+    content |= {
+        "hyper_parameters": dict(stage.hparams),
+        "datamodule_hyper_parameters": config["data"],
+    }
     stage.on_save_checkpoint(content)
     AtomicCheckpointIO().save_checkpoint(content, path)
     return path
@@ -91,13 +107,29 @@ def write_run(folder: Path, flow: Checkpoint, stage: dict[str, Any], scale: floa
     """A run folder with the weights of a flow, times a number."""
     weights = dict(flow.generator.named_parameters())
     state = flow.generator.state_dict()
-    options = {"sampler": None, "few": None, "seed": 0, "generator": {"name": "rectified_flow"}, **flow.config}
+    options = {
+        "sampler": None,
+        "few": None,
+        "seed": 0,
+        "generator": {"name": "rectified_flow"},
+        **flow.config,
+    }
     model = {key: options[key] for key in (*MODEL, "sampler", "few", "seed")}
     content = {
-        "state_dict": {f"generator.{name}": scale * v if name in weights else v for name, v in state.items()},
-        "hyper_parameters": {**model, **{key: value for key, value in stage.items() if key != "name"}},
+        "state_dict": {
+            f"generator.{name}": scale * v if name in weights else v for name, v in state.items()
+        },
+        "hyper_parameters": {
+            **model,
+            **{key: value for key, value in stage.items() if key != "name"},
+        },
         "datamodule_hyper_parameters": flow.config.get("data", {}),
-        "r2flow": {"stage": stage["name"], "plugins": [], "total_steps": 7, **flow.generator.drawing()},
+        "r2flow": {
+            "stage": stage["name"],
+            "plugins": [],
+            "total_steps": 7,
+            **flow.generator.drawing(),
+        },
         "global_step": 7,
     }
     AtomicCheckpointIO().save_checkpoint(content, folder / "checkpoints" / "step-00000007.ckpt")
@@ -164,10 +196,16 @@ def saved(tmp_path: Path) -> tuple[Path, dict]:
     """A checkpoint of ours with random weights, averaged and raw, and the averaged ones."""
     stage = make_stage(CONFIG)
     parameters = dict(stage.named_parameters())
-    raw = {name: torch.randn_like(v) if name in parameters else v for name, v in stage.state_dict().items()}
+    raw = {
+        name: torch.randn_like(v) if name in parameters else v
+        for name, v in stage.state_dict().items()
+    }
     averaged = {name: v + 1 if name in parameters else v for name, v in raw.items()}
     content = {"state_dict": averaged, "current_model_state": raw, "global_step": 7}
-    content |= {"hyper_parameters": dict(stage.hparams), "datamodule_hyper_parameters": CONFIG["data"]}
+    content |= {
+        "hyper_parameters": dict(stage.hparams),
+        "datamodule_hyper_parameters": CONFIG["data"],
+    }
     stage.on_save_checkpoint(content)
     path = tmp_path / "run" / "checkpoints" / "step-00000007.ckpt"
     AtomicCheckpointIO().save_checkpoint(content, path)
@@ -204,7 +242,8 @@ def captured(run: Callable[[], int | None]) -> Done:
             code = run() or 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
-    logging.getLogger("r2flow.flow").setLevel(logging.NOTSET)  # `report solvers` raises it for its process
+    # `report solvers` raises it for its process
+    logging.getLogger("r2flow.flow").setLevel(logging.NOTSET)
     return Done(code, said.getvalue(), complained.getvalue())
 
 
@@ -237,7 +276,9 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Larger cells on the ground, for tests to which their size is nothing: millions of them take time."""
+    """Larger cells on the ground, for tests to which their size is nothing: millions of them take
+    time.
+    """
     monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)
     monkeypatch.setattr("r2flow.metrics.lidm.JSDLiDM.width", 200**2)
     monkeypatch.setattr("r2flow.metrics.lidm.COARSE", 5)
@@ -254,7 +295,9 @@ def write_scan(path: Path, number: int, reflectance: float = 0.5) -> None:
     """A scan whose only return lies at 5 + number metres."""
     path.parent.mkdir(parents=True, exist_ok=True)
     r = 5.0 + number
-    write_points(path, np.array([[r, 0.01, -0.05 * r]], np.float32), np.array([reflectance], np.float32))
+    write_points(
+        path, np.array([[r, 0.01, -0.05 * r]], np.float32), np.array([reflectance], np.float32)
+    )
 
 
 def folder_of(folder: Path, first: int, count: int) -> Path:

@@ -10,14 +10,24 @@ from r2flow.samplers import FixedSteps
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
     "encoding": {"format": "logscale", "reflectance": True},
-    "backbone": {"name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
+    "backbone": {
+        "name": "hdit",
+        "base_channels": 16,
+        "depths": [1, 1],
+        "num_heads": [1, 2],
+        "time_channels": 16,
+    },
 }  # of a tiny flow
 
 
 class Field(Flow):
-    """dx/dt = function(t, x) on states of `noise_shape`; without a space there is nothing to decode."""
+    """dx/dt = function(t, x) on states of `noise_shape`; without a space there is nothing to
+    decode.
+    """
 
-    def __init__(self, function: Velocity, noise_shape: tuple[int, ...], space: ModelSpace | None = None) -> None:
+    def __init__(
+        self, function: Velocity, noise_shape: tuple[int, ...], space: ModelSpace | None = None
+    ) -> None:
         nn.Module.__init__(self)
         self.function, self.noise_shape, self.space = function, noise_shape, space
         self.run_by(FixedSteps())

@@ -1,6 +1,7 @@
 """A child process that reads damaged files under a memory limit and an alarm; see test_fuzzing.py.
 
-Each line that it prints is one file that was read otherwise than it should be, or the end of one kind of file.
+Each line that it prints is one file that was read otherwise than it should be, or the end of one
+kind of file.
 """
 
 import json
@@ -17,7 +18,8 @@ import numpy as np
 
 MEMORY = 6 << 30  # bytes of address space
 PATIENCE = 20  # seconds a file
-SPARE = 96 << 20  # bytes that a reader may take besides four times its file: buffers, and what it imports
+# bytes that a reader may take besides four times its file: buffers, and what it imports
+SPARE = 96 << 20
 
 
 class TooLong(BaseException):
@@ -25,7 +27,9 @@ class TooLong(BaseException):
 
 
 def damaged(content: bytes, draw: np.random.Generator) -> bytes:
-    """Flipped bits, a cut, an insertion, an overwritten stretch, or large and negative numbers in the header."""
+    """Flipped bits, a cut, an insertion, an overwritten stretch, or large and negative numbers in
+    the header.
+    """
     data, kind = bytearray(content), draw.integers(7)
     if kind in (0, 5):  # anywhere, and in the first bytes, where headers are
         size = len(data) if kind == 0 else min(len(data), 256)
@@ -38,10 +42,16 @@ def damaged(content: bytes, draw: np.random.Generator) -> bytes:
         data[place:place] = draw.bytes(int(draw.integers(1, 64)))
     elif kind == 3:
         first, last = sorted(draw.integers(0, len(data), 2).tolist())
-        data[first:last] = [bytes(last - first), draw.bytes(last - first), b"\xff" * (last - first)][draw.integers(3)]
+        data[first:last] = [
+            bytes(last - first),
+            draw.bytes(last - first),
+            b"\xff" * (last - first),
+        ][draw.integers(3)]
     elif kind == 4:
         place = int(draw.integers(min(len(data), 512)))
-        data[place : place + 8] = [b"\xff" * 8, b"\x00" * 8, b"99999999", b"-1      ", b"[[[[[[[["][draw.integers(5)]
+        data[place : place + 8] = [b"\xff" * 8, b"\x00" * 8, b"99999999", b"-1      ", b"[[[[[[[["][
+            draw.integers(5)
+        ]
     else:
         digits = [place for place, byte in enumerate(data[:4096]) if 48 <= byte < 58]
         if digits:
@@ -51,7 +61,9 @@ def damaged(content: bytes, draw: np.random.Generator) -> bytes:
 
 
 def peak() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
+        1 if sys.platform == "darwin" else 1024
+    )
 
 
 def too_long(*_: object) -> None:
@@ -102,10 +114,16 @@ def main(folder: Path, seed: int, count: int) -> None:
             if grown > 4 * len(data) + SPARE:
                 wrong = f"{len(data)} bytes take {grown >> 20} MiB; {wrong}"
             if wrong:
-                print(json.dumps([f"{original.parent.name}/{original.name}", number, wrong]), flush=True)
+                print(
+                    json.dumps([f"{original.parent.name}/{original.name}", number, wrong]),
+                    flush=True,
+                )
         target.write_bytes(content)
         read(target)  # where files lie beside each other, the next one is damaged alone
-        print(json.dumps(["done", f"{original.parent.name}/{original.name}", count, times_read]), flush=True)
+        print(
+            json.dumps(["done", f"{original.parent.name}/{original.name}", count, times_read]),
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

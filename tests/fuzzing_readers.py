@@ -1,4 +1,6 @@
-"""What reads each kind of file in the fuzzing; a reader of a file with a checksum returns its content as bytes."""
+"""What reads each kind of file in the fuzzing; a reader of a file with a checksum returns its
+content as bytes.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +31,9 @@ def points(path: Path) -> None:
 
 
 def image(path: Path) -> None:
-    assert np.isfinite(read_image(path, Reading(SENSOR, reflectance=True, on_bad_scan="error"))).all()
+    assert np.isfinite(
+        read_image(path, Reading(SENSOR, reflectance=True, on_bad_scan="error"))
+    ).all()
 
 
 def labels(path: Path) -> None:
@@ -50,7 +54,9 @@ def in_folder(name: str) -> Callable[[Path], Path]:
 
 def prepared(path: Path) -> bytes:
     folder = in_folder("prepared")(path)
-    source = SOURCES["prepared"].open(Described("it", SourceOptions("prepared", str(folder))), Reading(SENSOR, reflectance=True))
+    source = SOURCES["prepared"].open(
+        Described("it", SourceOptions("prepared", str(folder))), Reading(SENSOR, reflectance=True)
+    )
     assert isinstance(source, PreparedScans)
     for shard in source.rows[:, 1]:
         try:
@@ -62,7 +68,9 @@ def prepared(path: Path) -> bytes:
 
 def pairs(path: Path) -> bytes:
     folder = in_folder("pairs")(path)
-    store = PairStore(folder, PairOptions(num=4, sampler={"name": "euler", "steps": 1}, batch_size=2), (2, 8, 64))
+    store = PairStore(
+        folder, PairOptions(num=4, sampler={"name": "euler", "steps": 1}, batch_size=2), (2, 8, 64)
+    )
     try:
         return store.read(0)[0]["x_1"].tobytes()
     except Damaged as error:
@@ -77,7 +85,7 @@ def checkpoint(path: Path) -> bytes | None:
 
 
 def samples(path: Path) -> None:
-    describe(in_folder("samples")(path)).stored
+    _ = describe(in_folder("samples")(path)).stored
 
 
 def config(path: Path) -> None:

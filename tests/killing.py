@@ -1,4 +1,6 @@
-"""Processes that kill themselves at a moment that the test chooses, and waiting for others, not for ever."""
+"""Processes that kill themselves at a moment that the test chooses, and waiting for others, not for
+ever.
+"""
 
 import os
 import signal
@@ -11,11 +13,22 @@ import torch
 from r2flow.errors import InputError
 
 # The n-th rename, and whether the process dies before it or after it.
-MOMENTS = [(1, True), (1, False), (2, True), (1, False), (1, True), (2, True), (1, False), (2, False)]
+MOMENTS = [
+    (1, True),
+    (1, False),
+    (2, True),
+    (1, False),
+    (1, True),
+    (2, True),
+    (1, False),
+    (2, False),
+]
 
 
 def die_at(rename: int, before: bool) -> None:
-    """From now on this process dies, by SIGKILL, at its `rename`-th file: before it has its name, or after."""
+    """From now on this process dies, by SIGKILL, at its `rename`-th file: before it has its name,
+    or after.
+    """
     replace, seen = os.replace, 0
 
     def dying(source: str, target: str) -> None:

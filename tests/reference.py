@@ -1,4 +1,6 @@
-"""Reference cases, tensors computed once with the published code of a system: reading and comparing."""
+"""Reference cases, tensors computed once with the published code of a system: reading and
+comparing.
+"""
 
 import json
 import zlib
@@ -12,7 +14,15 @@ from torch import Tensor, nn
 
 from r2flow.backbones import Backbone, build_backbone
 
-SCALES = {"half": 0.5, "bias": 0.1, "std01": 0.1, "codebook": 0.3, "unit100": 100.0, "ape": 0.5, "bn_mean": 0.2}
+SCALES = {
+    "half": 0.5,
+    "bias": 0.1,
+    "std01": 0.1,
+    "codebook": 0.3,
+    "unit100": 100.0,
+    "ape": 0.5,
+    "bn_mean": 0.2,
+}
 
 
 def load_case(shared: Path, name: str) -> dict[str, Any]:
@@ -30,7 +40,9 @@ def load_case(shared: Path, name: str) -> dict[str, Any]:
 
 
 def _draw(name: str, shape: tuple[int, ...], kind: str, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed((zlib.crc32(name.encode()) ^ (seed * 0x9E3779B1)) & 0x7FFFFFFF)
+    generator = torch.Generator().manual_seed(
+        (zlib.crc32(name.encode()) ^ (seed * 0x9E3779B1)) & 0x7FFFFFFF
+    )
     z = torch.randn(tuple(shape), generator=generator)
     if kind in ("matrix", "half_matrix"):
         return z * (0.5 if kind == "half_matrix" else 1) / max(1, z[0].numel()) ** 0.5
@@ -51,8 +63,12 @@ KEPT = ("base_channels", "channel_multiplier", "num_residual_blocks", "depths", 
 def backbone_of(name: str, case: dict[str, Any]) -> Backbone:
     """The backbone of a case with its weights, among which are its rays."""
     cfg = case["cfg"]
-    options = {OPTIONS.get(key, key): value for key, value in cfg.items() if key in (*OPTIONS, *KEPT)}
-    model = build_backbone({"name": name, **options}, torch.zeros(2, *cfg["resolution"]), cfg["in_channels"])
+    options = {
+        OPTIONS.get(key, key): value for key, value in cfg.items() if key in (*OPTIONS, *KEPT)
+    }
+    model = build_backbone(
+        {"name": name, **options}, torch.zeros(2, *cfg["resolution"]), cfg["in_channels"]
+    )
     model.load_state_dict(case["state_dict"])
     return model
 
@@ -79,15 +95,23 @@ def assert_norms(
     expected = {name: norm or 0.0 for name, norm in norms.items()}
     least = 1e-6 * max(expected.values())
     for name, parameter in model.named_parameters():
-        norm, known = 0.0 if parameter.grad is None else parameter.grad.norm().item(), expected.get(prefix + name, 0.0)
+        norm, known = (
+            0.0 if parameter.grad is None else parameter.grad.norm().item(),
+            expected.get(prefix + name, 0.0),
+        )
         assert abs(norm - known) <= tolerance * known + least, name
     assert set(expected) <= {prefix + name for name, _ in model.named_parameters()}
 
 
 def assert_published(
-    model: nn.Module, case: dict[str, Any], tolerance: float, call: Callable[[dict[str, Tensor]], Any]
+    model: nn.Module,
+    case: dict[str, Any],
+    tolerance: float,
+    call: Callable[[dict[str, Tensor]], Any],
 ) -> dict[str, Tensor]:
-    """A network's outputs, and their gradients by inputs and parameters, are the case's; the outputs, by name."""
+    """A network's outputs, and their gradients by inputs and parameters, are the case's; the
+    outputs, by name.
+    """
     given = {name: value.clone() for name, value in case["inputs"].items()}
     for name in case["grad_inputs"]:
         given[name].requires_grad_()
@@ -104,7 +128,11 @@ def assert_published(
 
 def published_names(shared: Path, system: str) -> dict[str, list[int]]:
     """The shape of each weight of a published network of full size."""
-    return dict(json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())[system]["names"])
+    return dict(
+        json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())[system][
+            "names"
+        ]
+    )
 
 
 def shapes_of(model: nn.Module) -> dict[str, list[int]]:

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
-
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
+
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import build_space
@@ -56,7 +56,8 @@ def test_torch_s_default_type_and_modes_change_nothing(saved, request):
 def test_a_run_goes_on_without_the_gpu_that_it_began_on(saved, monkeypatch):
     path, averaged = saved
     content = torch.load(path, weights_only=True)
-    monkeypatch.setattr(torch.serialization, "location_tag", lambda storage: "cuda:0")  # as a GPU's run writes it
+    # as a GPU's run writes it
+    monkeypatch.setattr(torch.serialization, "location_tag", lambda storage: "cuda:0")
     AtomicCheckpointIO().save_checkpoint(content, path)
     monkeypatch.undo()
     found = AtomicCheckpointIO().load_checkpoint(path)["state_dict"]
@@ -65,7 +66,9 @@ def test_a_run_goes_on_without_the_gpu_that_it_began_on(saved, monkeypatch):
 
 def test_a_file_that_would_run_code_is_refused(tmp_path: Path):
     torch.save({"state_dict": Trap()}, tmp_path / "evil.ckpt")
-    with pytest.raises(InputError, match=r"evil.ckpt is refused: it holds objects that would run code"):
+    with pytest.raises(
+        InputError, match=r"evil.ckpt is refused: it holds objects that would run code"
+    ):
         load_checkpoint(tmp_path / "evil.ckpt")
     (tmp_path / "evil.pkl").write_bytes(pickle.dumps(Trap()))
     with pytest.raises(InputError, match="evil.pkl"):
@@ -93,7 +96,9 @@ def test_compressed_tensors_are_refused_before_they_are_unpacked(saved):
         load_checkpoint(path)
 
 
-@pytest.mark.parametrize("notes", [json.dumps({"config": CONFIG, "step": math.inf}), "[" * 100_000, "[]", "3"])
+@pytest.mark.parametrize(
+    "notes", [json.dumps({"config": CONFIG, "step": math.inf}), "[" * 100_000, "[]", "3"]
+)
 def test_notes_without_end_or_of_another_kind_are_refused(tmp_path: Path, notes: str):
     path = tmp_path / "model.safetensors"
     safetensors.torch.save_file({"x": torch.zeros(1)}, path, metadata={"r2flow": notes})
@@ -107,7 +112,9 @@ def test_missing_files_and_other_torch_files(tmp_path: Path):
     with pytest.raises(InputError, match="holds no checkpoint"):
         load_checkpoint(tmp_path)
     torch.save({"weight": torch.zeros(3)}, tmp_path / "weights.pt")
-    with pytest.raises(InputError, match=r"neither 'hyper_parameters' and 'r2flow' .* found 'weight'"):
+    with pytest.raises(
+        InputError, match=r"neither 'hyper_parameters' and 'r2flow' .* found 'weight'"
+    ):
         load_checkpoint(tmp_path / "weights.pt")
 
 
@@ -117,7 +124,10 @@ def test_missing_files_and_other_torch_files(tmp_path: Path):
         *({"hyper_parameters": value} for value in (None, [], "x", {})),
         *({"hyper_parameters": {"sensor": "x"}}, {"hyper_parameters": {"backbone": None}}),
         *({"datamodule_hyper_parameters": value} for value in (5, "x")),
-        *({"state_dict": value} for value in (None, {"generator.backbone.x": 3}, {1: torch.zeros(1)}, {})),
+        *(
+            {"state_dict": value}
+            for value in (None, {"generator.backbone.x": 3}, {1: torch.zeros(1)}, {})
+        ),
         *({"global_step": value} for value in ("abc", None, math.inf, math.nan)),
         *({"r2flow": value} for value in (None, [], "x", {})),
         *({"r2flow": {"sampler": value}} for value in ([1], "x", {"steps": {}})),
@@ -144,7 +154,9 @@ def test_weights_that_are_no_plain_numbers_are_refused(saved, kind):
         value.view(-1)[-1] = kind
     elif kind != "sparse":
         value = value.to(kind)
-    torch.save({**torch.load(path, weights_only=True), "state_dict": {**averaged, name: value}}, path)
+    torch.save(
+        {**torch.load(path, weights_only=True), "state_dict": {**averaged, name: value}}, path
+    )
     with pytest.raises(InputError, match=name.removeprefix("generator.")):
         load_checkpoint(path)
 
@@ -153,7 +165,10 @@ def test_weights_that_do_not_fit_name_the_first(saved):
     path, averaged = saved
     content = torch.load(path, weights_only=True)
     (name, _), *others = averaged.items()
-    for changed, problem in (({**averaged, name: torch.zeros(3)}, "has shape"), (dict(others), "1 names missing")):
+    for changed, problem in (
+        ({**averaged, name: torch.zeros(3)}, "has shape"),
+        (dict(others), "1 names missing"),
+    ):
         torch.save({**content, "state_dict": changed}, path)
         with pytest.raises(InputError, match=problem):
             load_checkpoint(path)
@@ -162,10 +177,18 @@ def test_weights_that_do_not_fit_name_the_first(saved):
 def test_a_full_disk_is_one_line_and_loses_nothing(saved):
     path, _ = saved
     before = path.read_bytes()
-    with small_disk(50_000), pytest.raises(InputError, match=r"step-00000007.ckpt cannot be written.* are intact"):
+    with (
+        small_disk(50_000),
+        pytest.raises(InputError, match=r"step-00000007.ckpt cannot be written.* are intact"),
+    ):
         AtomicCheckpointIO().save_checkpoint({"x": torch.randn(100_000)}, path)
-    with small_disk(50_000), pytest.raises(InputError, match=r"cannot be written: [^.]*\. Fix this"):
-        AtomicCheckpointIO().save_checkpoint({"x": torch.randn(100_000)}, path.parent.parent / "new" / path.name)
+    with (
+        small_disk(50_000),
+        pytest.raises(InputError, match=r"cannot be written: [^.]*\. Fix this"),
+    ):
+        AtomicCheckpointIO().save_checkpoint(
+            {"x": torch.randn(100_000)}, path.parent.parent / "new" / path.name
+        )
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
@@ -175,7 +198,9 @@ def test_published_weights_are_kept_bit_by_bit(shared, tmp_path: Path):
     save_checkpoint(published, tmp_path / "ours.safetensors")
     ours = load_checkpoint(tmp_path / "ours.safetensors")
     assert (ours.format, ours.step) == ("r2flow", published.step)
-    torch.testing.assert_close(ours.generator.state_dict(), published.generator.state_dict(), rtol=0, atol=0)
+    torch.testing.assert_close(
+        ours.generator.state_dict(), published.generator.state_dict(), rtol=0, atol=0
+    )
     with pytest.raises(InputError, match="safetensors"):
         save_checkpoint(published, tmp_path / "model.pth")
 
@@ -190,7 +215,11 @@ def test_an_unfolding_distilled_checkpoint_brings_its_ring_angles_and_steps(shar
     loaded = load_checkpoint(tmp_path / "unfolding.pth")
     torch.testing.assert_close(loaded.sensor.rays()[0, :, 0], rings, rtol=0, atol=1e-6)
     torch.testing.assert_close(loaded.generator.backbone.coords[0, 0, :, 0], rings, rtol=0, atol=0)
-    assert (loaded.generator.sampler.steps, loaded.generator.fixed, loaded.config["stage"]["steps"]) == (2, True, 2)
+    assert (
+        loaded.generator.sampler.steps,
+        loaded.generator.fixed,
+        loaded.config["stage"]["steps"],
+    ) == (2, True, 2)
 
 
 def test_published_rows_of_any_number_divide_the_view_evenly(shared):
@@ -199,9 +228,14 @@ def test_published_rows_of_any_number_divide_the_view_evenly(shared):
     for rows in (16, 64, 100, 128):
         cfg["data"]["resolution"] = (rows, 64)
         space = build_space(published_config(cfg))
-        edges = 3 - 28 * torch.arange(rows + 1, dtype=torch.float64) / rows  # of the network, and of the projection
-        torch.testing.assert_close(space.rays[0, :, 0].rad2deg().double(), edges[:-1], rtol=0, atol=1e-5)
-        torch.testing.assert_close(torch.from_numpy(space.sensor.row_edges), edges, rtol=0, atol=1e-12)
+        # of the network, and of the projection
+        edges = 3 - 28 * torch.arange(rows + 1, dtype=torch.float64) / rows
+        torch.testing.assert_close(
+            space.rays[0, :, 0].rad2deg().double(), edges[:-1], rtol=0, atol=1e-5
+        )
+        torch.testing.assert_close(
+            torch.from_numpy(space.sensor.row_edges), edges, rtol=0, atol=1e-12
+        )
 
 
 def test_loading_and_sampling_import_nothing_that_they_do_not_need(saved):
@@ -229,16 +263,22 @@ def test_a_buffer_may_be_infinite_as_the_mask_of_an_attention_is():
 def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
     config = {key: CONFIG[key] for key in ("sensor", "encoding", "backbone")}
     mine = Checkpoint(build_generator(config).eval(), config)
-    mine.model.mid_levels[0].residual_ffn.adarms = mine.model.mid_levels[0].residual_attn.norm  # a plug-in may tie them
+    # a plug-in may tie them
+    mine.model.mid_levels[0].residual_ffn.adarms = mine.model.mid_levels[0].residual_attn.norm
     mine.save(tmp_path / "mine-step-1.safetensors")
     loaded = load_checkpoint(tmp_path / "mine-step-1.safetensors")
     names = mine.generator.state_dict().keys()
-    torch.testing.assert_close(loaded.generator.state_dict(), mine.generator.state_dict(), rtol=0, atol=0)
+    torch.testing.assert_close(
+        loaded.generator.state_dict(), mine.generator.state_dict(), rtol=0, atol=0
+    )
     assert loaded.config == config
     mine.generator.backbone = torch.compile(mine.generator.backbone)
     for half in (False, True):
         save_checkpoint(mine, tmp_path / "compiled.safetensors", half)
-        assert load_checkpoint(tmp_path / "compiled.safetensors").generator.state_dict().keys() == names
+        assert (
+            load_checkpoint(tmp_path / "compiled.safetensors").generator.state_dict().keys()
+            == names
+        )
     max(mine.generator.parameters(), key=torch.Tensor.numel).data.fill_(1e5)
     with pytest.raises(InputError, match="float16"):
         save_checkpoint(mine, tmp_path / "compiled.safetensors", half=True)

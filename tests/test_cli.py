@@ -18,21 +18,52 @@ from tests.test_sampling import network, scans
 
 def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path):
     path, _ = saved
-    out = r2flow("sample", path, "--num", 3, "--steps", 2, "--seed", 5, "--out", tmp_path / "a").said
+    out = r2flow(
+        "sample", path, "--num", 3, "--steps", 2, "--seed", 8, "--out", tmp_path / "a"
+    ).said
     assert str(tmp_path / "a" / "samples.png") in out
-    r2flow("sample", path.parent.parent, "--num", 1, "--steps", 2, "--seed", 5, "-o", tmp_path / "b", "--pictures", 0)
-    r2flow("sample", path, "--num", 3, "--steps", 2, "--seed", 6, "-o", tmp_path / "c", "--format", "npy")
+    r2flow(
+        "sample",
+        path.parent.parent,
+        "--num",
+        1,
+        "--steps",
+        2,
+        "--seed",
+        8,
+        "-o",
+        tmp_path / "b",
+        "--pictures",
+        0,
+    )
+    r2flow(
+        "sample",
+        path,
+        "--num",
+        3,
+        "--steps",
+        2,
+        "--seed",
+        6,
+        "-o",
+        tmp_path / "c",
+        "--format",
+        "npy",
+    )
     images = {name: np.load(tmp_path / name / "000000.npy") for name in "abc"}
     assert images["a"].shape == (2, 8, 64)
     assert images["a"].dtype == np.float32
     np.testing.assert_array_equal(images["a"], images["b"])
+    assert images["a"].any()
     assert (images["a"] != images["c"]).any()
     assert not list((tmp_path / "b").glob("*.png"))
     assert sorted(p.suffix for p in (tmp_path / "c").glob("00000*")) == [".npy"] * 3 + [".png"] * 3
 
 
 def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path):
-    files = [tmp_path / drive / "velodyne_points" / "data" / "000000.bin" for drive in ("d1", "d2", "d3")]
+    files = [
+        tmp_path / drive / "velodyne_points" / "data" / "000000.bin" for drive in ("d1", "d2", "d3")
+    ]
     for file in files:
         write_scan(file, 3)
     said = r2flow("show", *files, "--size", "32x256", "--out", tmp_path / "views").said
@@ -68,7 +99,9 @@ def verbs() -> list[str]:
     from r2flow.cli.verbs import app
 
     top = typer.main.get_command(app).commands
-    return sorted([*(top.keys() - {"report"}), *(f"report {name}" for name in top["report"].commands)])
+    return sorted(
+        [*(top.keys() - {"report"}), *(f"report {name}" for name in top["report"].commands)]
+    )
 
 
 @pytest.mark.parametrize("verb", verbs())
@@ -76,19 +109,41 @@ def test_every_verb_has_help_with_an_example(r2flow, verb, monkeypatch):
     monkeypatch.setenv("COLUMNS", "0")  # as some shells say of no terminal
     example = " ".join(r2flow(*verb.split(), "--help").said.split()).partition("Example: ")[2]
     assert f" {verb} " in example  # torchrun too takes it: --num is a prefix of its --numa-binding
-    assert not example.startswith("torchrun ") or torch.distributed.run.parse_args(example.split()[1:])
+    assert not example.startswith("torchrun ") or torch.distributed.run.parse_args(
+        example.split()[1:]
+    )
 
 
 @pytest.mark.parametrize(
     ("error", "words"),
     [
         (MemoryError(), "out of memory. Give smaller batches"),
-        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "object. Give smaller batches"),
-        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"), "20.00 GiB"),
-        (RuntimeError("can't allocate memory: you tried to allocate 96 bytes.\nx"), "96 bytes. Give smaller batches"),
-        (RuntimeError("not enough memory: you tried to allocate 96 bytes."), "96 bytes. Give smaller batches"),
-        (TypeError("Cannot convert a MPS Tensor to float64, as the MPS framework doesn't support float64."), "cpu"),
-        (RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly"), "unexpectedly. Is there memory for as many"),
+        (
+            ImportError("libtorch_cpu.so: failed to map segment from shared object"),
+            "object. Give smaller batches",
+        ),
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"),
+            "20.00 GiB",
+        ),
+        (
+            RuntimeError("can't allocate memory: you tried to allocate 96 bytes.\nx"),
+            "96 bytes. Give smaller batches",
+        ),
+        (
+            RuntimeError("not enough memory: you tried to allocate 96 bytes."),
+            "96 bytes. Give smaller batches",
+        ),
+        (
+            TypeError(
+                "Cannot convert a MPS Tensor to float64, as the MPS framework doesn't support float64."
+            ),
+            "cpu",
+        ),
+        (
+            RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly"),
+            "unexpectedly. Is there memory for as many",
+        ),
     ],
 )
 def test_what_a_machine_cannot_do_is_one_line(r2flow, monkeypatch, tmp_path, error, words):
@@ -97,7 +152,9 @@ def test_what_a_machine_cannot_do_is_one_line(r2flow, monkeypatch, tmp_path, err
 
 
 def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_path):
-    monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", Mock(side_effect=RuntimeError("shapes differ")))
+    monkeypatch.setattr(
+        "r2flow.model.checkpoint.load_checkpoint", Mock(side_effect=RuntimeError("shapes differ"))
+    )
     with pytest.raises(RuntimeError, match="shapes"):
         r2flow("sample", "-o", tmp_path)
 
@@ -108,9 +165,26 @@ def test_a_model_is_loaded_on_a_device_that_is_here(saved, device):
         load(saved[0], device)
 
 
-def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, tmp_path):
-    corners = write_checkpoint(tmp_path / "a.ckpt", {**CONFIG, "sensor": {**CONFIG["sensor"], "rays": "reference"}})
-    r2flow("sample", corners, "--num", 1, "--steps", 1, "--pictures", 0, "--format", "npy,ply", "-o", tmp_path)
+def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(
+    r2flow, tmp_path
+):
+    corners = write_checkpoint(
+        tmp_path / "a.ckpt", {**CONFIG, "sensor": {**CONFIG["sensor"], "rays": "reference"}}
+    )
+    r2flow(
+        "sample",
+        corners,
+        "--num",
+        1,
+        "--steps",
+        1,
+        "--pictures",
+        0,
+        "--format",
+        "npy,ply",
+        "-o",
+        tmp_path,
+    )
     assert json.loads((tmp_path / "manifest.json").read_text())["recipe"]["rays"] == "centre"
     middles, _ = image_to_points(np.load(tmp_path / "000000.npy"), SENSOR.rays("centre"))
     np.testing.assert_array_equal(read_points(tmp_path / "000000.ply").xyz, middles)
@@ -123,11 +197,18 @@ def run(tmp_path: Path) -> Path:
 
 @pytest.mark.usefixtures("quick_pictures")
 def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
-    out, files = tmp_path / "between", [tmp_path / "scans" / "one.bin", tmp_path / "scans" / "two.ply"]
+    out, files = (
+        tmp_path / "between",
+        [tmp_path / "scans" / "one.bin", tmp_path / "scans" / "two.ply"],
+    )
     for path, image in zip(files, scans(2).numpy(), strict=True):
         write_points(path, *image_to_points(image, SENSOR.rays()))
-    said = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8).said
-    assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [f"{i:03d}.ply" for i in range(4)]
+    said = r2flow(
+        "interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8
+    ).said
+    assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [
+        f"{i:03d}.ply" for i in range(4)
+    ]
     rows = json.loads((out / "interpolation.json").read_text())["rows"]
     for index in range(4):
         image = np.load(out / "frames" / f"{index:03d}.npy")
@@ -143,9 +224,13 @@ def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
 
 def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):
     part = tmp_path / "part"
-    said = r2flow("sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", part).said
+    said = r2flow(
+        "sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", part
+    ).said
     # 11.25 degrees are 2 columns, and the network's unit is 8.
-    assert "generating rows 0-3, columns 16-47, for rows 0-2, columns 24-39: 25% of the image" in said
+    assert (
+        "generating rows 0-3, columns 16-47, for rows 0-2, columns 24-39: 25% of the image" in said
+    )
     image = np.load(part / "000000.npy")
     assert image.shape == (2, 8, 64)
     for judged in (("evaluate", part, "simulated:0"), ("evaluate", "simulated:0", part)):

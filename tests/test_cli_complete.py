@@ -75,7 +75,9 @@ def sparse_scan(path: Path, steps: int = 900) -> np.ndarray:
 def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, ending):
     image = full_scan(tmp_path / f"one{ending}")
     found = tmp_path / "out" / f"one{ending}"
-    assert r2flow("complete", tmp_path / found.name, "-c", run, "--mask=rows:2", "--out", found.parent).quiet
+    assert r2flow(
+        "complete", tmp_path / found.name, "-c", run, "--mask=rows:2", "--out", found.parent
+    ).quiet
     if ending == ".npy":
         answer = np.load(found)
         assert np.array_equal(answer[:, ::2], image[:, ::2])
@@ -95,7 +97,11 @@ def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, end
 def test_a_sparser_sensor_is_found_and_its_points_come_back(complete, tmp_path):
     xyz = sparse_scan(tmp_path / "in" / "room.PCD")
     said = complete(tmp_path / "in", "--num", 2).said
-    for words in ("vlp16 with 16 beams from +15.1 to -14.9", "6 of the 8 rows", "7 of its 16 beams look past"):
+    for words in (
+        "vlp16 with 16 beams from +15.1 to -14.9",
+        "6 of the 8 rows",
+        "7 of its 16 beams look past",
+    ):
         assert words in said
     assert "uses them with densify" in said  # the model itself has no other sensor
     answers = [read_points(tmp_path / "out" / f"room_{a}.pcd") for a in range(2)]
@@ -108,7 +114,10 @@ def test_a_sparser_sensor_is_found_and_its_points_come_back(complete, tmp_path):
         assert spread["deviation"].shape == spread["returned"].shape == (8, 64)
         assert ((spread["deviation"] == 0) & (spread["returned"] == 1)).sum() >= 6 * 64
     assert len(open_scans(tmp_path / "out")) == 2  # the answers alone, not their spread
-    assert "vlp16 with 16 beams" in complete(tmp_path / "in", "--from", "vlp16", out=tmp_path / "named")[1]
+    assert (
+        "vlp16 with 16 beams"
+        in complete(tmp_path / "in", "--from", "vlp16", out=tmp_path / "named")[1]
+    )
 
 
 def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(complete, tmp_path):
@@ -130,7 +139,9 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(complet
 
 
 def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(complete, tmp_path):
-    """Returns come back to the bit and some gaps return; without the option all gaps are rays without a return."""
+    """Returns come back to the bit and some gaps return; without the option all gaps are rays
+    without a return.
+    """
     image = full_scan(tmp_path / "one.npy")
     image[:, ::2, ::3] = 0
     np.save(tmp_path / "one.npy", image)
@@ -144,7 +155,9 @@ def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(complete, tmp_path):
     write_points(tmp_path / "thin.ply", xyz[np.random.default_rng(0).random(len(xyz)) < 0.02])
     for name, thinned in ("room", False), ("thin", True):
         said = complete(tmp_path / f"{name}.ply", "--from", "vlp16", out=tmp_path / name).said
-        assert ("of the measured rays have no return: for thinned scans give --fill-gaps" in said) == thinned
+        assert (
+            "of the measured rays have no return: for thinned scans give --fill-gaps" in said
+        ) == thinned
 
 
 def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):
@@ -156,14 +169,19 @@ def test_simulated_scans_are_seen_through_another_sensor(complete, tmp_path):
 def test_a_model_of_range_alone_leaves_reflectance_out(complete, tmp_path):
     path = write_run(tmp_path / "run", network(reflectance=False), TRANSFER)
     full_scan(tmp_path / "one.bin")
-    assert "answers have no reflectance" in complete(tmp_path / "one.bin", "--mask", "rows:2", model=path).said
+    assert (
+        "answers have no reflectance"
+        in complete(tmp_path / "one.bin", "--mask", "rows:2", model=path).said
+    )
     assert read_points(tmp_path / "out" / "one.ply").reflectance is None
 
 
 def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
     path = write_run(tmp_path / "run", network("diffusion"), TRANSFER)
     image = full_scan(tmp_path / "one.npy")
-    assert complete(tmp_path / "one.npy", "--mask", "rows:2", "--sampler", "repaint", "--steps", 2, model=path).quiet
+    assert complete(
+        tmp_path / "one.npy", "--mask", "rows:2", "--sampler", "repaint", "--steps", 2, model=path
+    ).quiet
     assert np.array_equal(np.load(tmp_path / "out" / "one.npy")[:, ::2], image[:, ::2])
     note = json.loads((tmp_path / "out" / "manifest.json").read_text())["recipe"]["sampler"]
     assert (note["name"], note["steps"], note["repeats"]) == ("repaint", 2, 16)
@@ -174,9 +192,21 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
     [
         (None, ["--mask", "points:0"], "one: the mask keeps nothing that was measured"),
         (None, ["--mask", "points:1"], "one: the mask keeps everything that was measured"),
-        (None, ["--from", "vlp16"], "of 8 rows by --from, in Python by sensor (vlp16 has 16), or --size 8x64 alone"),
-        (np.full((2, 8, 64), np.nan, np.float32), [], "is NaN or infinite in places; 0 stands for a ray without"),
-        (np.full((1, 8, 4), 3, np.float32), [], "must be a range image of floats (2 or 1, H, W), found float32 (1, 8"),
+        (
+            None,
+            ["--from", "vlp16"],
+            "of 8 rows by --from, in Python by sensor (vlp16 has 16), or --size 8x64 alone",
+        ),
+        (
+            np.full((2, 8, 64), np.nan, np.float32),
+            [],
+            "is NaN or infinite in places; 0 stands for a ray without",
+        ),
+        (
+            np.full((1, 8, 4), 3, np.float32),
+            [],
+            "must be a range image of floats (2 or 1, H, W), found float32 (1, 8",
+        ),
         (-scans()[0].numpy(), [], "0 stands for no return"),
         (np.full((2, 8, 64), 3, np.float32), [], "its reflectance goes up to 3, not 1; divide"),
         (np.full((1, 8, 64), 90, np.float32), [], "none of its ranges lies within 1.45-80 m"),
@@ -190,8 +220,12 @@ def test_what_cannot_be_done_is_one_line(complete, tmp_path, image, options, mes
 @pytest.mark.parametrize("sensor", [[], ["--from", "vlp32c"]])
 def test_points_of_which_none_is_in_view_are_one_line(complete, tmp_path, sensor):
     xyz, reflectance = image_to_points(scans()[0].numpy(), SENSOR.rays())
-    write_points(tmp_path / "far.bin", 500 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True), reflectance)
-    assert_refused(complete(tmp_path / "far.bin", *sensor), "lies within 1.45-80 m", tmp_path / "out")
+    write_points(
+        tmp_path / "far.bin", 500 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True), reflectance
+    )
+    assert_refused(
+        complete(tmp_path / "far.bin", *sensor), "lies within 1.45-80 m", tmp_path / "out"
+    )
 
 
 def test_the_folder_of_the_scans_is_not_written_into(complete, tmp_path):
@@ -219,27 +253,39 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
     (tmp_path / "b" / f"one{ending}").unlink()
     assert "1 scan written" in complete(tmp_path / "b", *asked)[1]
     answer, both, last = completed.complete, tmp_path / "both", tmp_path / "last"
-    other = [lambda: complete(tmp_path / "b", *asked, out=both)]  # a command that begins and ends meanwhile
-    monkeypatch.setattr(completed, "complete", lambda *a, **how: (other and other.pop()(), answer(*a, **how))[1])
+    # a command that begins and ends meanwhile
+    other = [lambda: complete(tmp_path / "b", *asked, out=both)]
+    monkeypatch.setattr(
+        completed, "complete", lambda *a, **how: (other and other.pop()(), answer(*a, **how))[1]
+    )
     assert [complete(tmp_path / drive, *asked, out=both)[0] for drive in "aab"] == [0, 0, 0]
     other = [lambda: complete(tmp_path / "b", *asked, out=last)]
-    assert "holds other answers: seed" in complete(tmp_path / "a", *asked, "--seed", 1, out=last).refusal
-    monkeypatch.setattr("os.access", lambda _, mode: not mode & 2)  # for writing: complete folders may be read-only
+    assert (
+        "holds other answers: seed"
+        in complete(tmp_path / "a", *asked, "--seed", 1, out=last).refusal
+    )
+    # for writing: complete folders may be read-only
+    monkeypatch.setattr("os.access", lambda _, mode: not mode & 2)
     assert complete(tmp_path / "a", *asked, out=both)[0] == 0
 
 
 def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path, monkeypatch):
-    monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))  # no pause
+    # no pause
+    monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))
     for place, number in enumerate([0, 1, 0, 1]):
         full_scan(tmp_path / "scans" / f"{place}.npy", number)
     given = prepare_folder(tmp_path / "scans", tmp_path / "prep", SENSOR)
     asked = given, "--mask", "rows:2", "--scans"
     for most, numbers in ((1, [2]), (2, [1, 2, 3])):  # evenly spread
         assert complete(*asked, most)[0] == 0
-        assert sorted(path.stem for path in (tmp_path / "out").glob("*.npy")) == [f"prep-{n:06d}" for n in numbers]
+        assert sorted(path.stem for path in (tmp_path / "out").glob("*.npy")) == [
+            f"prep-{n:06d}" for n in numbers
+        ]
     whole = open_scans(given).source
     for number in numbers:
-        assert np.array_equal(np.load(tmp_path / "out" / f"prep-{number:06d}.npy")[:, ::2], whole[number][:, ::2])
+        assert np.array_equal(
+            np.load(tmp_path / "out" / f"prep-{number:06d}.npy")[:, ::2], whole[number][:, ::2]
+        )
     assert f"1 scan written to {tmp_path / 'out'}, 3 there already" in complete(*asked, 4).said
     assert "hashing 4/4 scans" in complete(*asked, 4).stderr
 
@@ -260,21 +306,40 @@ def test_an_unusual_scale_that_is_estimated_is_told(complete, tmp_path):
     asked = tmp_path / "one.ply", "--from", "vlp16"
     assert "reflectance is divided by 0.01; --reflectance-scale" in complete(*asked)[2]
     assert complete(*asked, "--reflectance-scale", "0.01", out=tmp_path / "b")[2] == ""
-    # So is that of a scan of the model's sensor: unscaled values would stand next to answers in [0, 1].
+    # So is that of a scan of the model's sensor: unscaled values would stand next to answers in [0,
+    # 1].
     full_scan(tmp_path / "two.bin")
     points = read_points(tmp_path / "two.bin")
-    write_points(tmp_path / "two.bin", points.xyz, points.reflectance / points.reflectance.max() * np.float32(0.02))
-    assert "divided by 0.02" in complete(tmp_path / "two.bin", "--mask", "rows:2", out=tmp_path / "c")[2]
+    write_points(
+        tmp_path / "two.bin",
+        points.xyz,
+        points.reflectance / points.reflectance.max() * np.float32(0.02),
+    )
+    assert (
+        "divided by 0.02"
+        in complete(tmp_path / "two.bin", "--mask", "rows:2", out=tmp_path / "c")[2]
+    )
     assert read_points(tmp_path / "c" / "two.bin").reflectance.max() == pytest.approx(1)
 
 
 @pytest.mark.parametrize("size", ["32x128", "16x128"])
-def test_reflectance_beyond_the_sensor_s_scale_is_neither_clipped_nor_silent(complete, tmp_path, size):
+def test_reflectance_beyond_the_sensor_s_scale_is_neither_clipped_nor_silent(
+    complete, tmp_path, size
+):
     xyz = sparse_scan(tmp_path / "room.pcd")
-    counts = np.resize(np.arange(0, 65536, 257, dtype=np.float32), len(xyz))  # 0 to 255, in two bytes
+    # 0 to 255, in two bytes
+    counts = np.resize(np.arange(0, 65536, 257, dtype=np.float32), len(xyz))
     write_points(tmp_path / "room.pcd", xyz, counts)
     write_sensor(replace(VLP16, name="mine", reflectance_scale=255.0), tmp_path / "mine.yaml", "")
-    given = "--from", tmp_path / "mine.yaml", "--to", tmp_path / "mine.yaml", "--size", size, "--fill-gaps"
+    given = (
+        "--from",
+        tmp_path / "mine.yaml",
+        "--to",
+        tmp_path / "mine.yaml",
+        "--size",
+        size,
+        "--fill-gaps",
+    )
     code, _, error = complete(tmp_path / "room.pcd", *given, model=None)
     assert (code, error.count("divided by 65535")) == (0, 1)
     answer = read_points(tmp_path / "out" / "room.pcd").reflectance
@@ -283,7 +348,10 @@ def test_reflectance_beyond_the_sensor_s_scale_is_neither_clipped_nor_silent(com
     counts[0] = 210  # a single value beyond the named scale
     write_points(tmp_path / "room.pcd", xyz, counts)
     write_sensor(replace(VLP16, name="mine", reflectance_scale=200.0), tmp_path / "mine.yaml", "")
-    assert "divided by" not in complete(tmp_path / "room.pcd", *given, model=None, out=tmp_path / "named")[2]
+    assert (
+        "divided by"
+        not in complete(tmp_path / "room.pcd", *given, model=None, out=tmp_path / "named")[2]
+    )
     answer = read_points(tmp_path / "named" / "room.pcd").reflectance
     np.testing.assert_allclose(answer[1 : len(xyz)], counts[1:] / 200, atol=1e-6)
 
@@ -293,7 +361,10 @@ def test_points_that_are_dropped_are_told(complete, tmp_path):
     rows = np.fromfile(tmp_path / "one.bin", np.float32).reshape(-1, 4)
     rows[::5, 3] = np.nan
     rows.tofile(tmp_path / "one.bin")
-    assert f"are dropped ({len(rows[::5])} points" in complete(tmp_path / "one.bin", "--mask", "rows:2")[2]
+    assert (
+        f"are dropped ({len(rows[::5])} points"
+        in complete(tmp_path / "one.bin", "--mask", "rows:2")[2]
+    )
 
 
 def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):
@@ -313,7 +384,10 @@ def test_answers_by_another_mask_file_or_scale_are_none(complete, tmp_path):
     ("scan", "beams"),
     [
         ("vlp16/000200.pcd", "16 beams"),
-        ("nuscenes_hdl32e/n015-2018-07-24-11-22-45+0800__LIDAR_TOP__1532402927647951.pcd.bin", "32 beams"),
+        (
+            "nuscenes_hdl32e/n015-2018-07-24-11-22-45+0800__LIDAR_TOP__1532402927647951.pcd.bin",
+            "32 beams",
+        ),
         ("rellis_os1_64/000104.bin", "64 beams"),
         ("rellis_vlp32c/vel000104.bin", "32 beams"),
     ],
@@ -323,12 +397,20 @@ def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_pa
     said = complete(file).said
     assert beams in said
     assert "1 scan written" in said
-    used, kept = (int(number.replace(",", "")) for number in re.findall(r"(?:used|kept):[ a-z]* (\d[\d,]*)\b", said))
-    flow, (written,) = r2flow.load(run), (file for file in (tmp_path / "out").iterdir() if file.suffix != ".json")
+    used, kept = (
+        int(number.replace(",", ""))
+        for number in re.findall(r"(?:used|kept):[ a-z]* (\d[\d,]*)\b", said)
+    )
+    flow, (written,) = (
+        r2flow.load(run),
+        (file for file in (tmp_path / "out").iterdir() if file.suffix != ".json"),
+    )
     answer, points, given = flow.complete(file), read_points(file), read_points(written)
     assert len(flow.points(answer[0])[0]) - used == len(given.xyz) - kept >= 0
     r = np.linalg.norm(points.xyz, axis=1)
-    assert np.array_equal(given.xyz[:kept], points.xyz[(r >= SENSOR.min_range) & (r <= SENSOR.max_range)])
+    assert np.array_equal(
+        given.xyz[:kept], points.xyz[(r >= SENSOR.min_range) & (r <= SENSOR.max_range)]
+    )
     if points.reflectance is not None:
         assert torch.equal(flow.complete(np.column_stack([points.xyz, points.reflectance])), answer)
 
@@ -340,7 +422,10 @@ def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_p
     assert "16 of the 32 rows of mine are measured" in complete(*asked, model=None).said
     said = complete(*asked[:1], "--from", tmp_path / "mine.yaml", out=tmp_path / "other").said
     assert "6 of its 16 beams look past" in said
-    assert "--to FILE (r2flow sensor) --size 16x900, in Python Checkpoint.through of such a sensor, uses" in said
+    assert (
+        "--to FILE (r2flow sensor) --size 16x900, in Python Checkpoint.through of such a sensor, uses"
+        in said
+    )
 
 
 def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path, caplog):
@@ -352,11 +437,19 @@ def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path,
     assert torch.equal(*(r2flow.load(run).complete(cloud, sensor="hdl64e") for _ in range(2)))
     assert [message.partition(":")[0] for message in caplog.messages] == ["points in memory"] * 2
     coarse = torch.from_numpy(cloud).bfloat16()
-    assert torch.equal(*(r2flow.load(run).complete(points, sensor="vlp16") for points in (coarse, coarse.double())))
-    for given, found in ((np.zeros(4), "(4,)"), (np.zeros((0, 2, 8, 64)), "(0, 2, 8, 64)"), (["a.bin"], "list")):
+    assert torch.equal(
+        *(r2flow.load(run).complete(points, sensor="vlp16") for points in (coarse, coarse.double()))
+    )
+    for given, found in (
+        (np.zeros(4), "(4,)"),
+        (np.zeros((0, 2, 8, 64)), "(0, 2, 8, 64)"),
+        (["a.bin"], "list"),
+    ):
         with pytest.raises(InputError, match=rf"points \(N, 3 or 4\); found .*{re.escape(found)}"):
             r2flow.load(run).complete(given)
-    with pytest.raises(InputError, match="^points in memory: .*, in Python by sensor: .*beams cannot be separated"):
+    with pytest.raises(
+        InputError, match="^points in memory: .*, in Python by sensor: .*beams cannot be separated"
+    ):
         r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
 
 
@@ -379,7 +472,18 @@ def test_points_of_a_pitched_vehicle_are_warned_of_and_completed(complete, tmp_p
 
 def test_points_next_to_range_images_are_completed(complete, r2flow, tmp_path: Path):
     folder = tmp_path / "in"
-    assert r2flow("simulate", "--num", 1, "--sensor", "vlp16", "--format", "bin,npy", "--labels", "--out", folder).said
+    assert r2flow(
+        "simulate",
+        "--num",
+        1,
+        "--sensor",
+        "vlp16",
+        "--format",
+        "bin,npy",
+        "--labels",
+        "--out",
+        folder,
+    ).said
     assert len(open_scans(folder)) == 1
     assert "16: ring after ring" in r2flow("sensor", folder).said
     assert r2flow("show", folder, "--out", tmp_path / "seen").quiet
@@ -399,7 +503,9 @@ def test_points_outside_the_limits_are_told(complete, tmp_path: Path):
     assert kept in complete(tmp_path / "some.ply", *asked, model=None).said
 
 
-@pytest.mark.parametrize(("rows", "columns", "named"), [(4, 64, True), (8, 32, True), (4, 32, True), (8, 32, False)])
+@pytest.mark.parametrize(
+    ("rows", "columns", "named"), [(4, 64, True), (8, 32, True), (4, 32, True), (8, 32, False)]
+)
 def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(tmp_path, rows, columns, named):
     """The same rays as points and as a range image: between them nothing was measured."""
     sensor, target = SENSORS["os1_64"].resized(rows, columns), SENSORS["os1_64"].resized(8, 64)
@@ -408,11 +514,16 @@ def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(tmp_path, ro
     image = np.stack([np.full(sensor.shape, 9.0), np.full(sensor.shape, 0.5)]).astype(np.float32)
     image[:, :, 3::5] = 0
     write_points(tmp_path / "points" / "0.ply", *image_to_points(image, sensor.rays()))
-    ((scan,), (said,)) = open_partial([str(tmp_path / "points")], Reading(target), sensor if named else None)
+    ((scan,), (said,)) = open_partial(
+        [str(tmp_path / "points")], Reading(target), sensor if named else None
+    )
     expected = image_through(image, sensor, target)
     found = scan.read()
     for ray in Ray:
-        assert abs(int((found.state == ray).sum()) - int((expected.state == ray).sum())) <= rows * columns // 50
+        assert (
+            abs(int((found.state == ray).sum()) - int((expected.state == ray).sum()))
+            <= rows * columns // 50
+        )
     assert ("32 rays a turn" in said) == (columns == 32)
 
 
@@ -428,8 +539,12 @@ def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(tmp_path, ro
 )
 def test_the_model_is_chosen_by_what_is_missing(complete, tmp_path, mask, more, model, size):
     image = simulate(SENSORS["hdl64e"].resized(64, 512), 5, 0).image
-    write_points(tmp_path / "one.ply", *image_to_points(image, SENSORS["hdl64e"].resized(64, 512).rays()))
-    said = complete(tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, model=None).said
+    write_points(
+        tmp_path / "one.ply", *image_to_points(image, SENSORS["hdl64e"].resized(64, 512).rays())
+    )
+    said = complete(
+        tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, model=None
+    ).said
     assert f"the model {model}: " in said
     assert f"in each pixel of {size}" in said
     assert len(read_points(tmp_path / "out" / "one.ply").xyz) > 1000

@@ -26,8 +26,12 @@ def write_scans(folder: Path, sensor: Sensor, count: int, most: int) -> Path:
     for index in range(count):
         draw, e = np.random.default_rng(index), sensor.rays().numpy()[0]
         r = np.minimum(np.where(e < 0, 1.5 / np.sin(np.maximum(-e, 1e-9)), np.inf), 40 / np.cos(e))
-        image = np.stack([r, draw.integers(0, 256, r.shape) * (most / 255)]) * (draw.random(r.shape) < 0.9)
-        write_points(folder / f"{index:06d}.bin", *image_to_points(image.astype(np.float32), sensor.rays()))
+        image = np.stack([r, draw.integers(0, 256, r.shape) * (most / 255)]) * (
+            draw.random(r.shape) < 0.9
+        )
+        write_points(
+            folder / f"{index:06d}.bin", *image_to_points(image.astype(np.float32), sensor.rays())
+        )
     return folder
 
 
@@ -36,12 +40,23 @@ def scans(tmp_path: Path) -> Path:
     return write_scans(tmp_path / "scans", MINE, 3, 255)
 
 
-def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: Path, tmp_path: Path):
+def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(
+    r2flow, scans: Path, tmp_path: Path
+):
     out = tmp_path / "conf" / "mine.yaml"
     printed = " ".join(r2flow("sensor", scans, "--out", out).quiet.split())
-    for words in ("beams 8:", "128 steps a turn", "scale=255", "lie 0.00 from", "1.50 m above", "ring after ring"):
+    for words in (
+        "beams 8:",
+        "128 steps a turn",
+        "scale=255",
+        "lie 0.00 from",
+        "1.50 m above",
+        "ring after ring",
+    ):
         assert words in printed
-    np.testing.assert_allclose(yaml.safe_load(out.read_text())["elevations"], MINE.elevations, atol=1e-3)
+    np.testing.assert_allclose(
+        yaml.safe_load(out.read_text())["elevations"], MINE.elevations, atol=1e-3
+    )
     assert sorted(path.name for path in out.parent.iterdir()) == ["mine.yaml"]
 
     npy, image = ("--format", "npy", "-o", tmp_path / "image"), tmp_path / "image" / "000000.npy"
@@ -53,7 +68,10 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
 
 
 def test_points_of_another_frame_are_warned_of(r2flow, tmp_path: Path):
-    xyz, ring = image_to_points(np.full((1, 8, 128), 2.5, np.float32), MINE)[0], np.arange(8).repeat(128)
+    xyz, ring = (
+        image_to_points(np.full((1, 8, 128), 2.5, np.float32), MINE)[0],
+        np.arange(8).repeat(128),
+    )
     for mount, warned in ((1.5, True), (0, False)):
         write_points(tmp_path / "0.ply", xyz + np.float32([mount, 0, mount]), ring=ring)
         code, said, error = r2flow("sensor", tmp_path / "0.ply")
@@ -62,7 +80,10 @@ def test_points_of_another_frame_are_warned_of(r2flow, tmp_path: Path):
 
 
 def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, tmp_path: Path):
-    given, out = write_scans(tmp_path / "scans", SENSORS["pandar64"].resized(columns=384), 2, 1), tmp_path / "out"
+    given, out = (
+        write_scans(tmp_path / "scans", SENSORS["pandar64"].resized(columns=384), 2, 1),
+        tmp_path / "out",
+    )
     for verb in (
         ("show", given, "--format", "npy"),
         ("prepare", given, "--workers", 1),
@@ -72,14 +93,21 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
             code, _, error = r2flow(*verb, *sensor, "--out", out / (verb[0] + "".join(sensor)))
             warnings = [line for line in error.splitlines() if line.startswith("WARNING")]
             assert code == 0, error
-            assert len(warnings) == 1 + (verb[0] == "evaluate" and sensor != ()), error  # one for each set
-            words = ("64 beams from +14.9 to -24.9 degrees", "sensor=pandar64") if sensor else ("scans of pandar64",)
+            # one for each set
+            assert len(warnings) == 1 + (verb[0] == "evaluate" and sensor != ()), error
+            words = (
+                ("64 beams from +14.9 to -24.9 degrees", "sensor=pandar64")
+                if sensor
+                else ("scans of pandar64",)
+            )
             assert all(word in warnings[0] for word in words)
     assert read_manifest(out / "prepare")["recipe"]["reading"]["sensor"]["name"] == "pandar64"
     images = [np.load(out / f"show{forced}" / "000000.npy") for forced in ("", "--sensorhdl64e")]
-    assert (images[0][0] > 0).sum() > 1.1 * (images[1][0] > 0).sum()  # hdl64e sees 92 % of the returns
+    # hdl64e sees 92 % of the returns
+    assert (images[0][0] > 0).sum() > 1.1 * (images[1][0] > 0).sum()
     assert r2flow("show", given, "--sensor", "pandar64", "--format", "npy", "--out", out).quiet
-    (given / "answers").mkdir()  # of `complete`, next to the scans: no scans, and the scans stay the sensor's own
+    # of `complete`, next to the scans: no scans, and the scans stay the sensor's own
+    (given / "answers").mkdir()
     shutil.copy(out / "prepare" / "manifest.json", given / "answers")
     shutil.copy(given / "000000.bin", given / "answers")
     assert len(open_scans(given)) == 2
@@ -94,9 +122,15 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
         open_scans(given, Reading(SENSORS["hdl64e"]), sensor="vlp16")
 
 
-def test_a_thinned_scan_is_not_taken_for_another_sensors(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_a_thinned_scan_is_not_taken_for_another_sensors(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     quarter = Sensor("quarter", SENSORS["hdl64e_rings"].elevations[::4], columns=1024)
-    assert package.read(write_scans(tmp_path / "scans", quarter, 1, 1) / "000000.bin").shape == (2, 64, 1024)
+    assert package.read(write_scans(tmp_path / "scans", quarter, 1, 1) / "000000.bin").shape == (
+        2,
+        64,
+        1024,
+    )
     assert "they fit 'hdl32e'" in caplog.text  # the nearest of all
 
 
@@ -109,13 +143,25 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     assert r2flow("show", scans / "000000.bin", "--sensor", out, *npy)[0] == 0
     assert set(np.unique(np.load(image)[1])) <= {0, *np.unique(raw / np.float32(255))}
     assert np.load(image)[1].max() > 0.95
-    assert r2flow("prepare", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1).quiet
+    assert r2flow(
+        "prepare", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1
+    ).quiet
     assert read_manifest(tmp_path / "prepared")["recipe"]["reading"]["reflectance_scale"] == 255
-    given = (scans, scans / "000000.bin", "--sensor", out, "--metrics", "frechet_handcrafted", "--workers", 0)
+    given = (
+        scans,
+        scans / "000000.bin",
+        "--sensor",
+        out,
+        "--metrics",
+        "frechet_handcrafted",
+        "--workers",
+        0,
+    )
     assert "reflectance" not in r2flow("evaluate", *given).said
     shown = "show", scans / "000000.bin", "--sensor", out, *npy, "--reflectance-scale"
     r2flow(*shown, 510)
-    assert np.load(image)[1].max() == pytest.approx(raw.max() / 510, abs=0.01)  # what is given comes first
+    # what is given comes first
+    assert np.load(image)[1].max() == pytest.approx(raw.max() / 510, abs=0.01)
     assert "below a tenth" in r2flow(*shown, 5100).stderr
 
 
@@ -123,7 +169,9 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     ("s_KITTI-360.yaml", "s_KITTI_360"), ("2nd car.yaml", "my_2nd_car"), ("vlp16.yaml", "my_vlp16"),
     ("Größe.yaml", "Gr__e"), ("_.yml", "my__"),
 ])  # fmt: skip
-def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, file: str, name: str):
+def test_a_sensor_is_named_after_its_file(
+    r2flow, scans: Path, tmp_path: Path, file: str, name: str
+):
     assert r2flow("sensor", scans, "--out", tmp_path / file, "--num", 1).quiet
     assert read_sensor(tmp_path / file).name == name
 
@@ -144,7 +192,9 @@ def test_a_sensor_s_file_is_not_replaced(r2flow, scans: Path, tmp_path: Path):
         pytest.param("rellis_vlp32c", 255.0, marks=pytest.mark.slow),
     ],
 )
-def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: Path, tmp_path: Path, folder, scale):
+def test_the_three_commands_of_the_docs_run_as_they_are_written(
+    r2flow, shared: Path, tmp_path: Path, folder, scale
+):
     data, prepared = shared / "real" / "other_sensors" / folder, tmp_path / "my" / "prepared"
     mine = tmp_path / "my sensor.yaml"
     assert r2flow("sensor", data, "--out", mine).quiet
@@ -153,5 +203,7 @@ def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: 
     small = [part for part in TINY if not part.startswith(("data", "sensor."))]
     for given in (["data=prepared", f"data.root={prepared}"], ["data=folder", f"data.root={data}"]):
         own = [*given, f"sensor='{mine}'", "data.batch_size=1"]
-        done = in_process(tmp_path, [*own, *small, "trainer.max_steps=1", "trainer.fast_dev_run=true"])
+        done = in_process(
+            tmp_path, [*own, *small, "trainer.max_steps=1", "trainer.fast_dev_run=true"]
+        )
         assert "WARNING" not in done.stderr

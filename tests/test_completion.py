@@ -65,14 +65,28 @@ def test_scans_that_are_known_in_part_wholly_and_not_at_all_go_together():
     state[1] = ray_states(images)[1]
     state[2] = Ray.UNKNOWN
     checkpoint = network("rectified_flow")
-    found = list(complete(checkpoint, images, state, num=2, batch_size=4, sampler=build_sampler("replace", steps=2)))
+    found = list(
+        complete(
+            checkpoint,
+            images,
+            state,
+            num=2,
+            batch_size=4,
+            sampler=build_sampler("replace", steps=2),
+        )
+    )
     assert [one.evaluations.tolist() for one in found] == [[2, 2], [0, 0], [3, 3]]
     assert torch.equal(found[1].images, images[1].expand(2, -1, -1, -1))
     assert found[1].converged.all()
     assert not found[1].spread[0].any()
     for i, one in enumerate(found):
         (alone,) = complete(
-            checkpoint, images[i : i + 1], state[i : i + 1], num=2, first=i, sampler=build_sampler("replace", steps=2)
+            checkpoint,
+            images[i : i + 1],
+            state[i : i + 1],
+            num=2,
+            first=i,
+            sampler=build_sampler("replace", steps=2),
         )
         torch.testing.assert_close(one.images, alone.images, rtol=1e-4, atol=1e-4)
 
@@ -99,9 +113,23 @@ def test_spread_is_over_the_answers_with_a_return():
     torch.testing.assert_close(share, torch.tensor([[1, 1 / 3, 0]]))
 
 
-@pytest.mark.parametrize(("sensor", "size", "other"), [("hdl64e", "32x256", False), ("vlp16", "16x256", True)])
+@pytest.mark.parametrize(
+    ("sensor", "size", "other"), [("hdl64e", "32x256", False), ("vlp16", "16x256", True)]
+)
 def test_coarser_images_of_the_own_sensor_are_not_of_another(r2flow, tmp_path, sensor, size, other):
-    assert r2flow("simulate", "--num", 1, "--sensor", sensor, "--size", size, "--format", "npy", "--out", tmp_path).said
+    assert r2flow(
+        "simulate",
+        "--num",
+        1,
+        "--sensor",
+        sensor,
+        "--size",
+        size,
+        "--format",
+        "npy",
+        "--out",
+        tmp_path,
+    ).said
     found, (scan,), _ = load_checkpoint("densify").open_partial([str(tmp_path)])
     rows, columns = scan.read().state.nonzero()
     assert found.generator.foreign == other
@@ -114,12 +142,17 @@ def test_a_model_of_another_sensor_is_not_saved_as_that_of_training(tmp_path):
 
 
 def test_a_generator_that_cannot_complete_is_refused():
-    with pytest.raises(InputError, match="a Generator cannot complete a scan: that needs a flow of range images"):
+    with pytest.raises(
+        InputError, match="a Generator cannot complete a scan: that needs a flow of range images"
+    ):
         completing(Generator(network().generator.space, (4,)))
 
 
 def test_a_flow_without_a_condition_says_what_completes_with_it():
-    for model, name, words in ("rectified_flow", "euler", "repaint"), ("transfer_flow", "rk4", "rk4 needs v at"):
+    for model, name, words in (
+        ("rectified_flow", "euler", "repaint"),
+        ("transfer_flow", "rk4", "rk4 needs v at"),
+    ):
         with pytest.raises(InputError, match=words):
             completing(network(model).generator, name)
     assert completing(network().generator, "euler").name == "euler"
@@ -139,6 +172,10 @@ def test_a_flow_without_a_condition_says_what_completes_with_it():
     ],
 )
 def test_what_fits_nothing_is_refused(changed, message):
-    given = {"images": torch.zeros(1, 2, *SHAPE), "state": torch.zeros(1, *SHAPE, dtype=torch.uint8), **changed}
+    given = {
+        "images": torch.zeros(1, 2, *SHAPE),
+        "state": torch.zeros(1, *SHAPE, dtype=torch.uint8),
+        **changed,
+    }
     with pytest.raises(InputError, match=message):
         list(complete(network(), **given))

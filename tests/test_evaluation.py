@@ -16,7 +16,16 @@ from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.comparing import Comparison, with_equal_panels
-from r2flow.evaluation.measuring import Cache, MetricResult, Statistics, Work, gather_real, key_of, measure, real_rule
+from r2flow.evaluation.measuring import (
+    Cache,
+    MetricResult,
+    Statistics,
+    Work,
+    gather_real,
+    key_of,
+    measure,
+    real_rule,
+)
 from r2flow.evaluation.sets import reference_sets, sampled_set
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
@@ -31,7 +40,9 @@ from tests.test_sampling import flow
 READING = Reading(SENSOR)
 
 
-def measured(real: ScanSet, generated: ScanSet, cache: Cache | None = None, work: Work | None = None):
+def measured(
+    real: ScanSet, generated: ScanSet, cache: Cache | None = None, work: Work | None = None
+):
     metrics, work = {"jsd": JSD(), "mmd": MMD()}, work or Work()
     return measure(metrics, gather_real(metrics, real, work, cache), generated, work)
 
@@ -44,39 +55,58 @@ def test_figures_do_not_depend_on_order_batches_or_reading_processes(real, gener
     there = open_scans(str(real), READING)
     expected = figures(there, open_scans(str(generated), READING))
     backwards = folder(tmp_path / "backwards", images(10, 2)[::-1])
-    found = figures(there.part(range(11, -1, -1), "backwards"), open_scans(str(backwards), READING), work=Work(1, 1))
+    found = figures(
+        there.part(range(11, -1, -1), "backwards"),
+        open_scans(str(backwards), READING),
+        work=Work(1, 1),
+    )
     assert found == pytest.approx(expected, rel=1e-10)
 
 
 class TestCache:
-    def test_what_is_kept_gives_the_same_figures_and_is_not_read_again(self, real, generated, tmp_path, monkeypatch):
+    def test_what_is_kept_gives_the_same_figures_and_is_not_read_again(
+        self, real, generated, tmp_path, monkeypatch
+    ):
         cache, other = Cache(tmp_path / "cache"), open_scans(str(generated), READING)
         fresh = figures(open_scans(str(real), READING), other)
         assert figures(open_scans(str(real), READING), other, cache) == fresh
         truth = open_scans(str(real), READING)
-        monkeypatch.setattr(ScanSet, "batches", lambda *_: pytest.fail("the real scans were read again"))
+        monkeypatch.setattr(
+            ScanSet, "batches", lambda *_: pytest.fail("the real scans were read again")
+        )
         gather_real({"jsd": JSD(), "mmd": MMD()}, truth, Work(), cache)
         monkeypatch.undo()
         assert figures(truth, other, cache) == fresh
 
     def test_any_change_of_what_made_them_misses_it(self, real, tmp_path, monkeypatch):
-        def key(root: Path = real, reading: Reading = READING, metric: JSD | None = None, rule: str = "all") -> str:
+        def key(
+            root: Path = real,
+            reading: Reading = READING,
+            metric: JSD | None = None,
+            rule: str = "all",
+        ) -> str:
             return key_of(metric or JSD(), open_scans(str(root), reading), rule)
 
         first = key()
         assert key() == first
 
         class Other(JSD):
-            protocol = property(lambda self: JSD.protocol.fget(self).__class__("jsd", "other", weights="abc"))
+            protocol = property(
+                lambda self: JSD.protocol.fget(self).__class__("jsd", "other", weights="abc")
+            )
 
         keys = [first, key(rule="10 of 12"), *(key(metric=metric) for metric in (MMD(), Other()))]
         changes = {"reflectance": False}, {"projection": "unfolding"}, {"convention": "reference"}
-        keys += [key(reading=Reading(SENSOR, **one)) for one in (*changes, {"reflectance_scale": 2})]
+        keys += [
+            key(reading=Reading(SENSOR, **one)) for one in (*changes, {"reflectance_scale": 2})
+        ]
         keys.append(key_of(JSD(), open_scans(str(real), READING, num=7), "all"))
         monkeypatch.setattr(measuring, "FORMAT", measuring.FORMAT + 1)
         keys.append(key())
         plugin = tmp_path / "plugin.py"
-        monkeypatch.setattr("r2flow.plugins._loaded", {str(plugin): "plugin.py", "a.module": "a.module"})
+        monkeypatch.setattr(
+            "r2flow.plugins._loaded", {str(plugin): "plugin.py", "a.module": "a.module"}
+        )
         for code in ("x = 1", "x = 2"):
             plugin.write_text(code)
             keys.append(key())
@@ -97,7 +127,8 @@ class TestCache:
         for path in cache.folder.glob("*/*"):
             path.write_bytes(path.read_bytes()[:100])
         assert figures(there, other, cache) == expected
-        assert figures(there, other, Cache(tmp_path / ("n" * 256))) == expected  # which cannot be read or written
+        # which cannot be read or written
+        assert figures(there, other, Cache(tmp_path / ("n" * 256))) == expected
 
     def test_a_transposed_state_is_kept_and_another_recipe_gathered_again(self, tmp_path):
         cache, state = Cache(tmp_path), torch.arange(6.0).view(2, 3).T
@@ -109,7 +140,9 @@ class TestCache:
         assert cache.read("key") is None
 
     def test_sampled_scans_are_never_kept(self, tmp_path):
-        gather_real({"jsd": JSD()}, sampled_set(flow(), "flow", 2), Work(), Cache(tmp_path / "cache"))
+        gather_real(
+            {"jsd": JSD()}, sampled_set(flow(), "flow", 2), Work(), Cache(tmp_path / "cache")
+        )
         assert not (tmp_path / "cache").exists()
 
 
@@ -127,7 +160,9 @@ def test_some_metrics_are_of_the_field_s_subset_and_some_of_every_scan(real, mon
 
 
 class CountReturns(JSD):
-    """Returns of all scans; it passes for a metric of a network's features, which are given every real scan."""
+    """Returns of all scans; it passes for a metric of a network's features, which are given every
+    real scan.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -145,24 +180,38 @@ class CountReturns(JSD):
 def test_the_fixed_shuffle_is_stated_and_does_not_change():
     assert fixed_choice(7, 7) == list(range(7))
     key = np.array([0, zlib.crc32(b"shuffle")], dtype=np.uint64)
-    shuffled = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, 0])).permutation(81106)
+    shuffled = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, 0])).permutation(
+        81106
+    )
     assert fixed_choice(81106, 10000)[:3] == sorted(shuffled[:10000])[:3]
-    assert real_rule(JSD(), open_scans("simulated:0", READING, num=10_000)) == (range(10_000), "all 10000")
+    assert real_rule(JSD(), open_scans("simulated:0", READING, num=10_000)) == (
+        range(10_000),
+        "all 10000",
+    )
 
 
 class TestSets:
     def test_a_pcd_and_a_pcd_bin_of_a_name_are_one_sample(self, tmp_path):
         cloud = image_to_points(images(1, 2)[0], SENSOR.rays())
         write_points(tmp_path / "a.pcd", *cloud)
-        np.column_stack([*cloud, np.zeros(len(cloud[0]))]).astype("<f4").tofile(tmp_path / "a.pcd.bin")
+        np.column_stack([*cloud, np.zeros(len(cloud[0]))]).astype("<f4").tofile(
+            tmp_path / "a.pcd.bin"
+        )
         assert open_scans(str(tmp_path), READING).source.names == ["a.pcd.bin"]
 
     def test_scans_are_read_as_all_parts_of_a_mixture_were(self):
-        parts = [{"reading": {"convention": "reference", **more}} for more in ({"reflectance_scale": 255.0}, {})]
+        parts = [
+            {"reading": {"convention": "reference", **more}}
+            for more in ({"reflectance_scale": 255.0}, {})
+        ]
         learned = flow()
         learned.config["data"] = {"name": "mixed", "parts": parts}
         found = reading_for([], learned)
-        assert (found.projection, found.convention, found.reflectance_scale) == ("spherical", "reference", 1.0)
+        assert (found.projection, found.convention, found.reflectance_scale) == (
+            "spherical",
+            "reference",
+            1.0,
+        )
 
     def test_a_flow_is_sampled_from_the_noise_of_evaluations(self, real):
         drawn = sampled_set(flow(), "flow", 5, build_sampler("euler", steps=1), seed=9)
@@ -183,7 +232,9 @@ class TestExtremes:
         made = images(4, 2)
         made[1] = 0
         made[2, 0] = np.where(made[2, 0] > 0, 70, 0)  # beyond the mask
-        found = measured(*(open_scans(str(one), READING) for one in (real, folder(tmp_path / "g", made))))
+        found = measured(
+            *(open_scans(str(one), READING) for one in (real, folder(tmp_path / "g", made)))
+        )
         assert all(math.isfinite(value) for one in found for value in one.figures.values())
         assert all(one.protocol["sizes"]["generated_empty"] == 2 for one in found)
         assert all("2 of 4 generated scans" in " ".join(one.remarks) for one in found)
@@ -197,7 +248,9 @@ class TestExtremes:
 
 def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path, monkeypatch):
     real = open_scans(f"kitti_360:{kitti_360}", READING, "train")
-    found = reference_sets(real, {"generated": open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)})
+    found = reference_sets(
+        real, {"generated": open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)}
+    )
     assert list(found) == ["real halves", "generated, as many", "real drives"]
     names = real.source.names
     halves = [one.source.names for one in found["real halves"]]
@@ -208,7 +261,9 @@ def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path, monk
     assert len(reference_sets(real, {"flow": sampled})["flow, as many"][1]) == 5
     monkeypatch.setattr("r2flow.evaluation.sets.AGAIN", 4)
     assert "flow, as many" not in reference_sets(real, {"flow": sampled})
-    drives = [{name.split("/")[1][17:21] for name in one.source.names} for one in found["real drives"]]
+    drives = [
+        {name.split("/")[1][17:21] for name in one.source.names} for one in found["real drives"]
+    ]
     assert drives == [{"0003"}, {"0004"}]
     with pytest.raises(InputError, match="at least two"):
         reference_sets(real.part([0], "one"))
@@ -237,7 +292,8 @@ FEW = "too few scans for a verdict: 24 real, 18 generated, 200 and 100 needed"
         ("panel", 24, 18, 9.0, 11.0, f"above the real halves, below the baselines; {FEW}"),
         ("panel", 24, 18, 60.0, 9.5, f"not above the real halves, not below the baselines; {FEW}"),
         ("panel", 24, 18, 9.0, None, FEW),
-        ("panel", 200, 200, 9.0, None, "give 100 generated"),  # the halves' distance is larger since they are fewer
+        # the halves' distance is larger since they are fewer
+        ("panel", 200, 200, 9.0, None, "give 100 generated"),
         ("panel", 200, 200, 9.0, 9.5, "not distinguishable"),
         ("panel", 200, 200, 9.0, 15.5, "higher than between the real halves"),
         ("panel", 200, 200, 15.5, None, "higher than between the real halves"),
@@ -251,40 +307,69 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
     ]  # fmt: skip
     cases += [("a, as many", equal, (half, half), "reference")] * (equal is not None)
     comparisons = [
-        Comparison(name, *map(range, sizes), [MetricResult(metric, {metric: number}, {}, True)], kind)
+        Comparison(
+            name, *map(range, sizes), [MetricResult(metric, {metric: number}, {}, True)], kind
+        )
         for name, number, sizes, kind in cases
     ]
     first, second = verdict(comparisons)
     same = f"in as many scans as the halves {equal:g}, " if equal is not None else ""
-    assert first.startswith(f"a: {metric} {value:g} ({same}reference: real halves 10, baseline: noise 50): ")
+    assert first.startswith(
+        f"a: {metric} {value:g} ({same}reference: real halves 10, baseline: noise 50): "
+    )
     assert words in first
     assert second.startswith(f"b: {metric} {value + 1:g} ")
 
 
 @pytest.mark.parametrize(
-    ("noise", "said"), [(9.0, ["jsd ranks nothing here, with baselines below the real halves: noise."]), (11.0, [])]
+    ("noise", "said"),
+    [(9.0, ["jsd ranks nothing here, with baselines below the real halves: noise."]), (11.0, [])],
 )
 def test_a_figure_by_which_a_baseline_is_nearer_than_real_scans_ranks_nothing(noise, said):
     cases = ("a", 7.0, "judged"), ("real halves", 10.0, "reference"), ("noise", noise, "baseline")
-    results = [(name, [MetricResult("jsd", {"jsd": value}, {}, True)], kind) for name, value, kind in cases]
-    assert remarks_of([Comparison(name, range(9), range(9), one, kind) for name, one, kind in results]) == said
+    results = [
+        (name, [MetricResult("jsd", {"jsd": value}, {}, True)], kind) for name, value, kind in cases
+    ]
+    assert (
+        remarks_of([Comparison(name, range(9), range(9), one, kind) for name, one, kind in results])
+        == said
+    )
 
 
 def test_the_verdict_is_of_the_panel_if_measured():
     sizes = {"sizes": {"generated_empty": 3}}
-    results = [MetricResult(name, {name: value}, sizes, True) for name, value in (("jsd", 5.0), ("panel", 7.0))]
+    results = [
+        MetricResult(name, {name: value}, sizes, True)
+        for name, value in (("jsd", 5.0), ("panel", 7.0))
+    ]
     named = (("a", "judged"), ("real halves", "reference"))
     both = [Comparison(name, range(200), range(200), results, kind) for name, kind in named]
     assert verdict(both)[0].startswith("a: panel 7 (reference: real halves 7): not distinguishable")
     assert verdict(both)[0].endswith("; 3 of its scans are empty and not compared.")
     few = [replace(one, real=range(20), generated=range(20)) for one in both]
     assert "not above the real halves; too few" in verdict(few)[0]
-    assert verdict([replace(one, measured=[MetricResult("kid_x", {"kid_x": 5.0}, {}, False)]) for one in both]) == []
+    assert (
+        verdict(
+            [
+                replace(one, measured=[MetricResult("kid_x", {"kid_x": 5.0}, {}, False)])
+                for one in both
+            ]
+        )
+        == []
+    )
 
 
 def test_panels_are_means_of_the_same_lines():
     lines = dict.fromkeys(PANEL, 0.2)
-    panels = [{"panel": 0.2, **lines, REFLECTANCE: math.nan}, {"panel": 0.3, **lines, REFLECTANCE: 1.4}]
-    sets = [Comparison(str(i), [], [], [MetricResult("panel", one, {}, True)]) for i, one in enumerate(panels)]
-    assert [c.measured[0].figures["panel"] for c in with_equal_panels(sets)] == pytest.approx([0.2, 0.2])
+    panels = [
+        {"panel": 0.2, **lines, REFLECTANCE: math.nan},
+        {"panel": 0.3, **lines, REFLECTANCE: 1.4},
+    ]
+    sets = [
+        Comparison(str(i), [], [], [MetricResult("panel", one, {}, True)])
+        for i, one in enumerate(panels)
+    ]
+    assert [c.measured[0].figures["panel"] for c in with_equal_panels(sets)] == pytest.approx(
+        [0.2, 0.2]
+    )
     assert with_equal_panels(sets[1:]) == sets[1:]

@@ -20,7 +20,9 @@ from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import ROOT, tiny_options
 
-ONNX = pytest.mark.skipif(not (find_spec("onnxscript") and find_spec("onnxruntime")), reason="the extra 'export'")
+ONNX = pytest.mark.skipif(
+    not (find_spec("onnxscript") and find_spec("onnxruntime")), reason="the extra 'export'"
+)
 KINDS = ["pt2", pytest.param("onnx", marks=ONNX)]
 SHORT = build_sampler("adams3", steps=3, grid="power:1.5", finish=1 / 32)
 
@@ -50,7 +52,8 @@ def flow(name: str, generator: str = "rectified_flow") -> Checkpoint:
             [0, 0.375, 0.75],
             [[1, 0, 0, 0], [1, 0.375, 0, 0], [1, 0, 0.75, 0], [1, 0, 0.75, 0.25]],
         ),
-        # After Euler's first step, the trapezoidal rule corrects it: h (v_0 + v_1) / 2 + h (3 v_1 - v_0) / 2
+        # After Euler's first step, the trapezoidal rule corrects it: h (v_0 + v_1) / 2 + h (3 v_1 -
+        # v_0) / 2
         ("adams3:steps=2:grid=uniform:finish=0", [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0, 1]]),
         (
             "rk4:steps=1",
@@ -69,17 +72,23 @@ def test_a_sampler_is_its_butcher_tableau(sampler, times, states):
     found = tableau(flow("efficient_unet").generator, build_sampler(sampler))
     assert found.times == pytest.approx(times)
     assert found.second is None
-    torch.testing.assert_close(found.states, torch.tensor(states, dtype=torch.float64), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        found.states, torch.tensor(states, dtype=torch.float64), rtol=0, atol=1e-12
+    )
 
 
 def test_jumps_have_two_times():
     found = tableau(flow("efficient_unet", "flow_map").generator, build_sampler("jump", steps=2))
     assert found.times == [0, 0.5]
     assert found.second == [0.5, 1]
-    torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]).double())
+    torch.testing.assert_close(
+        found.states, torch.tensor([[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]).double()
+    )
 
 
-@pytest.mark.parametrize("sampler", ["dopri5", "torchdiffeq:method=rk4", "sde:steps=2", "mmps:steps=2", "renoise"])
+@pytest.mark.parametrize(
+    "sampler", ["dopri5", "torchdiffeq:method=rk4", "sde:steps=2", "mmps:steps=2", "renoise"]
+)
 def test_a_sampler_that_is_no_fixed_number_of_steps_of_the_ode_is_refused(sampler, tmp_path):
     with pytest.raises(InputError, match="cannot be exported|renoise needs noise"):
         export(flow("efficient_unet", "flow_map"), tmp_path / "flow.pt2", build_sampler(sampler))
@@ -91,7 +100,9 @@ class Clipped(RectifiedFlow):
         return super().velocity(t, x).clamp(-20, 20)
 
 
-@pytest.mark.parametrize(("network", "words"), [(True, "Clipped is more than its network"), (False, "is not linear")])
+@pytest.mark.parametrize(
+    ("network", "words"), [(True, "Clipped is more than its network"), (False, "is not linear")]
+)
 def test_a_velocity_of_ones_own_is_not_exported_as_the_network(network, words, tmp_path):
     checkpoint = flow("efficient_unet")
     checkpoint.generator.__class__ = Clipped
@@ -118,10 +129,16 @@ def test_an_export_leaves_the_model_as_it_was_and_takes_a_samplers_name(tmp_path
     assert checkpoint.generator.backbone.training
 
 
-def test_a_missing_package_names_its_extra_before_the_work_begins(r2flow, saved, tmp_path, monkeypatch):
+def test_a_missing_package_names_its_extra_before_the_work_begins(
+    r2flow, saved, tmp_path, monkeypatch
+):
     monkeypatch.setattr("r2flow.errors.find_spec", lambda name: None)
     missing = "an .onnx needs the package onnx: python -m pip install 'r2flow[export]'."
-    assert r2flow("export", saved[0], "--out", tmp_path / "flow.onnx") == (2, "", f"error: {missing}\n")
+    assert r2flow("export", saved[0], "--out", tmp_path / "flow.onnx") == (
+        2,
+        "",
+        f"error: {missing}\n",
+    )
 
 
 @pytest.mark.slow
@@ -135,7 +152,8 @@ def test_an_exported_sampler_gives_the_same_scans(name, kind, tmp_path):
         assert apart.metres < 1e-3
         assert apart.reflectance < 1e-5
         assert apart.rays == 0
-    assert compare(checkpoint, written, replace(SHORT, steps=9)).metres > 1e-2  # another sampler is another scan
+    # another sampler is another scan
+    assert compare(checkpoint, written, replace(SHORT, steps=9)).metres > 1e-2
 
 
 @pytest.mark.slow
@@ -153,7 +171,10 @@ def test_points_and_notes_come_with_the_scan(tmp_path):
     assert notes["r2flow"] == __version__
     assert notes["sensor"].items() >= {"name": "hdl64e", "columns": 64}.items()
     assert notes["sampler"]["steps"] == 3
-    assert notes["times"] == {"t": pytest.approx([0, 1 - ((1 + 32 ** (-2 / 3)) / 2) ** 1.5, 31 / 32]), "s": None}
+    assert notes["times"] == {
+        "t": pytest.approx([0, 1 - ((1 + 32 ** (-2 / 3)) / 2) ** 1.5, 31 / 32]),
+        "s": None,
+    }
 
 
 @pytest.mark.slow
@@ -181,8 +202,12 @@ def test_a_flow_map_goes_through_the_loop_and_the_page_s_program_runs(tmp_path, 
     assert apart.metres < 1e-3
     assert apart.rays == 0
     names: dict = {}
-    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sample.md").read_text(), flags=re.DOTALL)
+    snippets = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "sample.md").read_text(), flags=re.DOTALL
+    )
     exec(next(code for code in snippets if "InferenceSession" in code), names)
     scan, cloud = names["scan"][0], names["cloud"]
-    np.testing.assert_allclose(np.linalg.norm(cloud, axis=1), scan[0][scan[0] > 0], rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(cloud, axis=1), scan[0][scan[0] > 0], rtol=1e-5, atol=1e-4
+    )
     assert names["notes"]["evaluations"] == 3

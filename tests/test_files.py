@@ -40,9 +40,13 @@ def test_what_is_no_file_is_refused_by_its_name_and_stays(tmp_path):
         ("out", "is a folder"), ("pipe", "is not a regular file"), ("link", "is not a regular file"),
         ("/dev/null", "is not a regular file"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=f"{tmp_path / name} {words}"), atomic_write(tmp_path / name):
+        with (
+            pytest.raises(InputError, match=f"{tmp_path / name} {words}"),
+            atomic_write(tmp_path / name),
+        ):
             pytest.fail("the block was entered")
-    with pytest.raises(FileExistsError), atomic_write(tmp_path / "dangling" / "file"):  # a disk that is not mounted
+    # a disk that is not mounted
+    with pytest.raises(FileExistsError), atomic_write(tmp_path / "dangling" / "file"):
         pass
     assert sorted(os.listdir(tmp_path)) == before
     assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
@@ -79,11 +83,18 @@ def test_a_read_only_folder_is_an_error_with_the_file_s_own_name(tmp_path, monke
 
 
 def test_the_hash_of_a_state_is_of_names_shapes_types_and_bytes():
-    state = {"b": torch.tensor([1.0, 2.0]).bfloat16(), "a": torch.tensor([[1, 2], [3, 4]]).T, "c": torch.tensor(0.5)}
+    state = {
+        "b": torch.tensor([1.0, 2.0]).bfloat16(),
+        "a": torch.tensor([[1, 2], [3, 4]]).T,
+        "c": torch.tensor(0.5),
+    }
     named = (
         b"a (2, 2) torch.int64" + struct.pack("<4q", 1, 3, 2, 4)
         + b"b (2,) torch.bfloat16" + bytes.fromhex("803f0040")
         + b"c () torch.float32" + struct.pack("<f", 0.5)
     )  # fmt: skip
     assert state_hash(state) == hashlib.sha256(named).hexdigest()
-    assert state_hash(dict(reversed(state.items())), {"k": 1}) == hashlib.sha256(b'{"k": 1}' + named).hexdigest()
+    assert (
+        state_hash(dict(reversed(state.items())), {"k": 1})
+        == hashlib.sha256(b'{"k": 1}' + named).hexdigest()
+    )

@@ -1,4 +1,6 @@
-"""Ten thousand damaged files over every reader: one line, or what was written; no crash, no hang, no memory."""
+"""Ten thousand damaged files over every reader: one line, or what was written; no crash, no hang,
+no memory.
+"""
 
 import importlib.util
 import io
@@ -34,13 +36,17 @@ def write_scans(folder: Path) -> None:
     for name, content in in_every_format(folder.parent).items():
         ending, _, kind = name.partition(" ")
         (folder / f"{kind or 'a'}.{ending}").write_bytes(content)
-    np.savetxt(folder / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="", fmt="%.2f")
+    np.savetxt(
+        folder / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="", fmt="%.2f"
+    )
     np.savetxt(folder / "a.xyz", TABLE, fmt="%.2f")
     if importlib.util.find_spec("pyarrow"):
         import pyarrow
         from pyarrow import feather, parquet
 
-        table = pyarrow.table({"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2], "intensity": REFLECTANCE})
+        table = pyarrow.table(
+            {"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2], "intensity": REFLECTANCE}
+        )
         feather.write_feather(table, folder / "a.feather")
         parquet.write_table(table, folder / "a.parquet")
     if importlib.util.find_spec("laspy"):
@@ -92,7 +98,11 @@ def write_weights(folder: Path, beside: Path, run: Path) -> None:
     keep(folder, "checkpoint", run, model)
     weights = beside / "weights.pth"
     torch.save({"fc.weight": torch.randn(16, 16), "fc.bias": torch.randn(16)}, weights)
-    torch.save({"fc.weight": torch.randn(16, 16)}, beside / "legacy.pth", _use_new_zipfile_serialization=False)
+    torch.save(
+        {"fc.weight": torch.randn(16, 16)},
+        beside / "legacy.pth",
+        _use_new_zipfile_serialization=False,
+    )
     with tarfile.open(beside / "release.tar.gz", "w:gz") as tar:
         for name, data in (("model.ckpt", weights.read_bytes()), ("arch_cfg.yaml", b"name: net\n")):
             info = tarfile.TarInfo(f"net/{name}")
@@ -110,7 +120,12 @@ def test_damaged_files_are_one_line_or_what_was_written(tmp_path: Path, saved, e
     command = [sys.executable, "-m", "tests.fuzz", str(folder), str(SEED), str(each)]
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
     done = subprocess.run(
-        command, capture_output=True, text=True, cwd=ROOT, env={**os.environ, **threads}, timeout=3000
+        command,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, **threads},
+        timeout=3000,
     )
     said = [json.loads(line) for line in done.stdout.splitlines()]
     found = [line for line in said if line[0] != "done"]

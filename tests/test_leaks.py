@@ -47,7 +47,9 @@ def test_two_thousand_training_steps(scans, tmp_path, workers):  # noqa: F811
         "loggers=[csv,tensorboard]",
     )  # fmt: skip
     run, held = build(compose(options)), Held()
-    noting = LambdaCallback(on_train_batch_end=lambda trainer, *_: trainer.global_step % 400 or held.note())
+    noting = LambdaCallback(
+        on_train_batch_end=lambda trainer, *_: trainer.global_step % 400 or held.note()
+    )
     run.trainer.callbacks.append(noting)
     assert fit(run).finished
     assert len(held.noted) == 5

@@ -9,18 +9,24 @@ import lightning as L
 import pytest
 import torch
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from r2flow.callbacks import EMA, ReflowPairs
 from torch.utils.data import DataLoader
 
 import r2flow
 from r2flow import Distill, Rectify, Reflow, ScanDataModule
-from r2flow.callbacks import EMA, ReflowPairs
 from tests.conftest import ROOT, quiet_trainer
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*")
 
 BLOCK = re.compile(r"^```python( script)?\n(.*?)^```", re.M | re.S)
 SENSOR = {"name": "hdl64e", "rows": 8, "columns": 64}
-BACKBONE = {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16}
+BACKBONE = {
+    "name": "hdit",
+    "base_channels": 8,
+    "depths": [1, 1],
+    "num_heads": [1, 2],
+    "time_channels": 16,
+}
 
 
 def scans(**options) -> ScanDataModule:
@@ -40,11 +46,20 @@ def test_the_page_runs_block_by_block(tmp_path: Path, monkeypatch: pytest.Monkey
         if is_script:
             script = tmp_path / "script.py"
             script.write_text(code)
-            environment = {"PYTHONPATH": str(ROOT), "PATH": "", "OMP_NUM_THREADS": "1", "HOME": str(tmp_path)}
-            subprocess.run([sys.executable, script], check=True, timeout=200, cwd=tmp_path, env=environment)
+            environment = {
+                "PYTHONPATH": str(ROOT),
+                "PATH": "",
+                "OMP_NUM_THREADS": "1",
+                "HOME": str(tmp_path),
+            }
+            subprocess.run(
+                [sys.executable, script], check=True, timeout=200, cwd=tmp_path, env=environment
+            )
         else:
             exec(compile(code, f"docs/lightning.md, block {number + 1}", "exec"), names)
-    assert {"test/panel", "test/run lengths"} <= names["trainer"].callback_metrics.keys() | set(names["tested"])
+    assert {"test/panel", "test/run lengths"} <= names["trainer"].callback_metrics.keys() | set(
+        names["tested"]
+    )
     assert names["scans"][0].shape == (4, 2, 32, 256)
     assert names["flow"].hparams.learning_rate == 2e-3
 
@@ -73,14 +88,19 @@ def ended(trainer: L.Trainer) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in trainer.lightning_module.state_dict().items()}
 
 
-@pytest.mark.parametrize("stopped_at", [2, 3, 4])  # an epoch has 3 batches of 4 of the 12 - 2 scans ... 2 whole ones
+# an epoch has 3 batches of 4 of the 12 - 2 scans ... 2 whole ones
+@pytest.mark.parametrize("stopped_at", [2, 3, 4])
 def test_a_run_resumed_anywhere_ends_with_the_same_bits(tmp_path: Path, stopped_at: int):
     def trainer(steps: int, *callbacks: L.Callback) -> L.Trainer:
-        return quiet_trainer(tmp_path, max_steps=steps, callbacks=[EMA(every=1), *callbacks], gradient_clip_val=1.0)
+        return quiet_trainer(
+            tmp_path, max_steps=steps, callbacks=[EMA(every=1), *callbacks], gradient_clip_val=1.0
+        )
 
     whole = trainer(7)
     whole.fit(flow(), scans())
-    keep = ModelCheckpoint(tmp_path, every_n_train_steps=stopped_at, save_top_k=1, monitor=None, filename="kept")
+    keep = ModelCheckpoint(
+        tmp_path, every_n_train_steps=stopped_at, save_top_k=1, monitor=None, filename="kept"
+    )
     first = quiet_trainer(
         tmp_path, max_steps=7, callbacks=[EMA(every=1), keep, StopAfter(stopped_at)], gradient_clip_val=1.0,
         enable_checkpointing=True,
@@ -107,11 +127,17 @@ def test_a_checkpoint_of_a_plain_trainer_is_complete(tmp_path: Path):
     trainer.fit(flow(learning_rate=1e-3, sampler={"steps": 3}, seed=5), data)
     trainer.save_checkpoint(tmp_path / "last.ckpt")
     loaded = Rectify.load_from_checkpoint(tmp_path / "last.ckpt")
-    assert (loaded.hparams.learning_rate, loaded.hparams.seed, loaded.sensor.shape) == (1e-3, 5, (8, 64))
+    assert (loaded.hparams.learning_rate, loaded.hparams.seed, loaded.sensor.shape) == (
+        1e-3,
+        5,
+        (8, 64),
+    )
     model = r2flow.load(tmp_path / "last.ckpt")
     assert model.generator.sampler == loaded.generator.sampler
     assert model.generator.sampler.steps == 3
-    for (name, value), other in zip(model.generator.named_parameters(), loaded.generator.parameters(), strict=True):
+    for (name, value), other in zip(
+        model.generator.named_parameters(), loaded.generator.parameters(), strict=True
+    ):
         assert torch.equal(value, other), name
     drawn = torch.cat(quiet_trainer(tmp_path).predict(loaded, data))
     torch.testing.assert_close(drawn, model.sample(len(drawn), seed=5, batch_size=4))
@@ -120,7 +146,9 @@ def test_a_checkpoint_of_a_plain_trainer_is_complete(tmp_path: Path):
 def test_lightning_s_options_work(tmp_path: Path):
     stop = EarlyStopping("val/loss", patience=0, min_delta=1e9)
     best = ModelCheckpoint(tmp_path / "best", monitor="val/loss")
-    trainer = quiet_trainer(tmp_path, max_epochs=9, callbacks=[stop, best], enable_checkpointing=True)
+    trainer = quiet_trainer(
+        tmp_path, max_epochs=9, callbacks=[stop, best], enable_checkpointing=True
+    )
     trainer.fit(flow(), scans())
     assert trainer.current_epoch == 2  # the second epoch was not better by a thousand million
     assert r2flow.load(best.best_model_path).step in (2, 4)
@@ -156,7 +184,9 @@ def test_straightening_and_distilling(tmp_path: Path):
     trainer.save_checkpoint(tmp_path / "1rf.ckpt")
     parent = "1rf"
     for name, stage, first in (("2rf", Reflow, 0), ("2td", Distill, 8)):
-        data = ScanDataModule("pairs", pairs={"num": 8, "batch_size": 4, "sampler": {"name": "euler", "steps": 2}})
+        data = ScanDataModule(
+            "pairs", pairs={"num": 8, "batch_size": 4, "sampler": {"name": "euler", "steps": 2}}
+        )
         trainer = quiet_trainer(tmp_path, max_steps=1, callbacks=[ReflowPairs()])
         trainer.fit(stage(parent=tmp_path / f"{parent}.ckpt"), data)
         trainer.save_checkpoint(tmp_path / f"{name}.ckpt")
@@ -179,5 +209,7 @@ def test_scans_of_any_loader(tmp_path: Path):
 
 
 def test_other_scans_than_the_module_s_are_refused(tmp_path: Path):
-    with pytest.raises(r2flow.errors.InputError, match="the module's images are 64x1024 of hdl64e, the data's 8x64"):
+    with pytest.raises(
+        r2flow.errors.InputError, match="the module's images are 64x1024 of hdl64e, the data's 8x64"
+    ):
         quiet_trainer(tmp_path, max_steps=1).fit(Rectify("hdit_tiny"), scans())

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.model.lineage import Parent, find_parent
+from r2flow.registry import construct
 from r2flow.runs.composing import compose
 from r2flow.store import Store
 from r2flow.training import check
@@ -29,7 +31,11 @@ def parent(tmp_path: Path) -> Path:
 
 
 def child(parent: Path, reflectance) -> dict:
-    return {**CONFIG, "encoding": {**ENCODING, "reflectance": reflectance}, "stage": {"name": "rectify", "parent": str(parent)}}
+    return {
+        **CONFIG,
+        "encoding": {**ENCODING, "reflectance": reflectance},
+        "stage": {"name": "rectify", "parent": str(parent)},
+    }
 
 
 def completed(config: dict, asked: list[str], parent: Parent | None = None) -> dict:
@@ -61,14 +67,20 @@ def sized(config: dict, rows: int, columns: int, **backbone) -> dict:
         (["sensor.columns=128"], (8, 128)),
     ],
 )
-def test_a_sensor_is_the_parents_unless_another_is_asked_for(parent: Path, asked: list[str], shape: tuple[int, int]):
+def test_a_sensor_is_the_parents_unless_another_is_asked_for(
+    parent: Path, asked: list[str], shape: tuple[int, int]
+):
     config = completed(sized(child(parent, False), 16, 128), asked)
     assert (config["sensor"]["rows"], config["sensor"]["columns"]) == shape
 
 
 def test_pairs_are_images_of_the_parents_sensor(parent: Path):
     pairs = {"name": "pairs", "root": None, "pairs": {}}
-    config = {**sized(child(parent, False), 16, 128), "data": pairs, "stage": {"name": "reflow", "parent": str(parent)}}
+    config = {
+        **sized(child(parent, False), 16, 128),
+        "data": pairs,
+        "stage": {"name": "reflow", "parent": str(parent)},
+    }
     assert completed(config, [])["sensor"]["rows"] == 8
     with pytest.raises(InputError, match="sensor.rows is 16 here, but 8 in"):
         completed(config, ["sensor.rows=16"])
@@ -77,23 +89,38 @@ def test_pairs_are_images_of_the_parents_sensor(parent: Path):
 def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
     def on_pairs_of(flow: Path | None) -> dict:
         data = {"name": "pairs", "root": None, "pairs": {"of": flow and str(flow)}}
-        return completed({**child(parent, False), "data": data, "stage": {"name": "reflow", "parent": str(parent)}}, [])
+        return completed(
+            {
+                **child(parent, False),
+                "data": data,
+                "stage": {"name": "reflow", "parent": str(parent)},
+            },
+            [],
+        )
 
     other = write_checkpoint(tmp_path / "other" / "flow.ckpt", {**CONFIG, "seed": 1})
     config = on_pairs_of(other)
     its_own = config["stage"]["parent"]
-    assert config["data"]["pairs"]["parent"] == weights_hash(load_checkpoint(other)) != its_own["weights"]
+    assert (
+        config["data"]["pairs"]["parent"]
+        == weights_hash(load_checkpoint(other))
+        != its_own["weights"]
+    )
     assert Path(config["data"]["root"]).parent == other.parent
     own = on_pairs_of(None)
     assert own["data"]["pairs"]["parent"] == own["stage"]["parent"]["weights"] == its_own["weights"]
     assert Path(own["data"]["root"]).parent == Path(its_own["path"]).parent == parent.parent
-    with pytest.raises(InputError, match=r"data\.pairs\.of=.*taller\.ckpt has another sensor than .*parent\.ckpt"):
+    with pytest.raises(
+        InputError, match=r"data\.pairs\.of=.*taller\.ckpt has another sensor than .*parent\.ckpt"
+    ):
         on_pairs_of(write_checkpoint(tmp_path / "taller.ckpt", sized(CONFIG, 16, 64)))
 
 
 @pytest.mark.parametrize("position", ["none", "polar", "spherical_harmonics"])
 def test_weights_move_to_another_size_where_none_belongs_to_a_place(position: str):
-    theirs, ours = (build_generator(sized(CONFIG, *size, position=position)) for size in ((8, 64), (16, 128)))
+    theirs, ours = (
+        build_generator(sized(CONFIG, *size, position=position)) for size in ((8, 64), (16, 128))
+    )
     with torch.no_grad():
         for value in theirs.parameters():
             value.normal_()
@@ -102,7 +129,8 @@ def test_weights_move_to_another_size_where_none_belongs_to_a_place(position: st
     there = dict(theirs.named_parameters())
     assert all(torch.equal(value, there[name]) for name, value in ours.named_parameters())
     assert torch.equal(ours.backbone.coords, rays)
-    # A network made for the size, with these weights, does the same: nothing of the old rays is left.
+    # A network made for the size, with these weights, does the same: nothing of the old rays is
+    # left.
     same = build_generator(sized(CONFIG, 16, 128, position=position))
     same.load_state_dict({**theirs.state_dict(), "backbone.coords": rays})
     x, t = torch.randn(1, 1, 16, 128), torch.tensor(0.3)
@@ -111,12 +139,18 @@ def test_weights_move_to_another_size_where_none_belongs_to_a_place(position: st
 
 
 def test_weights_that_belong_to_a_place_do_not_move():
-    theirs, ours = (build_generator(sized(CONFIG, *size, position="learnable")) for size in ((8, 64), (16, 128)))
+    theirs, ours = (
+        build_generator(sized(CONFIG, *size, position="learnable")) for size in ((8, 64), (16, 128))
+    )
     with pytest.raises(InputError, match=r"do not fit .*give the sensor .*size mismatch"):
         ours.start_from(theirs)
 
 
 SENSOR_012 = replace(SENSOR, reflectance_scale=0.012)
+
+
+def data_options(**options: Any) -> DataOptions:
+    return construct("data", DataOptions, options)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +170,7 @@ def test_full_reflectance_is_what_was_given_else_the_sensors_and_one_in_what_r2f
     Store(tmp_path / "drawn", "samples", {}).begin()
     (tmp_path / "scans").mkdir()
     (tmp_path / "scans" / "manifest.json").write_text('{"version": 1}')  # of a data set
-    data = DataOptions(name, str(tmp_path / root), reading={"reflectance_scale": given})
+    data = data_options(name=name, root=str(tmp_path / root), reading={"reflectance_scale": given})
     (one,) = plan_data(data, SENSOR_012).sets
     assert one.reading.reflectance_scale == expected
 
@@ -147,14 +181,24 @@ def test_each_set_of_scans_says_its_whole_reading():
     data = {"name": "mixed", "parts": [part, other], "validation": {"data": part, "scans": 4}}
     reading = {"convention": "reference", "columns": None}
     found = ScanDataModule(**data, reading=reading, sensor=SENSOR_012).described()
-    scales = [one["reading"]["reflectance_scale"] for one in (*found["parts"], found["validation"]["data"])]
+    scales = [
+        one["reading"]["reflectance_scale"]
+        for one in (*found["parts"], found["validation"]["data"])
+    ]
     assert scales == [0.012, 2.0, 0.012]
     for one in (*found["parts"], found["validation"]["data"]):
-        whole = {"projection": "spherical", "convention": "reference", "columns": None, "on_bad_scan": "error"}
+        whole = {
+            "projection": "spherical",
+            "convention": "reference",
+            "columns": None,
+            "on_bad_scan": "error",
+        }
         assert one["reading"] == {**whole, "reflectance_scale": one["reading"]["reflectance_scale"]}
     assert ScanDataModule(**found).described() == found  # a run that is resumed says the same
     reading = {"projection": "unfolding", "reflectance_scale": 2.0}
-    scans = plan_data(DataOptions("pairs", scans=part, reading=reading), SENSOR_012).scans.reading
+    scans = plan_data(
+        data_options(name="pairs", scans=part, reading=reading), SENSOR_012
+    ).scans.reading
     assert (scans.projection, scans.reflectance_scale) == ("unfolding", 0.012)
 
 
@@ -174,16 +218,30 @@ def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Pa
 
     assert found() == ("unfolding", "reference")
     assert found(reading={"projection": "spherical"}) == ("spherical", "reference")
-    assert found(name="mixed", root=None, parts=[{"name": "folder", "root": "scans"}]) == ("unfolding", "reference")
+    assert found(name="mixed", root=None, parts=[{"name": "folder", "root": "scans"}]) == (
+        "unfolding",
+        "reference",
+    )
     for name, parts in (("simulated", None), ("mixed", [{"name": "simulated"}])):
         assert found(name=name, root=None, parts=parts) == ("spherical", "centre")
 
 
 def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):
     read = {"projection": "unfolding", "convention": "reference", "reflectance_scale": 255.0}
-    data = {"name": "pairs", "root": None, "pairs": {}, "reading": {**dict.fromkeys(read), "projection": "spherical"}}
-    config = {**child(parent, False), "data": data, "stage": {"name": "reflow", "parent": str(parent)}}
+    data = {
+        "name": "pairs",
+        "root": None,
+        "pairs": {},
+        "reading": {**dict.fromkeys(read), "projection": "spherical"},
+    }
+    config = {
+        **child(parent, False),
+        "data": data,
+        "stage": {"name": "reflow", "parent": str(parent)},
+    }
     there = parent_of(read, parent)
     assert {key: completed(config, [], there)["data"]["reading"][key] for key in read} == read
-    with pytest.raises(InputError, match=r"data\.reading\.projection is that of the flow that draws the pairs"):
+    with pytest.raises(
+        InputError, match=r"data\.reading\.projection is that of the flow that draws the pairs"
+    ):
         completed(config, ["data.reading.projection"], there)

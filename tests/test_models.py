@@ -30,7 +30,9 @@ def test_a_model_of_the_package_draws(name):
     assert name_of(found.path) == name
     assert all(value.isfinite().all() for value in found.generator.state_dict().values())
     if not found.generator.unconditional:
-        with pytest.raises(InputError, match="give one of which a ray is known, as r2flow complete"):
+        with pytest.raises(
+            InputError, match="give one of which a ray is known, as r2flow complete"
+        ):
             found.sample(1)
         return
     images = found.sample(1, steps=1)
@@ -52,14 +54,21 @@ AHEAD = {"drop_wrong": 0.6, "chamfer_m": 1.0, "mae_all_m": 1.0}  # of interpolat
           for name, size in (("os1_64", (64, 1024)), ("vlp32c", (32, 1800)), ("hdl32e", (32, 1024)))),
     ],
 )  # fmt: skip
-def test_densify_is_ahead_of_interpolation(name: str, size: tuple[int, int], task: str, most: dict[str, float]):
-    sensor = build_sensor(name, *size, elevations=np.linspace(-5, -60, 32) if name == "down" else None)
+def test_densify_is_ahead_of_interpolation(
+    name: str, size: tuple[int, int], task: str, most: dict[str, float]
+):
+    sensor = build_sensor(
+        name, *size, elevations=np.linspace(-5, -60, 32) if name == "down" else None
+    )
     image = simulate(sensor, 77, 0).image
     measured = parse_mask(task)(np.ones(size, bool), np.random.default_rng(0))
     state = ray_states(torch.from_numpy(image)[None], torch.from_numpy(measured))
     found = load_checkpoint("densify").through(sensor, numbered=name == "hdl64e")
     answer = found.complete(torch.from_numpy(image * measured)[None], state)[0, 0].numpy()
-    ours, lines = (errors(image, one, ~measured, sensor) for one in (answer, interpolated(image * measured, measured)))
+    ours, lines = (
+        errors(image, one, ~measured, sensor)
+        for one in (answer, interpolated(image * measured, measured))
+    )
     assert all(ours[key] < share * lines[key] for key, share in most.items())
     assert name != "hdl64e" or ours["iou"] > 1.15 * lines["iou"]
 
@@ -127,16 +136,26 @@ def test_half_precision_rounds_large_weights_alone(saved, tmp_path):
     original = load_checkpoint(saved[0])
     save_checkpoint(original, tmp_path / "half.safetensors", half=True)
     save_checkpoint(original, tmp_path / "again.safetensors", half=True)
-    assert (tmp_path / "half.safetensors").read_bytes() == (tmp_path / "again.safetensors").read_bytes()
+    assert (tmp_path / "half.safetensors").read_bytes() == (
+        tmp_path / "again.safetensors"
+    ).read_bytes()
     with safe_open(tmp_path / "half.safetensors", framework="pt") as file:
         kinds = {name: file.get_tensor(name).dtype for name in file.keys()}  # noqa: SIM118
-    large = {name for name, value in original.generator.named_parameters() if value.ndim > 1 and value.numel() > 256}
+    large = {
+        name
+        for name, value in original.generator.named_parameters()
+        if value.ndim > 1 and value.numel() > 256
+    }
     assert {name for name, kind in kinds.items() if kind == torch.float16} == large != set()
     read = load_checkpoint(tmp_path / "half.safetensors").generator.state_dict()
     for name, value in original.generator.state_dict().items():
         assert read[name].dtype == value.dtype
         # float16 has 11 significant bits, and steps of 2^-24 below 2^-14.
-        allowed = (value.abs() * 2.0**-11).clamp(min=2.0**-25) if name in large else torch.zeros_like(value)
+        allowed = (
+            (value.abs() * 2.0**-11).clamp(min=2.0**-25)
+            if name in large
+            else torch.zeros_like(value)
+        )
         assert ((read[name] - value).abs() <= allowed).all(), name
 
 
@@ -144,7 +163,10 @@ def test_a_written_config_says_what_was_learned_and_no_folder():
     parts, scans = [{"name": "folder", "root": "/data/a"}], {"name": "simulated", "root": "/data/b"}
     config = {
         "run_dir": "/home/me/runs/a",
-        "stage": {"name": "rectify", "parent": {"path": "/home/me/runs/b", "pairs": "/home/me/pairs", "step": 7}},
+        "stage": {
+            "name": "rectify",
+            "parent": {"path": "/home/me/runs/b", "pairs": "/home/me/pairs", "step": 7},
+        },
         "data": {"name": "mixed", "root": "/data", "parts": parts, "scans": scans},
         "sampler": {},
     }

@@ -30,7 +30,19 @@ def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, mon
     for arguments in (
         ("show", folder, "--out=~/views"),
         ("prepare", folder, "-o", "prepared", "--size", "16x64", "--workers", 1),
-        ("evaluate", folder, folder, "--metrics", "jsd", "--out", "page", "--size", "16x64", "--workers", 0),
+        (
+            "evaluate",
+            folder,
+            folder,
+            "--metrics",
+            "jsd",
+            "--out",
+            "page",
+            "--size",
+            "16x64",
+            "--workers",
+            0,
+        ),
     ):
         assert r2flow(*[f"./{one}" if one is folder else one for one in arguments]).said
     assert Path("views").is_dir()  # shells leave the ~ of --out=~/views
@@ -66,21 +78,26 @@ def test_a_dollar_in_a_text_is_drawn_as_one():
         figure.subplots().set(xscale="log", xlim=(1, 1e4))
     canvas = FigureCanvasAgg(usual)
     canvas.draw()
-    np.testing.assert_array_equal(figure_pixels(ours, int(ours.dpi)), np.asarray(canvas.buffer_rgba())[..., :3])
+    np.testing.assert_array_equal(
+        figure_pixels(ours, int(ours.dpi)), np.asarray(canvas.buffer_rgba())[..., :3]
+    )
 
 
 def test_a_full_disk_is_one_line_that_names_the_file(tmp_path: Path):
     raised = pytest.raises(OSError, match="cannot be written whole")
     with small_disk(10_000), raised as caught, atomic_write(tmp_path / "a.npy") as file:
         np.save(file, np.zeros((2, 64, 1024), np.float32))
-    assert explain_mistake(caught.value).startswith(f"{tmp_path / 'a.npy'}: cannot be written whole")
+    assert explain_mistake(caught.value).startswith(
+        f"{tmp_path / 'a.npy'}: cannot be written whole"
+    )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_newline_in_a_name_does_not_eat_the_line():
     assert explain_mistake(InputError("a\nb.bin is empty.")) == r"a\nb.bin is empty."
     assert explain_mistake(OSError(5, "Input/output error", "a\nb")) == r"a\nb: Input/output error"
-    assert explain_mistake(InputError("a\033[31mb")) == r"a\x1b[31mb"  # nor does it control the terminal
+    # nor does it control the terminal
+    assert explain_mistake(InputError("a\033[31mb")) == r"a\x1b[31mb"
     of_a_worker = "Caught InputError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n"
     of_a_worker += '  File "x", line 1\nr2flow.errors.InputError: a\nb.bin is empty.\n'
     assert explain_mistake(InputError(of_a_worker)) == r"a\nb.bin is empty."

@@ -23,14 +23,20 @@ READING = Reading(SENSOR, convention="reference")
 H, W = SENSOR.shape
 
 
-def angles(shift_down: np.ndarray | float, shift_right: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+def angles(
+    shift_down: np.ndarray | float, shift_right: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
     """Elevation and azimuth within each bin, both shifts from 0 (upper left corner) to 1, radians."""
     h, w = np.indices((H, W))
     return np.deg2rad(3 - 28 * (h + shift_down) / H), math.pi - 2 * math.pi * (w + shift_right) / W
 
 
 def points(r: np.ndarray, elevation: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    direction = [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
     return np.moveaxis(r * np.stack(direction), 0, -1)[r > 0]
 
 
@@ -44,7 +50,9 @@ def on_corners(r: np.ndarray) -> np.ndarray:
 
 
 def from_above(clouds: list[np.ndarray]) -> np.ndarray:
-    """Points of 3 m < r < 63 m in cells of 1.6 m, over all scans; the edges are the published ones, in float32."""
+    """Points of 3 m < r < 63 m in cells of 1.6 m, over all scans; the edges are the published ones,
+    in float32.
+    """
     count, edges = np.zeros((100, 100)), torch.linspace(-80, 80, 101).double().numpy()
     for xyz in clouds:
         for x, y, z in xyz:
@@ -65,7 +73,9 @@ def measured(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
     for number, image in enumerate(images(6, 1)):
         xyz = points(image[0], *angles(*draw.uniform(0.02, 0.98, (2, H, W)))).astype(np.float32)
         clouds.append(xyz)
-        write_points(tmp_path / "measured" / f"{number}.bin", xyz, np.full(len(xyz), 0.5, np.float32))
+        write_points(
+            tmp_path / "measured" / f"{number}.bin", xyz, np.full(len(xyz), 0.5, np.float32)
+        )
     return tmp_path / "measured", clouds
 
 
@@ -82,22 +92,32 @@ def test_real_points_are_the_measured_ones_and_generated_ones_bin_corners(measur
     corners = from_above([on_corners(r) for r in images(10, 2)[:, 0]])
     found = figure(measured[0], generated, PAPER)
     assert found == pytest.approx(distance(from_above(measured[1]), corners), rel=1e-5)
-    centres = [from_above([points(r, *angles(0.5, 0.5)) for r in both]) for both in (images(6, 1)[:, 0], made)]
+    centres = [
+        from_above([points(r, *angles(0.5, 0.5)) for r in both])
+        for both in (images(6, 1)[:, 0], made)
+    ]
     other = figure(measured[0], generated, R2FLOW)
     assert other == pytest.approx(distance(*centres), rel=1e-3)  # ranges of the files are float32
     assert abs(other / found - 1) > 0.02
 
 
-def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(kitti_360, monkeypatch):
+def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(
+    kitti_360, monkeypatch
+):
     monkeypatch.setattr("r2flow.evaluation.measuring.REAL_SCANS", 5)
     scans = open_scans(f"kitti_360:{kitti_360}", READING)
-    assert [name.split("/")[1][17:21] for name in scans.source.names][:6] == ["0000"] * 3 + ["0002"] * 3
+    assert [name.split("/")[1][17:21] for name in scans.source.names][:6] == ["0000"] * 3 + [
+        "0002"
+    ] * 3
     place = list(range(15))
     random.Random(0).shuffle(place)
     theirs = [*range(6, 15), *range(6)]  # drives 3, 4, 10, then 0, 2
     expected = sorted(theirs[p] for p in place[:5])
     assert published_choice(scans, 5) == expected
-    assert real_rule(METRICS["jsd"](), scans, PAPER) == (expected, "5 of 15, Python's shuffle, seed 0")
+    assert real_rule(METRICS["jsd"](), scans, PAPER) == (
+        expected,
+        "5 of 15, Python's shuffle, seed 0",
+    )
     assert real_rule(METRICS["jsd"](), scans)[0] != expected
     assert published_choice(open_scans("simulated:0", READING, num=15), 5) == sorted(place[:5])
 
@@ -114,11 +134,20 @@ def test_several_sets_stand_in_one_table_with_references_and_baselines(
     monkeypatch.setenv("R2FLOW_CACHE", str(tmp_path / "cache"))
     other = folder(tmp_path / "other", images(3, 7))
     options = ("--metrics", "all", "--size", "8x64", "--workers", 0, "--json", tmp_path / "e.json")
-    code, said, warned = r2flow("evaluate", measured[0], generated, other, *options, "--protocol", "paper")
+    code, said, warned = r2flow(
+        "evaluate", measured[0], generated, other, *options, "--protocol", "paper"
+    )
     assert code == 0, warned
     lines = said.splitlines()
-    assert lines[0].startswith("Protocol paper: real points as measured, generated points on rays through bin corners")
-    for words in ("generated (10 : 6)", "other (3 : 6)", "reference: real halves (3 : 3)", "baseline: noise (10 : 6)"):
+    assert lines[0].startswith(
+        "Protocol paper: real points as measured, generated points on rays through bin corners"
+    )
+    for words in (
+        "generated (10 : 6)",
+        "other (3 : 6)",
+        "reference: real halves (3 : 3)",
+        "baseline: noise (10 : 6)",
+    ):
         assert sum(words in line for line in lines) == 1
     assert len(lines) == len(set(lines))
     assert sum("no full rank" in line for line in lines) == 1

@@ -1,4 +1,4 @@
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import pytest
@@ -8,7 +8,10 @@ from r2flow.registry import MISSING, Registry, check_options, options_of
 
 
 def test_a_name_that_is_taken_is_refused_except_in_a_notebook():
-    table, cell = Registry("thing", a=1), [type("Mine", (), {"__module__": "__main__"}) for _ in range(2)]
+    table, cell = (
+        Registry("thing", a=1),
+        [type("Mine", (), {"__module__": "__main__"}) for _ in range(2)],
+    )
     for version in cell:  # it runs twice
         table.add("b", version)
     assert table["b"] is cell[1]
@@ -37,23 +40,31 @@ def test_a_missing_name_calls_each_hook_once_and_is_looked_up_again(monkeypatch)
 
 
 def test_an_annotated_option_is_checked_as_what_it_annotates():
-    def make(width: Annotated[int, "pixels"], name: Annotated[str | None, "of a file"] | bool = None) -> None:
+    def make(
+        width: Annotated[int, "pixels"], name: Annotated[str | None, "of a file"] | bool = None
+    ) -> None:
         pass
 
-    for good in ({"width": 1}, {"width": 1, "name": "a"}, {"width": 1, "name": None}, {"width": 1, "name": True}):
+    for good in (
+        {"width": 1},
+        {"width": 1, "name": "a"},
+        {"width": 1, "name": None},
+        {"width": 1, "name": True},
+    ):
         check_options("thing", make, good)
-    with pytest.raises(InputError, match=r"thing: width must be a whole number, found 1\.5"):
+    with pytest.raises(
+        InputError, match=r"thing: width: input should be a valid integer.* found 1\.5"
+    ):
         check_options("thing", make, {"width": 1.5})
-    with pytest.raises(InputError, match="thing: name must be a word or null or true or false, found 3"):
+    with pytest.raises(InputError, match="thing: name: input should be .*, found 3"):
         check_options("thing", make, {"width": 1, "name": 3})
 
 
-def test_options_are_those_by_keyword_and_have_values_of_their_own():
+def test_options_are_those_by_keyword():
     @dataclass
     class Settings:
         size: int
-        names: list[str] = field(default_factory=list)
+        damping: float = 0.5
 
-    options_of(Settings)["names"].append("changed")
-    assert options_of(Settings) == {"size": MISSING, "names": []}
+    assert options_of(Settings) == {"size": MISSING, "damping": 0.5}
     assert options_of(lambda *given, damping=1.0: None, given=2) == {"damping": 1.0}

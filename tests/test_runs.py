@@ -7,22 +7,42 @@ from pathlib import Path
 
 import pytest
 import torch
-
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
+
 from r2flow.errors import InputError
-from r2flow.runs.folder import RESUMED, check_run, contradictions, has_ended, open_run, read_config, run_lock
+from r2flow.runs.folder import (
+    RESUMED,
+    check_run,
+    contradictions,
+    has_ended,
+    open_run,
+    read_config,
+    run_lock,
+)
 from tests.conftest import small_disk
 
-CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10, "max_epochs": -1}}
+CONFIG = {
+    "seed": 0,
+    "data": {"root": "a", "batch_size": 4},
+    "trainer": {"devices": 1, "max_steps": 10, "max_epochs": -1},
+}
 
 
 def changed(**new) -> dict:
-    return CONFIG | {key: {**CONFIG.get(key, {}), **one} if isinstance(one, dict) else one for key, one in new.items()}
+    return CONFIG | {
+        key: {**CONFIG.get(key, {}), **one} if isinstance(one, dict) else one
+        for key, one in new.items()
+    }
 
 
 def checkpoint(run: Path, step: int, lacking: str = "", **notes: int) -> Path:
     path = run / "checkpoints" / f"step-{step:08d}.ckpt"
-    content = {**dict.fromkeys(RESUMED), "global_step": step, "r2flow": notes, "state_dict": {"weights": torch.zeros(100)}}
+    content = {
+        **dict.fromkeys(RESUMED),
+        "global_step": step,
+        "r2flow": notes,
+        "state_dict": {"weights": torch.zeros(100)},
+    }
     content.pop(lacking, None)
     AtomicCheckpointIO().save_checkpoint(content, path)
     return path
@@ -37,23 +57,40 @@ def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert open_run(tmp_path, changed(trainer={"devices": 4})) == newest
     with pytest.raises(InputError, match=r"data.batch_size=4 there, 8 here.*name=OTHER"):
         open_run(tmp_path, changed(data={"batch_size": 8}))
-    (part := newest.with_name(".step-00000006.ckpt.0.part")).touch()  # of the process that holds the lock
+    # of the process that holds the lock
+    (part := newest.with_name(".step-00000006.ckpt.0.part")).touch()
     assert open_run(tmp_path, changed(trainer={"devices": 8}), locked=False) == newest
     assert part.exists()
-    assert read_config(tmp_path) == changed(trainer={"devices": 4})  # what runs now, and not what was refused
-    with pytest.raises(InputError, match=r"max_steps=10 there, 9 here\. Give the same .* to resume it, or name="):
-        check_run(tmp_path, changed(trainer={"max_steps": 9}))  # of a link, which has a stage.parent of its own
-    for lacking in ("hyper_parameters", "r2flow", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step"):
+    # what runs now, and not what was refused
+    assert read_config(tmp_path) == changed(trainer={"devices": 4})
+    with pytest.raises(
+        InputError, match=r"max_steps=10 there, 9 here\. Give the same .* to resume it, or name="
+    ):
+        # of a link, which has a stage.parent of its own
+        check_run(tmp_path, changed(trainer={"max_steps": 9}))
+    for lacking in (
+        "hyper_parameters",
+        "r2flow",
+        "state_dict",
+        "optimizer_states",
+        "lr_schedulers",
+        "loops",
+        "global_step",
+    ):
         checkpoint(tmp_path, 6, lacking)
         assert open_run(tmp_path, CONFIG) == newest
 
 
 def test_the_parent_may_move_and_must_have_the_same_weights():
     def from_parent(path: str, weights: str) -> dict:
-        return changed(stage={"parent": {"path": path, "weights": weights, "pairs": f"{path}/pairs"}})
+        return changed(
+            stage={"parent": {"path": path, "weights": weights, "pairs": f"{path}/pairs"}}
+        )
 
     assert contradictions(from_parent("a", "1f"), from_parent("moved", "1f")) == []
-    assert contradictions(from_parent("a", "1f"), from_parent("a", "2e")) == ["stage.parent.weights=1f there, 2e here"]
+    assert contradictions(from_parent("a", "1f"), from_parent("a", "2e")) == [
+        "stage.parent.weights=1f there, 2e here"
+    ]
 
 
 def test_a_run_of_epochs_ends_at_the_step_that_its_checkpoint_notes(tmp_path: Path):
@@ -70,10 +107,13 @@ def test_a_finished_run_keeps_its_sampler(tmp_path: Path):
     assert open_run(tmp_path, other) == unfinished
     assert read_config(tmp_path) == other
     finished = checkpoint(tmp_path, 10)
-    with pytest.raises(InputError, match=r"sampler.steps=3 there, 4 here\..* r2flow sample .* --sampler NAME"):
+    with pytest.raises(
+        InputError, match=r"sampler.steps=3 there, 4 here\..* r2flow sample .* --sampler NAME"
+    ):
         open_run(tmp_path, changed(sampler={"method": "euler", "steps": 4}))
     assert read_config(tmp_path) == other
-    moved = changed(sampler={"method": "euler", "steps": 3, "precision": None}, data={"root": "b"})  # a key of today
+    # a key of today
+    moved = changed(sampler={"method": "euler", "steps": 3, "precision": None}, data={"root": "b"})
     assert open_run(tmp_path, moved) == finished
     assert read_config(tmp_path) == moved
 
@@ -81,7 +121,12 @@ def test_a_finished_run_keeps_its_sampler(tmp_path: Path):
 def test_each_part_of_a_mixture_may_move_and_must_stay_what_it_is():
     def parts(root: str, weight: float) -> dict:
         return {
-            "data": {"parts": [{"name": "folder", "root": "a"}, {"name": "folder", "root": root, "weight": weight}]}
+            "data": {
+                "parts": [
+                    {"name": "folder", "root": "a"},
+                    {"name": "folder", "root": root, "weight": weight},
+                ]
+            }
         }
 
     assert contradictions(parts("b", 1), parts("moved", 1)) == []
@@ -98,7 +143,9 @@ with run_lock(sys.argv[1]):
 
 
 def test_the_lock_names_its_holder_and_ends_when_that_is_killed(tmp_path: Path):
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
     try:
         assert holder.stdout.readline() == "held\n"
         for _ in range(2):  # who is refused takes nothing away
@@ -110,5 +157,9 @@ def test_the_lock_names_its_holder_and_ends_when_that_is_killed(tmp_path: Path):
         holder.wait()
     with run_lock(tmp_path, patience=0):
         assert f"pid {os.getpid()}" in (tmp_path / ".lock.holder").read_text()
-    with small_disk(1), pytest.raises(OSError, match=r"\.lock\.holder"), run_lock(tmp_path, patience=0):
+    with (
+        small_disk(1),
+        pytest.raises(OSError, match=r"\.lock\.holder"),
+        run_lock(tmp_path, patience=0),
+    ):
         pass

@@ -1,4 +1,6 @@
-"""Flows whose noise is known: x_1 = M + S x_0, element by element, and a network with random weights."""
+"""Flows whose noise is known: x_1 = M + S x_0, element by element, and a network with random
+weights.
+"""
 
 import math
 from pathlib import Path
@@ -77,15 +79,20 @@ def test_inversion_finds_the_noise(method, apart):
     assert found.converged.all()
     errors = round_trip(flow(), found)
     assert errors["rms"].max() < apart
-    torch.testing.assert_close(errors["noise_std"], expected.double().flatten(1).std(1), rtol=apart, atol=0)
+    torch.testing.assert_close(
+        errors["noise_std"], expected.double().flatten(1).std(1), rtol=apart, atol=0
+    )
     if method != "euler":
         assert errors["median_m"].max() < 1e-2
         assert errors["dropped"].max() < 0.01
 
 
-@pytest.mark.parametrize(("finish", "expected"), [(0.0, (1 - 0.25) ** 4), (0.1, (1 - 0.3) ** 3 * (1 - 0.1))])
+@pytest.mark.parametrize(
+    ("finish", "expected"), [(0.0, (1 - 0.25) ** 4), (0.1, (1 - 0.3) ** 3 * (1 - 0.1))]
+)
 def test_a_sampler_needs_a_field_alone_and_passes_gradients(finish, expected):
-    plugin = SimpleNamespace(field=lambda condition: lambda t, x: -x)  # dx/dt = -x in four Euler steps
+    # dx/dt = -x in four Euler steps
+    plugin = SimpleNamespace(field=lambda condition: lambda t, x: -x)
     x = torch.ones(1, 2, 4, 8, requires_grad=True)
     end = build_sampler("euler", steps=4, finish=finish)(plugin, x, None, None, lambda: None).x
     (gradient,) = torch.autograd.grad(end.sum(), x)
@@ -106,7 +113,9 @@ def test_round_trip_errors_are_what_they_say():
     assert errors["dropped"].item() == pytest.approx(other.item())
     assert errors["median_m"].item() == pytest.approx(0.5, rel=1e-4)
     assert errors["rms_m"].item() == pytest.approx(0.5 * (moved / kept).sqrt().item(), rel=1e-3)
-    assert errors["rms"].item() == pytest.approx((x - found.x_1).square().mean().sqrt().item(), rel=1e-6)
+    assert errors["rms"].item() == pytest.approx(
+        (x - found.x_1).square().mean().sqrt().item(), rel=1e-6
+    )
 
 
 def test_extreme_scans_go_there_and_back():
@@ -143,7 +152,9 @@ def test_slerp_follows_the_circle():
     x, y = torch.tensor([3.0, 0, 0]), torch.tensor([0, 3.0, 0])
     w = torch.linspace(0, 1, 7)
     angle = w * math.pi / 2
-    torch.testing.assert_close(slerp(x, y, w), 3 * torch.stack([angle.cos(), angle.sin(), 0 * w], 1))
+    torch.testing.assert_close(
+        slerp(x, y, w), 3 * torch.stack([angle.cos(), angle.sin(), 0 * w], 1)
+    )
     assert torch.equal(slerp(x, y, w[[0, -1]]), torch.stack([x, y]))
 
 
@@ -158,7 +169,9 @@ def test_slerp_between_nearly_parallel_ends_is_the_straight_mean(angle):
 
 def test_frames_lie_between_the_scans():
     a, b = scans(2)
-    found = interpolate_scans(flow(), torch.stack([a, b]), 5, build_sampler("dopri5", tolerance=1e-6))
+    found = interpolate_scans(
+        flow(), torch.stack([a, b]), 5, build_sampler("dopri5", tolerance=1e-6)
+    )
     assert found.images.shape == (5, 2, 8, 64)
     for frame, scan in ((found.images[0], a), (found.images[-1], b)):
         both = (frame[0] > 0) & (scan[0] > 0)
@@ -168,7 +181,9 @@ def test_frames_lie_between_the_scans():
     torch.testing.assert_close(found.images[2], middle[0], rtol=1e-2, atol=1e-2)
     assert (found.evaluations > 0).all()
     arrived = []
-    interpolate_scans(flow(), torch.stack([a, b]), 5, build_sampler("euler"), arrived=arrived.append)
+    interpolate_scans(
+        flow(), torch.stack([a, b]), 5, build_sampler("euler"), arrived=arrived.append
+    )
     assert arrived == [2, 3, 4, 5]
 
 
@@ -200,12 +215,16 @@ def test_a_scan_that_is_not_solved_is_flagged_and_said(tmp_path, caplog):
     assert drawn.converged.tolist() == [True, False, True]
     (others,) = sample(flow(), 3, steps=4, batch_size=3)
     assert torch.equal(drawn.images[::2], others.images[::2])
-    write_samples(flow(Lost()), tmp_path, 3, 0, build_sampler("euler", steps=4), pictures=0, batch_size=3)
+    write_samples(
+        flow(Lost()), tmp_path, 3, 0, build_sampler("euler", steps=4), pictures=0, batch_size=3
+    )
     assert "not solved, so no scans of this flow: 1" in caplog.text
     caplog.clear()
     flow(Lost()).sample(4, steps=4, batch_size=2)  # the second of each batch is lost
     flow(Lost()).complete(torch.zeros(2, 2, 8, 64), num=2, batch_size=2)
-    said = [record.getMessage().partition("flow: ")[2].partition(";")[0] for record in caplog.records]
+    said = [
+        record.getMessage().partition("flow: ")[2].partition(";")[0] for record in caplog.records
+    ]
     assert said == ["1", "3", "1 of the answers to scan 0", "1 of the answers to scan 1"]
 
 
@@ -216,10 +235,21 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     def write(num: int, seed: int = 0, **options) -> list[int]:
         drawn: list[int] = []
         monkeypatch.setattr(
-            "r2flow.reports.outputs.draw", lambda *asked, **how: drawn.extend(asked[1]) or draw(*asked, **how)
+            "r2flow.reports.outputs.draw",
+            lambda *asked, **how: drawn.extend(asked[1]) or draw(*asked, **how),
         )
         how = build_sampler("euler", steps=2)
-        write_samples(checkpoint, tmp_path, num, seed, how, ["npy", "ply"], pictures=0, batch_size=2, **options)
+        write_samples(
+            checkpoint,
+            tmp_path,
+            num,
+            seed,
+            how,
+            ["npy", "ply"],
+            pictures=0,
+            batch_size=2,
+            **options,
+        )
         return drawn
 
     checkpoint = flow()
@@ -235,7 +265,9 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     assert names() == [f"{number:06d}.npy" for number in range(5)]
     monkeypatch.setattr("r2flow.reports.outputs.draw", mock.Mock(side_effect=MemoryError))
     with pytest.raises(MemoryError):
-        write_samples(checkpoint, tmp_path, 2, 1, build_sampler("euler", steps=2), ["npy"], replace=True)
+        write_samples(
+            checkpoint, tmp_path, 2, 1, build_sampler("euler", steps=2), ["npy"], replace=True
+        )
     assert names() == [f"{number:06d}.npy" for number in range(5)]
     assert write(2, seed=1, replace=True) == [0, 1]
     assert names() == ["000000.npy", "000001.npy"]
@@ -251,7 +283,9 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
 
 
 def test_what_makes_whole_images_alone_makes_the_region_that_is_all():
-    gan = build_generator(compose(["experiment=vanilla_gan", "size=small", "generator.base_channels=4", *SIZE])).eval()
+    gan = build_generator(
+        compose(["experiment=vanilla_gan", "size=small", "generator.base_channels=4", *SIZE])
+    ).eval()
     (part,) = sample(gan, 1, region=region((16, 32)))
     (whole,) = sample(gan, 1)
     assert torch.equal(part.images, whole.images)
@@ -293,9 +327,12 @@ def test_the_network_is_computed_in_the_precision_that_is_asked_for():
     one, seen = network(), []
     linear = next(m for m in one.generator.modules() if type(m) is nn.Linear)
     linear.register_forward_hook(lambda module, given, made: seen.append(made.dtype))
-    exact, coarse = (next(sample(one, 2, steps=3, precision=name)).images for name in ("32-true", "bf16-mixed"))
+    exact, coarse = (
+        next(sample(one, 2, steps=3, precision=name)).images for name in ("32-true", "bf16-mixed")
+    )
     assert seen == [torch.float32] * 3 + [torch.bfloat16] * 3
-    assert 0 < (exact - coarse).norm() < 2**-4 * exact.norm()  # bfloat16 has 8 bits, of which some products take a few
+    # bfloat16 has 8 bits, of which some products take a few
+    assert 0 < (exact - coarse).norm() < 2**-4 * exact.norm()
     with torch.autocast("cpu", torch.bfloat16):  # of the caller
         assert torch.equal(next(sample(one, 2, steps=3)).images, exact)
     assert sampled_set(one, "", 2).about != sampled_set(network(), "", 2).about
@@ -307,14 +344,24 @@ def test_a_samplers_name_may_have_fields_as_on_the_command_line():
     assert build_sampler("euler:grid=[0,1e-3,1]").grid == (0, 0.001, 1)
     with pytest.raises(InputError, match="cannot be read"):
         flow().generator.choose("adams3:grid=[0")
-    assert completing(flow().generator, "repaint:steps=010") == completing(flow().generator, "repaint", steps=10)
+    assert completing(flow().generator, "repaint:steps=010") == completing(
+        flow().generator, "repaint", steps=10
+    )
 
 
 def test_settings_may_be_numpy_s_and_torch_s():
     own = build_sampler("euler", steps=2)
-    assert own.changed(steps=np.int64(4)) == build_sampler("euler", steps=np.int64(4)) == own.changed(steps=4)
+    assert (
+        own.changed(steps=np.int64(4))
+        == build_sampler("euler", steps=np.int64(4))
+        == own.changed(steps=4)
+    )
     for grid in (torch.tensor([0.0, 0.25, 1.0]), np.array([0, 0.25, 1])):
-        assert own.changed(grid=grid) == build_sampler("euler", grid=grid) == own.changed(grid=[0, 0.25, 1])
+        assert (
+            own.changed(grid=grid)
+            == build_sampler("euler", grid=grid)
+            == own.changed(grid=[0, 0.25, 1])
+        )
 
 
 def test_a_seed_is_a_whole_number_of_python_or_numpy():
@@ -326,7 +373,9 @@ def test_a_seed_is_a_whole_number_of_python_or_numpy():
 
 @pytest.mark.parametrize("method", ["ddim", "ddpm"])
 def test_a_diffusion_walks_noise_of_half_precision_in_float32(method):
-    walker = build_generator(compose(["experiment=r2dm", "size=small", "backbone.base_channels=8", *SIZE])).eval()
+    walker = build_generator(
+        compose(["experiment=r2dm", "size=small", "backbone.base_channels=8", *SIZE])
+    ).eval()
     draws, seen = Draws(0, range(2)), []
     noise, how = draws.start(walker.noise_shape).bfloat16(), build_sampler(method, steps=4)
     half, full = (walker(one, sampler=how, draws=draws).x for one in (noise, noise.float()))
@@ -348,12 +397,20 @@ TINY = ["backbone=hdit_tiny", "backbone.base_channels=16", "backbone.num_heads=[
         ([*TINY, "+generator.name=flow_map"], build_sampler("renoise", steps=2)),
         (["experiment=r2dm", "size=small"], build_sampler("ddpm", steps=2)),
         (["experiment=r2dm", "size=small"], build_sampler("ddim", eta=0, steps=1)),
-        (["experiment=lidargen", "size=small", "generator.levels=2"], build_sampler("langevin", steps=1)),
-        (["experiment=vanilla_gan", "size=small", "generator.base_channels=4"], build_sampler("direct")),
+        (
+            ["experiment=lidargen", "size=small", "generator.levels=2"],
+            build_sampler("langevin", steps=1),
+        ),
+        (
+            ["experiment=vanilla_gan", "size=small", "generator.base_channels=4"],
+            build_sampler("direct"),
+        ),
         (["experiment=dusty2", "size=small", "generator.base_channels=4"], build_sampler("direct")),
     ],
 )
-def test_a_scan_that_leaves_the_numbers_is_flagged_whatever_is_clamped(words: list[str], sampler: Sampler):
+def test_a_scan_that_leaves_the_numbers_is_flagged_whatever_is_clamped(
+    words: list[str], sampler: Sampler
+):
     def without_end(_: nn.Module, __: Any, found: Any) -> Any:
         if isinstance(found, dict):
             return {name: without_end(_, __, value) for name, value in found.items()}

@@ -1,4 +1,6 @@
-"""Ctrl-C and SIGTERM at moments when nothing of a run is under way yet: one line and the signal's exit code."""
+"""Ctrl-C and SIGTERM at moments when nothing of a run is under way yet: one line and the signal's
+exit code.
+"""
 
 import logging
 import signal
@@ -10,7 +12,14 @@ from pathlib import Path
 import pytest
 
 from r2flow.errors import InputError
-from r2flow.signals import STOPPING, Stopped, blocking_signals, handling_signals, init_loader_worker, stop_at_once
+from r2flow.signals import (
+    STOPPING,
+    Stopped,
+    blocking_signals,
+    handling_signals,
+    init_loader_worker,
+    stop_at_once,
+)
 from r2flow.store import Store
 from tests.conftest import ROOT
 from tests.killing import Unreadable, be_killed, fail, is_gone, refuse, wait_until
@@ -92,7 +101,10 @@ def test_workers_of_a_failed_run_end_with_it(tmp_path: Path):
 
 
 def test_a_run_hears_the_signal_of_its_job_that_its_launcher_ignores():
-    with handling_signals(signal.SIG_IGN, [signal.SIGUSR1]), handling_signals(stop_at_once, [signal.SIGUSR1]):
+    with (
+        handling_signals(signal.SIG_IGN, [signal.SIGUSR1]),
+        handling_signals(stop_at_once, [signal.SIGUSR1]),
+    ):
         assert signal.getsignal(signal.SIGUSR1) is stop_at_once
 
 
@@ -125,7 +137,8 @@ READ = 'list(ScanSet("", source, None).batches(range(99), 1, 2))'
 
 
 @pytest.mark.parametrize("number", STOPPING)
-@pytest.mark.parametrize(("work", "said"), [(MAKE, [""]), (READ, ["", "stopped\n"])])  # the latter within an import
+# the latter within an import
+@pytest.mark.parametrize(("work", "said"), [(MAKE, [""]), (READ, ["", "stopped\n"])])
 def test_told_to_stop_when_workers_start(tmp_path: Path, number: int, work: str, said: list[str]):
     (tmp_path / "script.py").write_text(WORKERS.replace("{work}", work).format(number=int(number)))
     process = start(tmp_path, ["script.py"], [sys.executable])

@@ -1,7 +1,8 @@
-"""Several hundred wrong commands over every verb and config group: one line, exit code 2, nothing written.
+"""Several hundred wrong commands over every verb and config group: one line, exit code 2, nothing
+written.
 
-A line of the lists is a command and, after a ` # `, what its answer must say. Without that, it must name one of the
-command's own options, keys or values.
+A line of the lists is a command and, after a ` # `, what its answer must say. Without that, it must
+name one of the command's own options, keys or values.
 """
 
 import contextlib
@@ -89,7 +90,16 @@ BASES = {
     "curvature": "report curvature run -o out", "solvers": "report solvers -o out",
     "backbones": "report backbones", "paper": "report paper run -o out",
 }  # fmt: skip
-WORDS = ("device", "sensor", "sampler", "format", "projection", "convention", "precision", "metrics")
+WORDS = (
+    "device",
+    "sensor",
+    "sampler",
+    "format",
+    "projection",
+    "convention",
+    "precision",
+    "metrics",
+)
 
 
 def wrong_places() -> Iterator[str]:
@@ -105,15 +115,24 @@ def wrong_places() -> Iterator[str]:
 
 def wrong_values() -> Iterator[str]:
     """Values out of the range of each option's annotation, one command each."""
-    registered = [*app.registered_commands, *app.registered_groups[0].typer_instance.registered_commands]
+    registered = [
+        *app.registered_commands,
+        *app.registered_groups[0].typer_instance.registered_commands,
+    ]
     for verb, callback in ((one.callback.__name__, one.callback) for one in registered):
         for name, parameter in inspect.signature(callback).parameters.items():
             annotation = parameter.annotation
-            options = [one for one in getattr(annotation, "__metadata__", ()) if isinstance(one, OptionInfo)]
+            options = [
+                one
+                for one in getattr(annotation, "__metadata__", ())
+                if isinstance(one, OptionInfo)
+            ]
             if verb not in BASES or not options:
                 continue
             kinds = {annotation.__origin__, *get_args(annotation.__origin__)}
-            long = [one for one in options[0].param_decls if one.startswith("--")] or [f"--{name.replace('_', '-')}"]
+            long = [one for one in options[0].param_decls if one.startswith("--")] or [
+                f"--{name.replace('_', '-')}"
+            ]
             values = ["nope"] if name in WORDS else []
             values += ["64"] if name == "size" else []
             values += ["a", "1.5"] if int in kinds else []
@@ -146,7 +165,24 @@ name=x scans=3 # no key 'scans'
 name=x +parent=3
 """
 
-USUAL = {"", "-", "c", "o", "x", "a", "1", "0", "3", "name", "run", "out", "scans", "train", "data", "report"}
+USUAL = {
+    "",
+    "-",
+    "c",
+    "o",
+    "x",
+    "a",
+    "1",
+    "0",
+    "3",
+    "name",
+    "run",
+    "out",
+    "scans",
+    "train",
+    "data",
+    "report",
+}
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +196,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "run" / "config.yaml").write_text(yaml.safe_dump(CONFIG))
     save_checkpoint(load_checkpoint(place / "run"), place / "flow.safetensors")
     (place / "empty" / "a.pt2").mkdir(parents=True)
-    np.save(place / "image.npy", np.stack([np.full((8, 64), 9.0), np.full((8, 64), 0.5)]).astype(np.float32))
+    np.save(
+        place / "image.npy",
+        np.stack([np.full((8, 64), 9.0), np.full((8, 64), 0.5)]).astype(np.float32),
+    )
     (place / "bad.bin").write_bytes(b"\0" * 30)
     (place / "bad.yaml").write_text("name: mine\nelevations: [3]\n")
     (place / "file.txt").write_text("in the way")
@@ -169,7 +208,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def listing(folder: Path) -> dict[Path, tuple[int, int]]:
     found = {path: path.stat() for path in sorted(folder.rglob("*"))}
-    return {path: (stat.st_size, 0 if path.is_dir() else stat.st_mtime_ns) for path, stat in found.items()}
+    return {
+        path: (stat.st_size, 0 if path.is_dir() else stat.st_mtime_ns)
+        for path, stat in found.items()
+    }
 
 
 @pytest.fixture
@@ -193,8 +235,16 @@ def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
         assert end.value.code == 2, said
         (answer,) = (line for line in said.splitlines() if not line.startswith("WARNING"))
         assert answer.startswith("error: ")
-        named = {word for argument in arguments[1:] for word in re.split(r"[^\w²-]+", argument.strip("-"))}
-        wanted = {words} if words else (named - USUAL) | {one for one in arguments if one.startswith("--")}
+        named = {
+            word
+            for argument in arguments[1:]
+            for word in re.split(r"[^\w²-]+", argument.strip("-"))
+        }
+        wanted = (
+            {words}
+            if words
+            else (named - USUAL) | {one for one in arguments if one.startswith("--")}
+        )
         assert any(word in answer for word in wanted), answer
         assert listing(place) == before
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from r2flow.flow.losses import LOSSES, absolute
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
-from r2flow.generators import Generator
 from r2flow.registry import Portion
 from r2flow.stages import STAGES
 from r2flow.stages.base import Batch
@@ -65,7 +64,9 @@ class LearnStreetMap(LearnFlowMap):
         x_t, target = torch.where(here, x_t, aim[0]), torch.where(here, v, aim[1])
         estimate = self.generator.map()(t, x_t, s)  # type: ignore[operator]
         ends = (s == 1) & (t < s)
-        of_ends, others = (self.loss_of_each(loss, estimate, target) for loss in (self.end_loss, self.loss))
+        of_ends, others = (
+            self.loss_of_each(loss, estimate, target) for loss in (self.end_loss, self.loss)
+        )
         return torch.where(ends, of_ends, others).mean()
 
 

@@ -101,7 +101,8 @@ class Backbone(ExactBuffers):
     def _velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
         y = x.to(next(self.parameters()).dtype)
         v = self.velocity(t, y, s) if self.second_time else self.velocity(t, y)
-        expected = (len(x), self.out_channels, *x.shape[2:])
+        # not len(x), which torch.export would take for a constant
+        expected = (x.shape[0], self.out_channels, *x.shape[2:])
         if v.shape != expected:  # one channel or one image would broadcast in the loss
             raise InputError(
                 f"a {type(self).__name__} must give images of {expected}, found {tuple(v.shape)}."

@@ -268,5 +268,5 @@ class UNet(Backbone, ABC):
         """The first convolution, on the image and the features of its rays."""
         if self.coords_encoding is not None:
             features = self.get_buffer("features").to(x.dtype)
-            x = torch.cat([x, features.expand(len(x), -1, -1, -1)], dim=1)
+            x = torch.cat([x, features.expand(x.shape[0], -1, -1, -1)], dim=1)
         return self.in_conv(x)

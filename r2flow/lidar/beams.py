@@ -8,7 +8,6 @@ from itertools import groupby
 import numpy as np
 from numpy import ndarray
 from scipy.ndimage import median
-from scipy.signal import find_peaks
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points
@@ -198,6 +197,8 @@ def _beams_of_elevations(elevation: ndarray) -> Beams | None:
 
     The bandwidth is that where the number of peaks is most stable.
     """
+    from scipy.signal import find_peaks  # half a second
+
     returned = np.isfinite(elevation)
     seen = elevation[returned]
     low, high = np.quantile(seen, [1e-4, 1 - 1e-4])

@@ -7,7 +7,8 @@ from torch import Tensor
 from r2flow.backbones.attention import _Axis, _compiled_flex, _flex_mask, neighbourhood_attention
 from r2flow.errors import InputError
 
-# (rows, columns, window): tiled evenly or not, rings narrower than the window, fewer rows than the window
+# (rows, columns, window): tiled evenly or not, rings narrower than the window, fewer rows than the
+# window
 MAPS = [
     (8, 24, (3, 9)),
     (4, 8, (3, 9)),
@@ -20,7 +21,9 @@ MAPS = [
 ]
 
 
-def qkv(rows: int, columns: int, batch: int = 2, heads: int = 2, channels: int = 4) -> tuple[Tensor, ...]:
+def qkv(
+    rows: int, columns: int, batch: int = 2, heads: int = 2, channels: int = 4
+) -> tuple[Tensor, ...]:
     generator = torch.Generator().manual_seed(rows * 100 + columns)
     shape = (batch, rows, columns, heads, channels)
     return tuple(torch.randn(shape, generator=generator, dtype=torch.float64) for _ in range(3))
@@ -34,7 +37,11 @@ def by_loops(q: Tensor, k: Tensor, v: Tensor, window: tuple[int, int], wrap: boo
         top = max(0, min(i - window[0] // 2, rows - height))
         for j in range(columns):
             left = j - window[1] // 2 if wrap else max(0, min(j - window[1] // 2, columns - width))
-            seen = [(a, b % columns) for a in range(top, top + height) for b in range(left, left + width)]
+            seen = [
+                (a, b % columns)
+                for a in range(top, top + height)
+                for b in range(left, left + width)
+            ]
             keys = torch.stack([k[:, a, b] for a, b in seen], dim=-2)  # (B, N, seen, D)
             values = torch.stack([v[:, a, b] for a, b in seen], dim=-2)
             weights = torch.softmax((q[:, i, j, :, None] * keys).sum(-1), dim=-1)
@@ -44,7 +51,10 @@ def by_loops(q: Tensor, k: Tensor, v: Tensor, window: tuple[int, int], wrap: boo
 
 def assert_defined(inputs, window, wrap, backend, atol):
     weights = torch.randn(inputs[0].shape, generator=torch.Generator().manual_seed(1)).to(inputs[0])
-    outputs = by_loops(*inputs, window, wrap), neighbourhood_attention(*inputs, window, wrap, backend=backend)
+    outputs = (
+        by_loops(*inputs, window, wrap),
+        neighbourhood_attention(*inputs, window, wrap, backend=backend),
+    )
     results = [[out, *torch.autograd.grad((out * weights).sum(), inputs)] for out in outputs]
     for expected, found in zip(*results, strict=True):
         torch.testing.assert_close(found, expected, rtol=0, atol=atol)
@@ -63,7 +73,8 @@ def test_a_mask_made_while_sampling_serves_training_and_a_graph_two_backward_pas
     _compiled_flex()  # its kernels need CUDA, torch's rule for compiled backward passes does not
     x = torch.rand(3, requires_grad=True)
     y = torch.compile(lambda x: x.exp().sin(), backend="aot_eager", dynamic=True)(x).sum()
-    assert torch.equal(*(torch.autograd.grad(y, x, retain_graph=True)[0] for _ in range(2)))  # as in `mmps`
+    # as in `mmps`
+    assert torch.equal(*(torch.autograd.grad(y, x, retain_graph=True)[0] for _ in range(2)))
 
 
 def test_a_backend_that_cannot_be_had_says_why():
@@ -72,7 +83,9 @@ def test_a_backend_that_cannot_be_had_says_why():
 
 
 @pytest.mark.parametrize("wrap", [True, False])
-@pytest.mark.parametrize(("rows", "columns", "window"), [shape for shape in MAPS if shape[1] >= shape[2][1]])
+@pytest.mark.parametrize(
+    ("rows", "columns", "window"), [shape for shape in MAPS if shape[1] >= shape[2][1]]
+)
 def test_the_mask_for_flex_shows_what_tiles_see(rows, columns, window, wrap):
     """Its kernels need CUDA; whom it lets see whom does not."""
     count = rows * columns

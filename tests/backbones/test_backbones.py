@@ -1,4 +1,6 @@
-"""What every backbone in the table must do, what the published ones do beyond it, and every configuration."""
+"""What every backbone in the table must do, what the published ones do beyond it, and every
+configuration.
+"""
 
 import copy
 import itertools
@@ -31,13 +33,16 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_output_and_gradients_are_the_references_at_times_of_their_own_and_at_one_time(shared, name):
+def test_output_and_gradients_are_the_references_at_times_of_their_own_and_at_one_time(
+    shared, name
+):
     case = load_case(shared, f"{name}.pt")
     model, x = backbone_of(CASES[name], case), case["x"].clone().requires_grad_()
     output, at_one = model(case["t"], x), model(case["t_scalar"], case["x"][:1])
     for found, expected in ((output, case["output"]), (at_one, case["output_t_scalar"])):
-        # relative to the norm: logit scales of 100 amplify rounding, and the reference itself, computed again in
-        # float64, differs from its float32 output by up to 1.2e-4 in single pixels
+        # relative to the norm: logit scales of 100 amplify rounding, and the reference itself,
+        # computed again in float64, differs from its float32 output by up to 1.2e-4 in single
+        # pixels
         assert relative(found, expected) < 5e-5
         assert CASES[name] == "hdit" or (found - expected).abs().max() < 5e-5
     (output * case["grad_w"]).sum().backward()
@@ -46,8 +51,12 @@ def test_output_and_gradients_are_the_references_at_times_of_their_own_and_at_on
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize(("in_channels", "out_channels"), [(1, None), (2, None), (2, 2), (5, 2), (1, 3)])
-def test_the_answer_has_the_shape_of_the_image_and_channels_of_its_own(name, in_channels, out_channels):
+@pytest.mark.parametrize(
+    ("in_channels", "out_channels"), [(1, None), (2, None), (2, 2), (5, 2), (1, 3)]
+)
+def test_the_answer_has_the_shape_of_the_image_and_channels_of_its_own(
+    name, in_channels, out_channels
+):
     model = tiny(name, in_channels, out_channels)
     expected = in_channels if out_channels is None else out_channels
     assert model(torch.rand(2), image(2, in_channels)).shape == (2, expected, ROWS, COLUMNS)
@@ -149,10 +158,16 @@ def test_a_shape_that_is_not_whole_units_names_one_that_is(name, dimension):
 
 
 POSITIONS = ["fourier_features", "polar", "spherical_harmonics", "none", None]
-OPTIONS = [{"position": position, "ring": ring, "dropout": 0.1} for position in POSITIONS for ring in (True, False)]
+OPTIONS = [
+    {"position": position, "ring": ring, "dropout": 0.1}
+    for position in POSITIONS
+    for ring in (True, False)
+]
 
 
-@pytest.mark.parametrize(("name", "options"), [*((name, {}) for name in NAMES), *itertools.product(PUBLISHED, OPTIONS)])
+@pytest.mark.parametrize(
+    ("name", "options"), [*((name, {}) for name in NAMES), *itertools.product(PUBLISHED, OPTIONS)]
+)
 def test_every_parameter_has_a_gradient_under_every_option(name, options):
     model = tiny(name, **options).train()
     model(torch.rand(2), image()).square().mean().backward()
@@ -175,7 +190,9 @@ def test_a_rolled_ring_gives_a_rolled_velocity_without_position(name):
 def test_a_narrow_ring_computes_what_a_ring_of_many_turns_does(turns):
     model, x = tiny("local").double(), image()[..., :4].double()
     many = model.velocity(torch.tensor([0.4]), x.repeat(1, 1, 1, 32))
-    torch.testing.assert_close(model.velocity(torch.tensor([0.4]), x.repeat(1, 1, 1, turns)), many[..., : 4 * turns])
+    torch.testing.assert_close(
+        model.velocity(torch.tensor([0.4]), x.repeat(1, 1, 1, turns)), many[..., : 4 * turns]
+    )
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -210,13 +227,19 @@ def test_every_configuration_builds_for_every_sensor(config):
 @pytest.mark.parametrize(
     ("names", "count"),
     [
-        (("hdit_18m", "adm_unet_18m", "efficient_unet_18m"), lambda model: sum(p.numel() for p in model.parameters())),
+        (
+            ("hdit_18m", "adm_unet_18m", "efficient_unet_18m"),
+            lambda model: sum(p.numel() for p in model.parameters()),
+        ),
         (("hdit_18m", "adm_unet_15g", "efficient_unet_15g"), count_macs),
     ],
 )
 def test_backbones_of_an_ablation_are_of_one_size_or_one_cost(names, count):
     with torch.device("meta"):
-        counts = [count(build_backbone(configurations()[name], build_sensor("hdl64e").rays(), 2)) for name in names]
+        counts = [
+            count(build_backbone(configurations()[name], build_sensor("hdl64e").rays(), 2))
+            for name in names
+        ]
     assert max(counts) <= 1.1 * min(counts)
 
 
@@ -226,5 +249,8 @@ def test_names_and_shapes_are_the_published_models(config, shared):
     with torch.device("meta"):
         model = build_backbone(configurations()[config], build_sensor("hdl64e").rays(), 2)
     kinds = dict.fromkeys(dict(model.named_parameters()), "param")
-    found = {key: (list(value.shape), kinds.get(key, "buffer")) for key, value in model.state_dict().items()}
+    found = {
+        key: (list(value.shape), kinds.get(key, "buffer"))
+        for key, value in model.state_dict().items()
+    }
     assert found == {key: (shape, kind) for key, shape, kind in expected}

@@ -13,7 +13,10 @@ MODES = list(itertools.product((True, False), (True, False)))  # gradients, auto
 
 def quick(names, times):
     """All of them, those but HDiT in the long run of the tests: tracing takes seconds."""
-    return [pytest.param(name, times, marks=() if name == "hdit" else pytest.mark.slow) for name in names]
+    return [
+        pytest.param(name, times, marks=() if name == "hdit" else pytest.mark.slow)
+        for name in names
+    ]
 
 
 class Counter:
@@ -48,8 +51,13 @@ def test_two_graphs_for_each_mode_and_then_no_more(name):
 
     def call(batch: int, gradients: bool, autocast: bool) -> None:
         x = image(batch)
-        with torch.set_grad_enabled(gradients), torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast):
-            torch.testing.assert_close(compiled(torch.tensor(0.3), x), model(0.3, x), rtol=0, atol=0.1)
+        with (
+            torch.set_grad_enabled(gradients),
+            torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast),
+        ):
+            torch.testing.assert_close(
+                compiled(torch.tensor(0.3), x), model(0.3, x), rtol=0, atol=0.1
+            )
 
     for mode in MODES:
         for batch in (7, 5, 3, 1):  # finished samples leave the batch of an adaptive solver
@@ -65,13 +73,16 @@ def test_two_graphs_for_each_mode_and_then_no_more(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_inductor_gives_the_same_values_and_gradients(name):
     torch.compiler.reset()
-    # float64: a fused sum rounds otherwise in float32, by 5e-4 in single gradients of the ADM U-Net.
+    # float64: a fused sum rounds otherwise in float32, by 5e-4 in single gradients of the ADM
+    # U-Net.
     model = tiny(name).double()
     x, t = image().double().requires_grad_(), torch.rand(2, dtype=torch.float64)
     compiled = torch.compile(model)
     results = []
     for call in (model, compiled):
         output = call(t, x)
-        results.append([output, *torch.autograd.grad(output.square().sum(), [x, *model.parameters()])])
+        results.append(
+            [output, *torch.autograd.grad(output.square().sum(), [x, *model.parameters()])]
+        )
     for expected, found in zip(*results, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)

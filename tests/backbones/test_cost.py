@@ -51,18 +51,23 @@ class Other(nn.Module):
     def __init__(self):
         super().__init__()
         self.transposed = nn.ConvTranspose2d(3, 3, 2, stride=2)
-        self.convolution, self.recurrent = nn.Conv1d(3, 3, 5, padding=2), nn.GRU(3, 3, batch_first=True)
+        self.convolution, self.recurrent = (
+            nn.Conv1d(3, 3, 5, padding=2),
+            nn.GRU(3, 3, batch_first=True),
+        )
 
     def forward(self, x):  # (B, 3, 8, 16)
         tokens = self.recurrent(self.convolution(self.transposed(x)[..., :8, :16].flatten(2)).mT)[0]
-        return (torch.einsum("bqc,bkc->bqk", tokens, tokens).softmax(-1) @ tokens).mT.unflatten(2, (8, 16))
+        return (torch.einsum("bqc,bkc->bqk", tokens, tokens).softmax(-1) @ tokens).mT.unflatten(
+            2, (8, 16)
+        )
 
 
 def test_other_layers_by_hand():
     """128 values or tokens of 3 channels.
 
-    Each value meets 2 x 2 taps of 3 channels in the transposed convolution; a token meets 5 taps, two products for
-    each of three gates, and two products of all pairs.
+    Each value meets 2 x 2 taps of 3 channels in the transposed convolution; a token meets 5 taps,
+    two products for each of three gates, and two products of all pairs.
     """
     model = Plain(torch.zeros(2, 8, 16), in_channels=2, out_channels=3)
     before = count_macs(model)

@@ -1,4 +1,6 @@
-"""A part of an image against a backbone that was built for the part alone, from its own rays, without a ring."""
+"""A part of an image against a backbone that was built for the part alone, from its own rays,
+without a ring.
+"""
 
 import pytest
 import torch
@@ -31,11 +33,16 @@ X, T = torch.randn(2, 2, *SHAPE), torch.tensor([0.2, 0.9])
 def test_a_part_is_the_backbone_of_its_own_rays(name, part):
     # of positions whose shapes do not depend on the image's
     options = {"position": "none", "detail": [2, 8]} if name == "hdit" else {"position": "polar"}
-    whole, own = backbone(name, **options), backbone(name, part.crop(RAYS), ring=part.width == 64, **options)
+    whole, own = (
+        backbone(name, **options),
+        backbone(name, part.crop(RAYS), ring=part.width == 64, **options),
+    )
     weights = {key: value for key, value in whole.state_dict().items() if key != "coords"}
     own.load_state_dict({**weights, "coords": own.coords})
     with torch.no_grad():
-        torch.testing.assert_close(whole.cropped(part.rows, part.columns)(T, part.crop(X)), own(T, part.crop(X)))
+        torch.testing.assert_close(
+            whole.cropped(part.rows, part.columns)(T, part.crop(X)), own(T, part.crop(X))
+        )
 
 
 @pytest.mark.parametrize("name", CROPPABLE)
@@ -54,16 +61,24 @@ def test_a_part_has_its_own_rays_and_the_whole_is_as_before(name, part):
 
 def test_a_learned_position_follows_the_part():
     whole, part = backbone("hdit"), PARTS[1]
-    learned, own = whole.spatial_pe.embedding, whole.cropped(part.rows, part.columns).spatial_pe.embedding
-    assert torch.equal(own, torch.cat([learned[:, :, 12:], learned[:, :, :4]], 2))  # columns 48-63, 0-15 in fours
+    learned, own = (
+        whole.spatial_pe.embedding,
+        whole.cropped(part.rows, part.columns).spatial_pe.embedding,
+    )
+    # columns 48-63, 0-15 in fours
+    assert torch.equal(own, torch.cat([learned[:, :, 12:], learned[:, :, :4]], 2))
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_the_weights_are_shared(name):
     whole = backbone(name)
-    own = {parameter.data_ptr() for parameter in whole.cropped(PARTS[0].rows, PARTS[0].columns).parameters()}
+    own = {
+        parameter.data_ptr()
+        for parameter in whole.cropped(PARTS[0].rows, PARTS[0].columns).parameters()
+    }
     shared = {parameter.data_ptr() for parameter in whole.parameters()}
-    assert len(own - shared) == (1 if name == "hdit" else 0)  # the position embedding is a piece of the whole one
+    # the position embedding is a piece of the whole one
+    assert len(own - shared) == (1 if name == "hdit" else 0)
 
 
 def test_units_are_patches_halved_at_every_level():

@@ -19,7 +19,9 @@ def test_the_path_changes_nothing_at_the_start():
 
 
 def test_the_path_sees_single_pixels():
-    """Without tokens and blocks it is two 3 x 3 convolutions: a pixel is seen 2 columns away, also across the seam."""
+    """Without tokens and blocks it is two 3 x 3 convolutions: a pixel is seen 2 columns away, also
+    across the seam.
+    """
     model = untrained("hdit", detail=[1, 8]).eval()
     torch.nn.init.normal_(model.detail.answer.weight)
     torch.nn.init.zeros_(model.detail.spread.weight)
@@ -34,7 +36,9 @@ def test_the_path_sees_single_pixels():
 
 @pytest.mark.parametrize("s", [0.3, 1.0])
 def test_input_and_target_of_the_network_have_unit_variance(s):
-    x_0, x_1 = torch.randn(2, 200_000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    x_0, x_1 = torch.randn(
+        2, 200_000, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     x_1 = s * x_1
     for t in T:
         into, skip, out = (factor.flatten() for factor in precondition(t[None], s))

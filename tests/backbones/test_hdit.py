@@ -17,17 +17,24 @@ def test_circular_attention_blocks_are_the_references(shared, index):
     ))  # fmt: skip
     layer.load_state_dict(case["state_dict"])
     with torch.no_grad():
-        for factor in (1, 2**-9):  # attention is by cosines: the lengths of queries and keys do not matter
+        # attention is by cosines: the lengths of queries and keys do not matter
+        for factor in (1, 2**-9):
             layer.qkv_proj.weight[: 2 * case["dim"]] *= factor
             residual = layer(case["x"], case["emb"], layer.rope.table(case["coords"]))
             torch.testing.assert_close(residual, case["residual"], rtol=0, atol=1e-5)
 
 
-def test_times_and_rays_are_rounded_as_the_references(shared, monkeypatch):  # logits of up to 100 amplify what is left
-    case, F = load_case(shared, "hdit_16x192.pt"), torch.nn.functional  # its norm rounds as published in torch 2.6 too
+# logits of up to 100 amplify what is left
+def test_times_and_rays_are_rounded_as_the_references(shared, monkeypatch):
+    # its norm rounds as published in torch 2.6 too
+    case, F = load_case(shared, "hdit_16x192.pt"), torch.nn.functional
     model, rays = backbone_of("hdit", case), F.avg_pool2d(case["state_dict"]["coords"], (1, 4))
-    monkeypatch.setattr("r2flow.backbones.layers.rms_norm", lambda x, scale: F.rms_norm(x, scale.shape, scale, 1e-6))
-    torch.testing.assert_close(model.timestep_pe(case["t"]), case["acts"]["timestep_pe"], rtol=0, atol=5e-7)
+    monkeypatch.setattr(
+        "r2flow.backbones.layers.rms_norm", lambda x, scale: F.rms_norm(x, scale.shape, scale, 1e-6)
+    )
+    torch.testing.assert_close(
+        model.timestep_pe(case["t"]), case["acts"]["timestep_pe"], rtol=0, atol=5e-7
+    )
     for level in range(3):
         block = (model.down_levels[f"level_{level}"] if level < 2 else model.mid_levels)[0]
         assert torch.equal(model.get_buffer(f"table_{level}"), block.residual_attn.rope.table(rays))
@@ -46,11 +53,21 @@ def test_angles_stay_exact_whatever_the_weights_become(dtype):
 
 
 def test_autocast_does_not_round_the_image_at_the_ends():
-    """Where blocks add nothing and inner levels are left out, the network is linear layers between two images."""
+    """Where blocks add nothing and inner levels are left out, the network is linear layers between
+    two images.
+    """
     model, x, t = tiny("hdit", detail=[1, 8]), image(), torch.tensor([0.1, 0.9985])
     with torch.no_grad():
         for name, weight in model.named_parameters():
-            if name.endswith(("out_proj.weight", "linear.weight", "spread.weight", "second.weight", "second.bias")):
+            if name.endswith(
+                (
+                    "out_proj.weight",
+                    "linear.weight",
+                    "spread.weight",
+                    "second.weight",
+                    "second.bias",
+                )
+            ):
                 weight.zero_()
             elif name.endswith("alpha"):  # the share of the inner level is its sigmoid
                 weight.fill_(-1e4)

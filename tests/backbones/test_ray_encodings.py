@@ -16,7 +16,9 @@ def units(shared):
 
 
 def test_spherical_harmonics_are_the_references(units):
-    torch.testing.assert_close(SphericalHarmonics((16, 64))(units["hdl_16x64"]), units["sh5_16x64"], rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        SphericalHarmonics((16, 64))(units["hdl_16x64"]), units["sh5_16x64"], rtol=0, atol=1e-5
+    )
 
 
 def test_rotary_frequencies_are_the_references(units):
@@ -27,13 +29,19 @@ def test_rotary_frequencies_are_the_references(units):
 
 
 def test_spherical_harmonics_are_orthonormal():
-    """Integrated over the sphere, by Gauss-Legendre in sin e and equal steps in a, Y_i Y_j is delta_ij."""
+    """Integrated over the sphere, by Gauss-Legendre in sin e and equal steps in a, Y_i Y_j is
+    delta_ij.
+    """
     z, w = np.polynomial.legendre.leggauss(16)
     nodes, weights = torch.from_numpy(np.arcsin(z)), torch.from_numpy(w)
     azimuth = torch.arange(32, dtype=torch.float64) * (2 * math.pi / 32)
-    y = SphericalHarmonics((16, 32))(torch.stack(torch.meshgrid(nodes, azimuth, indexing="ij"))[None])[0].flatten(1)
+    y = SphericalHarmonics((16, 32))(
+        torch.stack(torch.meshgrid(nodes, azimuth, indexing="ij"))[None]
+    )[0].flatten(1)
     area = (weights[:, None] * (2 * math.pi / 32)).expand(16, 32).flatten()
-    torch.testing.assert_close((y * area) @ y.T, torch.eye(25, dtype=torch.float64), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        (y * area) @ y.T, torch.eye(25, dtype=torch.float64), rtol=0, atol=1e-12
+    )
 
 
 def test_rotation_keeps_lengths_and_depends_on_angle_differences_only():

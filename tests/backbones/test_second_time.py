@@ -1,4 +1,6 @@
-"""u(x, t, s): a network of two times is the network of one time that it starts from, until it learns otherwise."""
+"""u(x, t, s): a network of two times is the network of one time that it starts from, until it
+learns otherwise.
+"""
 
 import pytest
 import torch
@@ -69,7 +71,9 @@ def test_nearby_second_times_are_told_apart_under_autocast(name):
 
 
 def test_a_backbone_that_takes_one_time_says_so_when_it_is_built():
-    with pytest.raises(InputError, match="OneTime takes no second time: choose a backbone that does"):
+    with pytest.raises(
+        InputError, match="OneTime takes no second time: choose a backbone that does"
+    ):
         type("OneTime", (Backbone,), {})(rays(), second_time=True)
 
 
@@ -79,5 +83,8 @@ def test_a_backbone_that_gives_another_shape_is_named(part, found):
         def velocity(self, t, x, s=None):
             return super().velocity(t, x)[part]  # a part would broadcast
 
-    with pytest.raises(InputError, match=rf"a Ranges must give images of \(2, 2, {ROWS}, {COLUMNS}\), found {found}"):
+    with pytest.raises(
+        InputError,
+        match=rf"a Ranges must give images of \(2, 2, {ROWS}, {COLUMNS}\), found {found}",
+    ):
         Ranges(rays())(0.5, image(2))

@@ -11,9 +11,12 @@ from tests.reference import load_case
 
 def test_resampling_is_the_references(shared):
     units = load_case(shared, "units_encodings.pt")
-    cases = [(case["kw"], case) for case in units["resample"] if "direction" not in case["kw"]]  # of one axis: unused
+    # of one axis: unused
+    cases = [(case["kw"], case) for case in units["resample"] if "direction" not in case["kw"]]
     for options, case in cases:
-        resample = Resample(options.get("window", (1, 3, 3, 1)), "up" in options, options.get("ring", True))
+        resample = Resample(
+            options.get("window", (1, 3, 3, 1)), "up" in options, options.get("ring", True)
+        )
         torch.testing.assert_close(resample.kernel, case["kernel"], rtol=0, atol=0)
         torch.testing.assert_close(resample(units["h"]), case["out"], rtol=0, atol=1e-5)
     assert len(cases) == 6
@@ -23,7 +26,8 @@ def test_resampling_is_the_references(shared):
 def test_resampling_keeps_a_constant_ring_constant(window):
     x = torch.full((1, 3, 8, 16), 2.5)
     for up in (True, False):
-        inner = Resample(window, up=up, ring=True)(x)[:, :, 1:-1]  # the filter sees zeros above and below
+        # the filter sees zeros above and below
+        inner = Resample(window, up=up, ring=True)(x)[:, :, 1:-1]
         torch.testing.assert_close(inner, torch.full_like(inner, 2.5))
 
 
@@ -32,14 +36,26 @@ def test_resampling_keeps_a_constant_ring_constant(window):
     ("options", "message"),
     [
         ({"base_channels": 2}, "base_channels: must be even and at least 4, found 2"),
-        ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
+        (
+            {"num_residual_blocks": [1, 2]},
+            r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]",
+        ),
         ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
         ({"position": "learnable"}, "no position named 'learnable'; known: fourier_features, none"),
         ({"name": "local", "channels": 5}, "channels: must be even and at least 4, found 5"),
         ({"name": "hdit", "depths": (1, 0, 1, 1)}, "depths must be 4 integers of at least 1"),
-        ({"name": "hdit", "base_channels": 16, "num_heads": (3, 2, 2, 2)}, "16 channels cannot be shared by 3 heads"),
-        *(({"name": "hdit", "detail": detail}, "detail must be 2 integers") for detail in ([2], [0, 8], [2, 8, 8])),
-        ({"name": "hdit", "attention": "tile"}, "no attention backend named 'tile'.*Did you mean 'tiles'"),
+        (
+            {"name": "hdit", "base_channels": 16, "num_heads": (3, 2, 2, 2)},
+            "16 channels cannot be shared by 3 heads",
+        ),
+        *(
+            ({"name": "hdit", "detail": detail}, "detail must be 2 integers")
+            for detail in ([2], [0, 8], [2, 8, 8])
+        ),
+        (
+            {"name": "hdit", "attention": "tile"},
+            "no attention backend named 'tile'.*Did you mean 'tiles'",
+        ),
     ],
 )
 def test_options_that_cannot_work_say_why(name, options, message):
@@ -49,5 +65,10 @@ def test_options_that_cannot_work_say_why(name, options, message):
 
 @pytest.mark.parametrize(("name", "width"), [("adm_unet", 16), ("efficient_unet", 8)])
 def test_the_first_convolution_has_its_published_width(name, width):
-    options = {"name": name, "base_channels": 8, "channel_multiplier": [2, 2], "num_residual_blocks": 1}
+    options = {
+        "name": name,
+        "base_channels": 8,
+        "channel_multiplier": [2, 2],
+        "num_residual_blocks": 1,
+    }
     assert len(build_backbone(options, torch.zeros(2, 16, 64), 2).in_conv.weight) == width

@@ -22,9 +22,15 @@ def rays(rows: int = ROWS, columns: int = COLUMNS) -> torch.Tensor:
 
 
 def untrained(
-    name: str, in_channels: int = 2, out_channels: int | None = None, second_time: bool = False, **options: Any
+    name: str,
+    in_channels: int = 2,
+    out_channels: int | None = None,
+    second_time: bool = False,
+    **options: Any,
 ) -> Backbone:
-    return build_backbone({**tiny_options(name), **options}, rays(), in_channels, out_channels, second_time)
+    return build_backbone(
+        {**tiny_options(name), **options}, rays(), in_channels, out_channels, second_time
+    )
 
 
 def tiny(name: str, *channels: int | None, **options: Any) -> Backbone:

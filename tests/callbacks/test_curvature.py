@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch import nn
-
 from r2flow.callbacks import EMA, SamplePictures
 from r2flow.callbacks.curvature import Curvature
 from r2flow.callbacks.periodic import Periodic
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import nn
+
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.noise import standard_normal
 from r2flow.reports import pictures
@@ -21,7 +21,8 @@ from tests.fields import Field
 pytestmark = pytest.mark.filterwarnings("ignore:.*")
 
 SPACE = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays())
-# Of 1, 2 and 3 at steps 2 and 3: the average copies 1, takes 1 - 2^(-2/3) of it and the rest of 2, then half of 3.
+# Of 1, 2 and 3 at steps 2 and 3: the average copies 1, takes 1 - 2^(-2/3) of it and the rest of 2,
+# then half of 3.
 AVERAGES = 1 + 2 ** (-2 / 3), (1 + 2 ** (-2 / 3) + 3) / 2
 
 
@@ -68,22 +69,37 @@ def fit(tmp_path, callbacks, steps=6, logger=None, **options):
     stage = Stage()
     loader = torch.utils.data.DataLoader(torch.zeros(64, 1), batch_size=1)
     logger = logger or CSVLogger(tmp_path, name="metrics")
-    more = {"max_steps": steps, "callbacks": callbacks, "logger": logger, "log_every_n_steps": 1, **options}
+    more = {
+        "max_steps": steps,
+        "callbacks": callbacks,
+        "logger": logger,
+        "log_every_n_steps": 1,
+        **options,
+    }
     quiet_trainer(tmp_path, **more).fit(stage, loader)
     return stage
 
 
 def exact(a: float, n: int) -> tuple[float, float]:
-    """(int s dt, the same over |d|^2) of Euler's n steps: v_k = -a x_0 (1 - a/n)^k, mean over two scans."""
+    """(int s dt, the same over |d|^2) of Euler's n steps: v_k = -a x_0 (1 - a/n)^k, mean over two
+    scans.
+    """
     factors = [-a * (1 - a / n) ** k for k in range(n)]
     mean = sum(factors) / n
     variance = sum((f - mean) ** 2 for f in factors) / n
-    norms = [standard_normal(SPACE.shape, 7, "evaluation", i).double().square().sum().item() for i in range(2)]
+    norms = [
+        standard_normal(SPACE.shape, 7, "evaluation", i).double().square().sum().item()
+        for i in range(2)
+    ]
     return variance * sum(norms) / 2, variance / mean**2
 
 
 def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
-    fit(tmp_path, [EMA(decay=0.5, every=1, warmup_steps=0), Curvature(every=2, num=2, steps=4)], steps=3)
+    fit(
+        tmp_path,
+        [EMA(decay=0.5, every=1, warmup_steps=0), Curvature(every=2, num=2, steps=4)],
+        steps=3,
+    )
     curves = read_curves(tmp_path, ("curvature/s", "curvature/bend", "train/loss"))
     assert curves["curvature/s"][0].tolist() == [2, 3]  # every second step, and the last
     assert curves["train/loss"][0].tolist() == [1, 2, 3]
@@ -108,7 +124,9 @@ def test_a_resumed_run_does_not_look_again_at_the_step_that_it_goes_on_from():
             looked.append(trainer.global_step)
 
     looked: list[int] = []
-    trainer = SimpleNamespace(global_step=4, estimated_stepping_batches=8, is_global_zero=True, callbacks=[])
+    trainer = SimpleNamespace(
+        global_step=4, estimated_stepping_batches=8, is_global_zero=True, callbacks=[]
+    )
     counted, module = Counted(every=2), nn.Module()
     counted.on_train_start(trainer, module)
     for trainer.global_step in (4, 5, 5, 6, 6):
@@ -119,10 +137,21 @@ def test_a_resumed_run_does_not_look_again_at_the_step_that_it_goes_on_from():
 def test_pictures_show_scans_of_the_averaged_weights_from_the_same_noise(tmp_path, monkeypatch):
     sheets = []
     real = pictures.contact_sheet
-    monkeypatch.setattr("r2flow.callbacks.periodic.contact_sheet", lambda *given: sheets.append(given) or real(*given))
+    monkeypatch.setattr(
+        "r2flow.callbacks.periodic.contact_sheet",
+        lambda *given: sheets.append(given) or real(*given),
+    )
     callbacks = [EMA(decay=0.5, every=1, warmup_steps=0), SamplePictures(every=2, num=2, steps=4)]
-    fit(tmp_path, callbacks, steps=3, logger=TensorBoardLogger(tmp_path, name="tensorboard", version=""))
-    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == ["step-00000002.png", "step-00000003.png"]
+    fit(
+        tmp_path,
+        callbacks,
+        steps=3,
+        logger=TensorBoardLogger(tmp_path, name="tensorboard", version=""),
+    )
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [
+        "step-00000002.png",
+        "step-00000003.png",
+    ]
     noise = torch.stack([standard_normal(SPACE.shape, 7, "evaluation", i) for i in range(2)])
     for a, (images, _, titles) in zip(AVERAGES, sheets, strict=True):
         expected = SPACE.decode(noise * (1 - a / 4) ** 4).numpy()  # Euler's path

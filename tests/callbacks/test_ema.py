@@ -2,9 +2,9 @@ import lightning as L
 import pytest
 import torch
 from lightning.pytorch.callbacks import LambdaCallback
+from r2flow.callbacks.ema import DECAYS, EMA, averaged_weights
 from torch import nn
 
-from r2flow.callbacks.ema import DECAYS, EMA, averaged_weights
 from tests.conftest import quiet_trainer
 from tests.reference import load_case
 
@@ -12,7 +12,9 @@ from tests.reference import load_case
 def test_decays_begin_behind_the_warm_up_and_are_bounded():
     """LiDARGen's is constant, LiDM's (1 + n) / (10 + n) from n = 1."""
     assert [DECAYS["constant"](step, 2, 0.9) for step in (1, 2, 3)] == [0, 0.9, 0.9]
-    assert [DECAYS["ratio"](step, 2, 0.26) for step in (1, 2, 3, 9)] == pytest.approx([0, 2 / 11, 0.25, 0.26])
+    assert [DECAYS["ratio"](step, 2, 0.26) for step in (1, 2, 3, 9)] == pytest.approx(
+        [0, 2 / 11, 0.25, 0.26]
+    )
 
 
 class Scripted(L.LightningModule):
@@ -46,7 +48,9 @@ def trained(ema: EMA, values: list[float], tmp_path) -> tuple[Scripted, list[tup
         trace.append((module.weight.item(), average))
 
     callbacks = [ema, LambdaCallback(on_train_batch_end=look)]
-    trainer = quiet_trainer(tmp_path, max_steps=len(values), callbacks=callbacks, num_sanity_val_steps=0)
+    trainer = quiet_trainer(
+        tmp_path, max_steps=len(values), callbacks=callbacks, num_sanity_val_steps=0
+    )
     trainer.fit(module, loader, loader)
     return module, trace
 
@@ -59,11 +63,18 @@ def test_the_average_follows_the_reference_s_trace(shared, tmp_path):
     assert [average for _, average in trace] == pytest.approx(averages, abs=1e-5)
 
 
-@pytest.mark.parametrize(("name", "rule"), [("lidm_diffusion", "ratio"), ("lidargen_objective", "constant")])
+@pytest.mark.parametrize(
+    ("name", "rule"), [("lidm_diffusion", "ratio"), ("lidargen_objective", "constant")]
+)
 def test_the_average_is_the_published_from_the_first_step_on(shared, tmp_path, name, rule):
     case = load_case(shared, f"{name}.pt")["ema"]
-    values, averages = ((case[key][1:] - case["ema"][0])[:, 0, 0].tolist() for key in ("online", "ema"))  # from 0
-    _, trace = trained(EMA(case.get("mu", 0.9999), every=1, warmup_steps=0, rule=rule), values, tmp_path)
+    # from 0
+    values, averages = (
+        (case[key][1:] - case["ema"][0])[:, 0, 0].tolist() for key in ("online", "ema")
+    )
+    _, trace = trained(
+        EMA(case.get("mu", 0.9999), every=1, warmup_steps=0, rule=rule), values, tmp_path
+    )
     assert [average for _, average in trace] == pytest.approx(averages, abs=1e-6)
 
 
@@ -78,7 +89,9 @@ def test_validation_sees_the_average_and_leaves_the_weights(tmp_path):
 
 
 @pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (3, 2), (3, 6), (3, 10), (20, 15)])
-def test_a_run_that_ends_before_its_average_begins_has_the_weights_that_it_learned(tmp_path, warmup: int, steps: int):
+def test_a_run_that_ends_before_its_average_begins_has_the_weights_that_it_learned(
+    tmp_path, warmup: int, steps: int
+):
     """Until then the average is that of the last copy; behind the warm-up it moves by half."""
     values = [float(n) for n in range(1, steps + 1)]
     _, trace = trained(EMA(0.5, every=10, warmup_steps=warmup), values, tmp_path)

@@ -5,13 +5,13 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.plugins import MixedPrecision
+from r2flow.callbacks.checkpoints import AtomicCheckpointIO
+from r2flow.callbacks.ema import EMA
+from r2flow.callbacks.guard import Guard
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow import noise
-from r2flow.callbacks.checkpoints import AtomicCheckpointIO
-from r2flow.callbacks.ema import EMA
-from r2flow.callbacks.guard import Guard
 from r2flow.data.loader import Permutations, RunSampler
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of
@@ -39,12 +39,24 @@ class Line(L.LightningModule):
 
 def batches(*values: float, offset: dict[int, float] | None = None) -> DataLoader:
     """One number a step, in order; `offset` by step."""
-    return DataLoader([(torch.tensor([x]), torch.tensor((offset or {}).get(i, 0.0))) for i, x in enumerate(values)])
+    return DataLoader(
+        [
+            (torch.tensor([x]), torch.tensor((offset or {}).get(i, 0.0)))
+            for i, x in enumerate(values)
+        ]
+    )
 
 
-def fit(module: L.LightningModule, loader, tmp_path, *callbacks: L.Callback, **options) -> L.Trainer:
+def fit(
+    module: L.LightningModule, loader, tmp_path, *callbacks: L.Callback, **options
+) -> L.Trainer:
     clip = 1.0 if module.automatic_optimization else None
-    own = {"max_steps": 100, "max_epochs": 1, "gradient_clip_val": clip, "use_distributed_sampler": False}
+    own = {
+        "max_steps": 100,
+        "max_epochs": 1,
+        "gradient_clip_val": clip,
+        "use_distributed_sampler": False,
+    }
     plugins = [AtomicCheckpointIO(), *options.pop("plugins", [])]
     trainer = quiet_trainer(tmp_path, callbacks=list(callbacks), plugins=plugins, **own, **options)
     trainer.fit(module, loader)
@@ -53,8 +65,8 @@ def fit(module: L.LightningModule, loader, tmp_path, *callbacks: L.Callback, **o
 
 @pytest.mark.parametrize(("value", "offset"), [(NAN, 0.0), (INF, 0.0), (2.0, INF)])
 def test_a_skipped_step_is_as_if_it_had_never_been(tmp_path, value: float, offset: float):
-    # AdamW at a constant rate counts its own steps: without the broken one the same weights come out. An infinite
-    # offset makes the loss infinite and leaves its gradient finite.
+    # AdamW at a constant rate counts its own steps: without the broken one the same weights come
+    # out. An infinite offset makes the loss infinite and leaves its gradient finite.
     skipped, without, guard = Line(), Line(), Guard()
     fit(skipped, batches(1.0, 2.0, value, -1.0, 0.5, offset={2: offset}), tmp_path, guard)
     fit(without, batches(1.0, 2.0, -1.0, 0.5), tmp_path)
@@ -105,7 +117,9 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
     # Two accumulated batches of 2: the first step takes images 0 to 3, the second 4 to 7.
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "step-00000001.ckpt").touch()
-    order = [int(s) for epoch in range(2) for s in noise.generator(0, "shuffle", epoch).permutation(6)]
+    order = [
+        int(s) for epoch in range(2) for s in noise.generator(0, "shuffle", epoch).permutation(6)
+    ]
     data = Batches({order[5]} - set(order[:4]))
     with refused(
         "stopped at step 2: the step was skipped",
@@ -122,11 +136,14 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
 
 def half(scale: float) -> MixedPrecision:
     """16-mixed, which Lightning has on GPUs only, with a scale to start from."""
-    return MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu", init_scale=scale, growth_interval=1000))
+    return MixedPrecision(
+        "16-mixed", "cpu", torch.amp.GradScaler("cpu", init_scale=scale, growth_interval=1000)
+    )
 
 
 def test_a_loss_scale_that_finds_its_place_is_no_defect(tmp_path):
-    # Half precision ends at 65504 < 2^16: gradients of size one overflow until the scale is well below that.
+    # Half precision ends at 65504 < 2^16: gradients of size one overflow until the scale is well
+    # below that.
     plugin, guard = half(2.0**20), Guard()
     fit(Line(), batches(*[1.0] * 20), tmp_path, guard, plugins=[plugin])
     assert plugin.scaler.get_scale() < 2.0**17
@@ -134,7 +151,9 @@ def test_a_loss_scale_that_finds_its_place_is_no_defect(tmp_path):
 
 
 def test_a_loss_scale_that_finds_no_place_ends_the_run(tmp_path):
-    with pytest.raises(InputError, match=r"3 steps in a row were .* 0 in the run.* loss scale 262144"):
+    with pytest.raises(
+        InputError, match=r"3 steps in a row were .* 0 in the run.* loss scale 262144"
+    ):
         fit(Line(), batches(*[1.0] * 20), tmp_path, Guard(skips=3), plugins=[half(2.0**20)])
     with pytest.raises(InputError, match=r"the step was skipped .* loss scale 1.04858e\+06"):
         fit(Line(), batches(1.0), tmp_path, Guard(lowest_scale=2.0**21), plugins=[half(2.0**20)])
@@ -157,11 +176,16 @@ def test_broken_weights_are_never_written(tmp_path, averaged: bool):
     stopped = "stopped at step 3: the weights are no longer finite (inner.bias first, 1 of 4)"
     with refused(stopped, "step-00000002.ckpt, from which the same command resumes"):
         fit(Line(), batches(*[1.0] * 9), tmp_path, *callbacks)
-    assert [p.name for p in checkpoints_of(tmp_path)] == ["step-00000002.ckpt", "step-00000001.ckpt"]
+    assert [p.name for p in checkpoints_of(tmp_path)] == [
+        "step-00000002.ckpt",
+        "step-00000001.ckpt",
+    ]
 
 
 class TwoLosses(Line):
-    """Each layer has an optimiser of its own; the gradient of the outer one is broken at the step of a negative x."""
+    """Each layer has an optimiser of its own; the gradient of the outer one is broken at the step
+    of a negative x.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -177,7 +201,9 @@ class TwoLosses(Line):
             optimizer.step()
 
     def configure_optimizers(self):
-        return [torch.optim.AdamW(layer.parameters(), lr=0.05) for layer in (self.inner, self.outer)]
+        return [
+            torch.optim.AdamW(layer.parameters(), lr=0.05) for layer in (self.inner, self.outer)
+        ]
 
 
 def test_of_two_optimizers_the_one_with_broken_gradients_skips_its_step(tmp_path):

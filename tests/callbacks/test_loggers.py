@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread, imsave
-
 from r2flow.callbacks.loggers import LOGGERS, log_config, log_figures, log_picture
+
 from r2flow.errors import InputError
 
 PIXELS = np.arange(8 * 16 * 3, dtype=np.uint8).reshape(8, 16, 3)
@@ -16,7 +16,9 @@ PIXELS = np.arange(8 * 16 * 3, dtype=np.uint8).reshape(8, 16, 3)
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
 def test_a_missing_package_names_its_extra(name, tmp_path, monkeypatch):
     monkeypatch.setattr("r2flow.errors.find_spec", lambda package: None)
-    with pytest.raises(InputError, match=rf"loggers=\[{name}\] needs .* install 'r2flow\[{name}\]'"):
+    with pytest.raises(
+        InputError, match=rf"loggers=\[{name}\] needs .* install 'r2flow\[{name}\]'"
+    ):
         LOGGERS[name](tmp_path)
     assert not [*tmp_path.iterdir()]
 

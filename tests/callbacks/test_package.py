@@ -3,8 +3,8 @@ import sys
 
 import lightning as L
 import pytest
-
 from r2flow.callbacks import CALLBACKS, Stopping, build_callbacks
+
 from r2flow.errors import InputError
 from r2flow.runs.composing import compose
 from tests.conftest import ROOT
@@ -17,14 +17,17 @@ def test_a_second_copy_is_refused(monkeypatch):
     assert "callbacks" not in sys.modules
 
 
-def test_what_is_no_callback_is_refused_and_a_plug_in_comes_before_what_saves_its_state(monkeypatch):
+def test_what_is_no_callback_is_refused_and_a_plug_in_comes_before_what_saves_its_state(
+    monkeypatch,
+):
     config = compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.theirs.some=2"])
     monkeypatch.setitem(CALLBACKS._entries, "theirs", lambda some: [L.Callback()] * some)
     with pytest.raises(InputError, match=r"theirs must make a Lightning callback, found \["):
         build_callbacks(config["callbacks"])
     monkeypatch.setitem(CALLBACKS._entries, "theirs", L.Callback)
     *_, theirs, last = build_callbacks({**config["callbacks"], "theirs": {}})
-    assert (type(theirs), type(last)) == (L.Callback, Stopping)  # which saves their state after the step
+    # which saves their state after the step
+    assert (type(theirs), type(last)) == (L.Callback, Stopping)
 
 
 @pytest.mark.parametrize("key", ["ema", "theirs"])

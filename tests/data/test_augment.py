@@ -1,4 +1,6 @@
-"""Augmentation: exact where it is geometry, counted where it is chance, and a function of (seed, k) alone."""
+"""Augmentation: exact where it is geometry, counted where it is chance, and a function of (seed, k)
+alone.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ KINDS = {"flip": True, "roll": True}
 
 
 # Every pixel has a range of its own, so that it can be found again.
-IMAGE = np.linspace(2, 70, 8 * 32, dtype=np.float32).reshape(8, 32) * np.array([[[1]], [[0.01]]], np.float32)
+IMAGE = np.linspace(2, 70, 8 * 32, dtype=np.float32).reshape(8, 32) * np.array(
+    [[[1]], [[0.01]]], np.float32
+)
 SLOPE = InMemory(IMAGE[None], ["slope"])
 
 
@@ -34,7 +38,8 @@ def test_half_of_the_scans_are_mirrored():
 def test_a_rolled_image_is_the_image_of_the_turned_scan():
     xyz, reflectance = image_to_points(IMAGE, SENSOR.rays())
     roll = Augmentation(roll=True)
-    turns = [int(np.argmin(roll(IMAGE, 0, k)[0, 0])) for k in range(400)]  # the first column is the nearest
+    # the first column is the nearest
+    turns = [int(np.argmin(roll(IMAGE, 0, k)[0, 0])) for k in range(400)]
     np.testing.assert_array_equal(roll(IMAGE, 0, 0), np.roll(IMAGE, turns[0], -1))
     a = -2 * np.pi / 32 * turns[0]  # columns count against azimuth
     turned = xyz @ np.float32([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]])

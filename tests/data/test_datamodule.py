@@ -61,25 +61,39 @@ def test_the_fingerprint_knows_the_parts_of_a_mixture_and_not_where_they_lie(tmp
 
 
 @pytest.mark.parametrize("held_out", [False, True])
-def test_the_fingerprint_knows_other_scans_of_the_same_names_and_a_copy(numbered: Path, tmp_path: Path, held_out: bool):
+def test_the_fingerprint_knows_other_scans_of_the_same_names_and_a_copy(
+    numbered: Path, tmp_path: Path, held_out: bool
+):
     def fingerprint(name: str, root: Path) -> str:
         other = {"name": name, "root": str(root)}
         options = {"validation": {"data": other}} if held_out else other
         return module(**{"name": "simulated", "scenes": 3, **options}).fingerprint()
 
-    copy = shutil.copytree(numbered, tmp_path / "copy", copy_function=shutil.copyfile)  # with other times
-    prepared = [prepare_folder(folder, tmp_path / f"of {folder.name}", SENSOR) for folder in (numbered, copy)]
+    # with other times
+    copy = shutil.copytree(numbered, tmp_path / "copy", copy_function=shutil.copyfile)
+    prepared = [
+        prepare_folder(folder, tmp_path / f"of {folder.name}", SENSOR)
+        for folder in (numbered, copy)
+    ]
     first = fingerprint("folder", numbered), fingerprint("prepared", prepared[0])
     assert (fingerprint("folder", copy), fingerprint("prepared", prepared[1])) == first
     for number in range(12):
         write_scan(copy / f"{number:06d}.bin", 20 + number)
     shutil.rmtree(prepared[1])
-    other = fingerprint("folder", copy), fingerprint("prepared", prepare_folder(copy, prepared[1], SENSOR))
+    other = (
+        fingerprint("folder", copy),
+        fingerprint("prepared", prepare_folder(copy, prepared[1], SENSOR)),
+    )
     assert not set(first) & set(other)
 
 
-def test_the_fingerprint_knows_the_simulator_s_revision_where_it_is_used(numbered: Path, monkeypatch):
-    drawn, read = module(scenes=3).fingerprint(), module(name="folder", root=str(numbered)).fingerprint()
+def test_the_fingerprint_knows_the_simulator_s_revision_where_it_is_used(
+    numbered: Path, monkeypatch
+):
+    drawn, read = (
+        module(scenes=3).fingerprint(),
+        module(name="folder", root=str(numbered)).fingerprint(),
+    )
     monkeypatch.setattr("r2flow.simulator.REVISION", 10**6)
     assert module(scenes=3).fingerprint() != drawn
     assert module(name="folder", root=str(numbered)).fingerprint() == read
@@ -109,20 +123,35 @@ def mixture(part) -> dict:
         ({**FOLDER, "split": "train"}, "no standard split"),
         ({**FOLDER, "parts": [FOLDER]}, "data.parts needs data=mixed"),
         ({**FOLDER, "reading": {"on_bad_scan": "ignore"}}, "reading.on_bad_scan: .*found 'ignore'"),
-        ({"name": "pairs", "root": "x", "scans": DRIVES}, r"data\.scans: kitti_360 has a standard split: give split"),
+        (
+            {"name": "pairs", "root": "x", "scans": DRIVES},
+            r"data\.scans: kitti_360 has a standard split: give split",
+        ),
         ({"name": "pairs", "root": "x", "scans": {**DRIVES, "split": None}}, "x is not a folder"),
         ({"name": "mixed"}, "data=mixed needs its parts"),
         (mixture({"root": "x"}), r"data.parts\[0\] needs the name"),
-        (mixture({"name": "folder", "rot": "x"}), r"data.parts\[0\]: no option 'rot'.*Did you mean 'root'"),
+        (
+            mixture({"name": "folder", "rot": "x"}),
+            r"data.parts\[0\]: no option 'rot'.*Did you mean 'root'",
+        ),
         (mixture(DRIVES), "has a standard split: give split, one of train, test, or null"),
         (mixture({**FOLDER, "weight": 1}), "every part a weight"),
         (mixture({"name": "simulated", "sensor": {"name": "vlp"}}), "no sensor named .vlp"),
         (mixture({**FOLDER, "weight": 0}), "weight: input should be greater than 0, found 0"),
         (mixture({**FOLDER, "scenes": 7}), r"data.parts\[0\].scenes does nothing for folder scans"),
-        ({"validation": {"data": {"name": "simulated", "drives": [1]}}}, "data.drives does nothing for simulated"),
-        ({"validation": {"data": {"name": "simulated", "root": 512}}}, "data.root does nothing for simulated"),
+        (
+            {"validation": {"data": {"name": "simulated", "drives": [1]}}},
+            "data.drives does nothing for simulated",
+        ),
+        (
+            {"validation": {"data": {"name": "simulated", "root": 512}}},
+            "data.root does nothing for simulated",
+        ),
         (mixture("folder"), "parts.0: input should be a valid dictionary, found 'folder'"),
-        (mixture({"name": "simulated", "scenes": 2**31}), "scenes: input should be less than or equal to 10000000"),
+        (
+            mixture({"name": "simulated", "scenes": 2**31}),
+            "scenes: input should be less than or equal to 10000000",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(options: dict, word: str):
@@ -132,23 +161,44 @@ def test_what_cannot_be_is_refused(options: dict, word: str):
 
 def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_path: Path, caplog):
     folder_of(tmp_path / "other", 20, 2)
-    module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(tmp_path / "other")}})
+    module(
+        name="folder",
+        root=str(numbered),
+        validation={"data": {"name": "folder", "root": str(tmp_path / "other")}},
+    )
     assert caplog.text == ""
-    module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(numbered)}})
+    module(
+        name="folder",
+        root=str(numbered),
+        validation={"data": {"name": "folder", "root": str(numbered)}},
+    )
     assert "data.validation.data holds 12 scans that are trained on" in caplog.text
     (tmp_path / "other" / "file.bin").symlink_to(numbered / "000002.bin")
     (tmp_path / "other" / "folder").symlink_to(numbered)
-    module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(tmp_path / "other")}})
+    module(
+        name="folder",
+        root=str(numbered),
+        validation={"data": {"name": "folder", "root": str(tmp_path / "other")}},
+    )
     assert f"trained on, as {numbered / '000000.bin'}" in caplog.messages[-1]
     (tmp_path / "other" / "folder").unlink()
-    module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(tmp_path / "other")}})
+    module(
+        name="folder",
+        root=str(numbered),
+        validation={"data": {"name": "folder", "root": str(tmp_path / "other")}},
+    )
     assert "holds 1 scans that are trained on" in caplog.messages[-1]
 
 
-def test_a_part_that_trains_on_what_another_holds_out_is_said(numbered: Path, tmp_path: Path, caplog):
+def test_a_part_that_trains_on_what_another_holds_out_is_said(
+    numbered: Path, tmp_path: Path, caplog
+):
     folder_of(tmp_path / "other", 20, 2)  # the last of them held out
     parts = [{"name": "folder", "root": str(root)} for root in (numbered, tmp_path / "other")]
-    for link, scan, said in (("0", "000000", ""), ("00", "000011", "held-out block of data.parts holds 1 scans that")):
+    for link, scan, said in (
+        ("0", "000000", ""),
+        ("00", "000011", "held-out block of data.parts holds 1 scans that"),
+    ):
         (tmp_path / "other" / f"{link}.bin").symlink_to(numbered / f"{scan}.bin")
         module(name="mixed", parts=parts)
         assert said in caplog.text
@@ -156,7 +206,8 @@ def test_a_part_that_trains_on_what_another_holds_out_is_said(numbered: Path, tm
 
 
 def test_scans_are_projected_as_the_run_says(numbered: Path):
-    with pytest.raises(InputError, match="neither ring after ring nor in whole firings"):  # of one point
+    # of one point
+    with pytest.raises(InputError, match="neither ring after ring nor in whole firings"):
         module(name="folder", root=str(numbered), reading={"projection": "unfolding"})
 
 
@@ -165,17 +216,24 @@ def test_validation_is_never_augmented_nor_drawn_anew_and_ranks_share_it(numbere
     plain = next(iter(module(**options).val_dataloader()))
     data = module(**options, augment={"flip": True, "roll": True})
     data.seed = 5
-    data.item_format = data.format._replace(further=lambda x, _, draws: {"drawn": torch.tensor(draws.integers(2**40))})
+    data.item_format = data.format._replace(
+        further=lambda x, _, draws: {"drawn": torch.tensor(draws.integers(2**40))}
+    )
     augmented = next(iter(data.val_dataloader()))
     assert torch.equal(plain["x_1"], augmented["x_1"])
-    assert augmented["drawn"].tolist() == [noise.generator(0, "condition", k).integers(2**40) for k in range(6)]
-    for ranks, seen in ((1, [0, 1, 2, 3, 4, 5]), (4, [1]), (6, [1]), (7, [0, 1, 2, 3, 4, 5])):  # two are left over
+    assert augmented["drawn"].tolist() == [
+        noise.generator(0, "condition", k).integers(2**40) for k in range(6)
+    ]
+    # two are left over
+    for ranks, seen in ((1, [0, 1, 2, 3, 4, 5]), (4, [1]), (6, [1]), (7, [0, 1, 2, 3, 4, 5])):
         data.trainer = SimpleNamespace(global_rank=1 % ranks, world_size=ranks)
         assert [k for batch in data.val_dataloader() for k in batch["k"].tolist()] == seen
 
 
 def learns_reflectance(wanted: bool | str, **options) -> bool:
-    return ScanDataModule(sensor=SENSOR, encoding={"reflectance": wanted}, **options).encoding.reflectance
+    return ScanDataModule(
+        sensor=SENSOR, encoding={"reflectance": wanted}, **options
+    ).encoding.reflectance
 
 
 class TestReflectance:
@@ -193,14 +251,18 @@ class TestReflectance:
         (numbered / "000000.bin").write_bytes(b"")
         data = {"name": "folder", "root": str(numbered)}
         assert learns_reflectance("auto", **data, reading={"on_bad_scan": "skip"})
-        with pytest.raises(InputError, match=r"000000.bin: it holds no points.* data.reading.on_bad_scan=skip"):
+        with pytest.raises(
+            InputError, match=r"000000.bin: it holds no points.* data.reading.on_bad_scan=skip"
+        ):
             learns_reflectance("auto", **data)
 
     def test_what_is_said_is_not_asked(self):
         nowhere = {"name": "folder", "root": "/nowhere"}
         assert learns_reflectance(True, **nowhere)
         assert not learns_reflectance(False, **nowhere)
-        with pytest.raises(InputError, match="reflectance: input should be a valid boolean.* found 'maybe'"):
+        with pytest.raises(
+            InputError, match="reflectance: input should be a valid boolean.* found 'maybe'"
+        ):
             learns_reflectance("maybe", **nowhere)
 
 
@@ -214,8 +276,13 @@ class TestPrepared:
         options = {"split": "train", "validation": {"share": 0.3}}
         raw = module(name="kitti_360", root=str(kitti_360), **options)
         prepared = module(name="prepared", root=str(prepared_360), **options)
-        assert numbers(prepared.training_source) == numbers(raw.training_source) == [9, 10, 11, 12, 13, 14]
-        assert numbers(prepared.validation_source) == numbers(raw.validation_source) == [30, 31, 32]  # a whole drive
+        assert (
+            numbers(prepared.training_source)
+            == numbers(raw.training_source)
+            == [9, 10, 11, 12, 13, 14]
+        )
+        # a whole drive
+        assert numbers(prepared.validation_source) == numbers(raw.validation_source) == [30, 31, 32]
         assert isinstance(prepared.training_source.parts[0], PreparedScans)  # mapped, not copied
 
     def test_samples_get_the_levels_that_sets_share(self, prepared_360: Path, numbered: Path):
@@ -247,8 +314,14 @@ class TestPrepared:
 
 def test_the_index_of_a_whole_data_set_is_small(tmp_path: Path, monkeypatch):
     for drive in (0, 2, 3, 4, 5, 6, 7, 9, 10):
-        write_scan(tmp_path / f"data_3d_raw/2013_05_28_drive_{drive:04d}_sync/velodyne_points/data/0000000000.bin", 1)
-    monkeypatch.setattr("os.listdir", lambda folder: [f"{frame:010d}.bin" for frame in range(81_106 // 9)])
+        write_scan(
+            tmp_path
+            / f"data_3d_raw/2013_05_28_drive_{drive:04d}_sync/velodyne_points/data/0000000000.bin",
+            1,
+        )
+    monkeypatch.setattr(
+        "os.listdir", lambda folder: [f"{frame:010d}.bin" for frame in range(81_106 // 9)]
+    )
     with memory_below(100 << 20):
         data = module(name="kitti_360", root=str(tmp_path), memory_gib=0, validation={"scans": 0})
         assert len(data.names) == 9 * (81_106 // 9)
@@ -261,6 +334,8 @@ def test_scenes_are_held_out_behind_those_that_are_trained_on():
 
 @pytest.mark.parametrize("of_two", [0, 1])
 def test_images_of_one_channel_are_not_read_into_two(numbered: Path, monkeypatch, of_two):
-    monkeypatch.setattr(ScanFiles, "__getitem__", lambda _, number: np.ones((1 + (number < of_two), *SENSOR.shape)))
+    monkeypatch.setattr(
+        ScanFiles, "__getitem__", lambda _, number: np.ones((1 + (number < of_two), *SENSOR.shape))
+    )
     with pytest.raises(InputError, match="found \\(1, "):
         next(iter(module(name="folder", root=str(numbered)).val_dataloader()))

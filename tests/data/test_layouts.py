@@ -25,7 +25,9 @@ def test_the_standard_split_of_kitti_360(kitti_360: Path):
 
 def test_drives_are_taken_by_number_and_by_name(kitti_360: Path):
     assert names(find_drives("kitti_360", kitti_360, drives=[10, 2])) == ["0010", "0002"]
-    assert names(find_drives("kitti_360", kitti_360, drives=["2013_05_28_drive_0003_sync"])) == ["0003"]
+    assert names(find_drives("kitti_360", kitti_360, drives=["2013_05_28_drive_0003_sync"])) == [
+        "0003"
+    ]
     with pytest.raises(InputError, match=r"no drive named '7'; known: 2013_05_28_drive_0000_sync"):
         find_drives("kitti_360", kitti_360, drives=[7])
 
@@ -45,7 +47,11 @@ def test_kitti_raw_and_odometry(tmp_path: Path):
 
 
 def test_kitti_object(tmp_path: Path):
-    for place in ("training/velodyne/000000", "training/velodyne/000001", "testing/velodyne/000000"):
+    for place in (
+        "training/velodyne/000000",
+        "training/velodyne/000001",
+        "testing/velodyne/000000",
+    ):
         write_scan(tmp_path / f"{place}.bin", 0)
     assert names(find_drives("object", tmp_path)) == ["training", "testing"]
     assert [len(drive.scans) for drive in find_drives("object", tmp_path, "train")] == [2]
@@ -64,14 +70,18 @@ def test_nuscenes_is_read_log_by_log_in_the_order_of_time(tmp_path: Path, caplog
     drives = find_drives("nuscenes", tmp_path)
     assert [drive.name for drive in drives] == [other, log]
     assert drives[1].scans == tuple(str(tmp_path / files[i]) for i in (1, 0, 2))
-    assert [drive.name for drive in find_drives("nuscenes", tmp_path / "samples/LIDAR_TOP")] == [log]
+    assert [drive.name for drive in find_drives("nuscenes", tmp_path / "samples/LIDAR_TOP")] == [
+        log
+    ]
     assert find_drives("nuscenes", tmp_path, drives=[log]) == drives[1:]
     assert not caplog.messages
     assert find_drives("folder", tmp_path)
     assert "nuscenes:FOLDER, reads its lidar alone" in caplog.text
 
 
-@pytest.mark.parametrize("layout", [name for name, kind in SOURCES.items() if isinstance(kind, Layout)])
+@pytest.mark.parametrize(
+    "layout", [name for name, kind in SOURCES.items() if isinstance(kind, Layout)]
+)
 def test_a_missing_or_empty_root_says_what_was_looked_for(layout: str, tmp_path: Path):
     with pytest.raises(InputError, match="is not a folder"):
         find_drives(layout, tmp_path / "missing")
@@ -79,13 +89,21 @@ def test_a_missing_or_empty_root_says_what_was_looked_for(layout: str, tmp_path:
         find_drives(layout, tmp_path)
 
 
-def test_a_folder_that_may_not_be_entered_is_left_out_with_its_name(tmp_path: Path, monkeypatch, caplog):
+def test_a_folder_that_may_not_be_entered_is_left_out_with_its_name(
+    tmp_path: Path, monkeypatch, caplog
+):
     Store(tmp_path / "day", "samples", {}).begin()
-    for place in ("day", "lost+found", ".Trash-0"):  # of a disk, for root alone; of what was deleted there
+    # of a disk, for root alone; of what was deleted there
+    for place in ("day", "lost+found", ".Trash-0"):
         write_scan(tmp_path / place / "0.bin", 1)
-    scandir, closed = os.scandir, Mock(side_effect=PermissionError(13, "Permission denied", tmp_path / "lost+found"))
+    scandir, closed = (
+        os.scandir,
+        Mock(side_effect=PermissionError(13, "Permission denied", tmp_path / "lost+found")),
+    )
     monkeypatch.setattr(os, "access", lambda path, mode: "lost" not in str(path))
-    monkeypatch.setattr(os, "scandir", lambda path: (closed if "lost" in str(path) else scandir)(path))
+    monkeypatch.setattr(
+        os, "scandir", lambda path: (closed if "lost" in str(path) else scandir)(path)
+    )
     assert made_here(tmp_path)
     assert names(find_drives("folder", tmp_path)) == ["day"]
     assert "lost+found: left out, not readable" in caplog.text
@@ -94,14 +112,19 @@ def test_a_folder_that_may_not_be_entered_is_left_out_with_its_name(tmp_path: Pa
 def test_a_split_that_holds_nothing_says_what_there_is_and_how_to_take_it(tmp_path: Path):
     for drive in ("08", "11", "12"):
         write_scan(tmp_path / "sequences" / drive / "velodyne" / "000000.bin", 1)
-    with pytest.raises(InputError, match=r"holds 08 \(validation\), 11 \(test\), 12 \(test\): give another data.split"):
+    with pytest.raises(
+        InputError,
+        match=r"holds 08 \(validation\), 11 \(test\), 12 \(test\): give another data.split",
+    ):
         find_drives("odometry", tmp_path, "train")
 
 
 def test_a_folder_of_recordings_says_which_tool_unpacks_them(tmp_path: Path):
     (tmp_path / "day").mkdir()
     (tmp_path / "day" / "drive.mcap").write_bytes(b"recorded")
-    with pytest.raises(InputError, match=r"holds no scan\. .*day/drive\.mcap holds many scans: r2flow unpack"):
+    with pytest.raises(
+        InputError, match=r"holds no scan\. .*day/drive\.mcap holds many scans: r2flow unpack"
+    ):
         find_drives("folder", tmp_path)
 
 
@@ -111,7 +134,9 @@ def test_notes_beside_scans_are_no_scans(tmp_path: Path):
         note.write_text("x,y,z\n1,2,3\n")
     assert find_drives("folder", tmp_path)[0].scans == tuple(map(str, notes))
     write_scan(tmp_path / "scans" / "0.bin", 1)
-    assert [d.scans for d in find_drives("folder", tmp_path) if d.scans] == [(str(tmp_path / "scans" / "0.bin"),)]
+    assert [d.scans for d in find_drives("folder", tmp_path) if d.scans] == [
+        (str(tmp_path / "scans" / "0.bin"),)
+    ]
     write_scan(tmp_path / "0.bin", 1)
     assert find_drives("folder", tmp_path)[0].scans == (str(tmp_path / "0.bin"),)
 
@@ -129,7 +154,8 @@ def test_linked_folders_are_looked_into_and_circles_end(tmp_path: Path):
 def test_scans_are_in_the_order_of_their_numbers_in_whichever_format(tmp_path: Path):
     for name in ("10", "9", "100", "1", "scan_2", "scan_10"):
         write_scan(tmp_path / f"{name}.bin", 1)
-    for name in ("9.ply", "9.NPY", "9.xyz", "._9.bin"):  # a scan in several formats; what a Mac leaves next to a file
+    # a scan in several formats; what a Mac leaves next to a file
+    for name in ("9.ply", "9.NPY", "9.xyz", "._9.bin"):
         (tmp_path / name).touch()
     (drive,) = find_drives("folder", tmp_path)
     assert [Path(scan).stem for scan in drive.scans] == ["1", "9", "10", "100", "scan_2", "scan_10"]

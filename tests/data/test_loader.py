@@ -9,7 +9,9 @@ from r2flow.errors import InputError
 
 
 def numbers(*values: float) -> InMemory:
-    return InMemory(np.array(values, np.float32).reshape(-1, 1, 1, 1), [str(value) for value in values])
+    return InMemory(
+        np.array(values, np.float32).reshape(-1, 1, 1, 1), [str(value) for value in values]
+    )
 
 
 def keys(images: int = 40, **options) -> list[tuple[int, int]]:
@@ -61,11 +63,20 @@ def test_parts_lie_end_to_end():
 def test_weights_are_the_shares_of_the_images():
     sizes, weights = [5, 40, 3], [3.0, 1.0, 4.0]
     order = MixedOrder(sizes, weights, seed=1)
-    parts = np.bincount(np.searchsorted(np.cumsum(sizes), [order[k] for k in range(8000)], side="right")) / 8000
-    np.testing.assert_allclose(parts, [3 / 8, 1 / 8, 4 / 8], atol=0.02)  # standard deviation at most 0.0056
+    parts = (
+        np.bincount(
+            np.searchsorted(np.cumsum(sizes), [order[k] for k in range(8000)], side="right")
+        )
+        / 8000
+    )
+    # standard deviation at most 0.0056
+    np.testing.assert_allclose(parts, [3 / 8, 1 / 8, 4 / 8], atol=0.02)
     first = [index for k in range(8000) if (index := order[k]) < 5]
-    np.testing.assert_allclose(np.bincount(first) / len(first), [0.2] * 5, atol=0.03)  # standard deviation 0.0073
-    assert [order[k] for k in (7999, 3)] == [MixedOrder(sizes, weights, seed=1)[k] for k in (7999, 3)]
+    # standard deviation 0.0073
+    np.testing.assert_allclose(np.bincount(first) / len(first), [0.2] * 5, atol=0.03)
+    assert [order[k] for k in (7999, 3)] == [
+        MixedOrder(sizes, weights, seed=1)[k] for k in (7999, 3)
+    ]
 
 
 def test_what_cannot_be_mixed_is_refused():

@@ -1,4 +1,6 @@
-"""One opener: what a name may be, whether scans have reflectance, and kinds of scans that a user adds."""
+"""One opener: what a name may be, whether scans have reflectance, and kinds of scans that a user
+adds.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +39,9 @@ def learns_reflectance(name: str, root: str) -> bool:
     return ScanDataModule(name, SENSOR, {"reflectance": "auto"}, root=root).encoding.reflectance
 
 
-def write_image(path: Path, number: int, channels: int = 2, size: tuple[int, int] = (8, 32)) -> Path:
+def write_image(
+    path: Path, number: int, channels: int = 2, size: tuple[int, int] = (8, 32)
+) -> Path:
     """A range image whose farthest return lies at 5 + number metres, with reflectance 0.5."""
     path.parent.mkdir(parents=True, exist_ok=True)
     image = np.zeros((channels, *size), np.float32)
@@ -49,7 +53,9 @@ def write_image(path: Path, number: int, channels: int = 2, size: tuple[int, int
 
 class TestSamples:
     def samples(self, folder: Path, size: tuple[int, int] = (8, 32)) -> Path:
-        Store(folder, "samples", {"reading": Reading(SENSORS["hdl64e"].resized(*size)).described()}).begin()
+        Store(
+            folder, "samples", {"reading": Reading(SENSORS["hdl64e"].resized(*size)).described()}
+        ).begin()
         write_image(folder / "000000.npy", 2, size=size)
         return folder
 
@@ -70,7 +76,11 @@ class TestSamples:
 
     def test_points_are_seen_through_any_sensor(self, tmp_path: Path):
         folder = self.samples(tmp_path)
-        write_points(folder / "000001.ply", np.array([[10.0, 0, 0], [0, 20, 0]], np.float32), np.ones(2, np.float32))
+        write_points(
+            folder / "000001.ply",
+            np.array([[10.0, 0, 0], [0, 20, 0]], np.float32),
+            np.ones(2, np.float32),
+        )
         seen = open_scans(folder / "000001.ply", Reading(SENSORS["vlp16"].resized(16, 64)))
         assert seen.source[0].shape[-2:] == (16, 64)
         assert sorted(seen.source[0][0][seen.source[0][0] > 0].tolist()) == [10, 20]
@@ -94,12 +104,20 @@ class TestSamples:
 
     def test_a_damaged_or_unreadable_note_is_one_line(self, tmp_path: Path, monkeypatch):
         self.samples(tmp_path)
-        for content in ("{", "1", '{"checksum": ""}', '{"checksum": "", "recipe": {"reading": {"sensor": {}}}}'):
+        for content in (
+            "{",
+            "1",
+            '{"checksum": ""}',
+            '{"checksum": "", "recipe": {"reading": {"sensor": {}}}}',
+        ):
             (tmp_path / "manifest.json").write_text(content)
             with pytest.raises(InputError, match=r"\A.*manifest.json is damaged.*\Z"):  # one line
                 open_scans(tmp_path)
-        monkeypatch.setattr("r2flow.store.read_json", Mock(side_effect=OSError(5, "Input/output error")))
-        with pytest.raises(OSError, match="Input/output error"):  # a working one is not to be removed
+        monkeypatch.setattr(
+            "r2flow.store.read_json", Mock(side_effect=OSError(5, "Input/output error"))
+        )
+        # a working one is not to be removed
+        with pytest.raises(OSError, match="Input/output error"):
             open_scans(tmp_path)
 
 
@@ -108,7 +126,10 @@ class TestWhatR2FlowWrote:
         sensor = SENSORS["vlp32c"].resized(16, 64)
         write_folder(SimulatedFolder(tmp_path, sensor, 3, ("ply",)), [5], workers=1)
         reading = reading_for(["simulated:3", tmp_path])
-        assert (reading.sensor, reading.reflectance_scale) == (replace(sensor, reflectance_scale=None), 1.0)
+        assert (reading.sensor, reading.reflectance_scale) == (
+            replace(sensor, reflectance_scale=None),
+            1.0,
+        )
         image = simulate(sensor, 3, 5).image
         np.testing.assert_allclose(open_scans(tmp_path, reading).source[0], image, atol=1e-5)
         wrong_scale = replace(reading, reflectance_scale=255.0)
@@ -121,30 +142,55 @@ class TestWhatR2FlowWrote:
 
     def test_another_sensor_than_their_own_is_warned_of(self, tmp_path: Path, caplog):
         for name in ("pandar64", "vlp16"):
-            write_folder(SimulatedFolder(tmp_path / name, SENSORS[name].resized(32, 64), 3, ("bin",)), [5], workers=1)
+            write_folder(
+                SimulatedFolder(tmp_path / name, SENSORS[name].resized(32, 64), 3, ("bin",)),
+                [5],
+                workers=1,
+            )
             open_scans(tmp_path / name, Reading(SENSORS[name].resized(16, 64)))
         assert not caplog.text  # fewer rows are of the same sensor
-        for root in (tmp_path / "vlp16", tmp_path):  # the second one also has a folder of the requested sensor
+        # the second one also has a folder of the requested sensor
+        for root in (tmp_path / "vlp16", tmp_path):
             caplog.clear()
             open_scans(root, Reading(SENSORS["pandar64"].resized(16, 64)))
             assert "manifest.json names vlp16 32x64; they fit 'vlp16'" in caplog.text
 
     def test_a_file_is_read_through_any_sensor(self, tmp_path: Path):
-        write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32))  # without reflectance
+        # without reflectance
+        write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32))
         for sensor in ("vlp16", SENSORS["vlp16"]):
             scan = r2flow.read(tmp_path / "a.ply", sensor)
             assert scan.shape == (2, *SENSORS["vlp16"].shape)
             assert scan[0].max() == 10
             assert not scan[1].any()
-        np.save(tmp_path / "a.npy", np.full((1, *SENSORS["vlp16"].shape), [10.0, 150.0] * 512, np.float32))
-        assert r2flow.read(tmp_path / "a.npy", "vlp16")[0, 0, :2].tolist() == [10, 0]  # it measures up to 100 m
+        np.save(
+            tmp_path / "a.npy",
+            np.full((1, *SENSORS["vlp16"].shape), [10.0, 150.0] * 512, np.float32),
+        )
+        # it measures up to 100 m
+        assert r2flow.read(tmp_path / "a.npy", "vlp16")[0, 0, :2].tolist() == [10, 0]
 
-    def test_reflectance_of_another_scale_is_scaled_and_of_an_uncommon_one_with_a_warning(self, tmp_path: Path, caplog):
-        for stored, scale, value in ((204, None, 0.8), (51, 102, 0.5), (51, None, 0.51), (0.048, None, 0.96)):
-            write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32), np.array([stored], np.float32))
-            assert float(r2flow.read(tmp_path / "a.ply", "vlp16", scale)[1].max()) == pytest.approx(value, abs=1e-6)
+    def test_reflectance_of_another_scale_is_scaled_and_of_an_uncommon_one_with_a_warning(
+        self, tmp_path: Path, caplog
+    ):
+        for stored, scale, value in (
+            (204, None, 0.8),
+            (51, 102, 0.5),
+            (51, None, 0.51),
+            (0.048, None, 0.96),
+        ):
+            write_points(
+                tmp_path / "a.ply",
+                np.array([[10.0, 0, 0]], np.float32),
+                np.array([stored], np.float32),
+            )
+            assert float(r2flow.read(tmp_path / "a.ply", "vlp16", scale)[1].max()) == pytest.approx(
+                value, abs=1e-6
+            )
             # Bytes below 100 may be of 255: only above it are retroreflectors.
-            told = {51: "divided by 100", 0.048: "divided by 0.05"}.get(stored * (scale is None), "")
+            told = {51: "divided by 100", 0.048: "divided by 0.05"}.get(
+                stored * (scale is None), ""
+            )
             assert told in caplog.text
             assert bool(caplog.text) == bool(told)
             caplog.clear()
@@ -164,7 +210,8 @@ class TestReflectance:
     )
     def test_training_and_every_other_use_agree(self, case: str, expected: bool, tmp_path: Path):
         if "image" in case:
-            np.save(tmp_path / "0.npy", np.zeros((2, 8, 32), np.float32))  # no return: it decides nothing
+            # no return: it decides nothing
+            np.save(tmp_path / "0.npy", np.zeros((2, 8, 32), np.float32))
             write_image(tmp_path / "1.npy", 1, channels=1 if case == "bare image" else 2)
         elif case == "none":
             write_points(tmp_path / "0.ply", np.array([[10, 0, -1]], np.float32))
@@ -194,7 +241,12 @@ def test_values_out_of_the_sensor_s_limits_are_dropped_for_a_model_alone(tmp_pat
     np.save(tmp_path / "0.npy", image)
     assert open_scans(tmp_path, READING).source[0][0].max() == 81
     seen = open_scans(tmp_path, Reading(SENSOR, within_limits=True)).source[0]
-    assert set(np.unique(seen[0]).round(2).tolist()) == {0, np.float32(1.45).round(2).item(), 40, 80}
+    assert set(np.unique(seen[0]).round(2).tolist()) == {
+        0,
+        np.float32(1.45).round(2).item(),
+        40,
+        80,
+    }
     assert np.array_equal(seen[1] > 0, seen[0] > 0)
 
 
@@ -204,7 +256,10 @@ def own_table(monkeypatch) -> None:
 
 
 def find_weeks(root: Path) -> list[Drive]:
-    return [Drive(week.name, tuple(map(str, sorted(week.glob("*.bin"))))) for week in sorted(root.glob("week-*"))]
+    return [
+        Drive(week.name, tuple(map(str, sorted(week.glob("*.bin")))))
+        for week in sorted(root.glob("week-*"))
+    ]
 
 
 @pytest.mark.usefixtures("own_table")
@@ -230,7 +285,9 @@ class WallKind(SourceKind):
 
     def open(self, scans, reading, seed=0, first_scene=0) -> InMemory:
         walls = range(2, 2 + int(scans.options.root))
-        images = np.ones((1, *reading.sensor.shape), np.float32) * np.float32(walls).reshape(-1, 1, 1, 1)
+        images = np.ones((1, *reading.sensor.shape), np.float32) * np.float32(walls).reshape(
+            -1, 1, 1, 1
+        )
         return InMemory(images, [f"wall at {wall} m" for wall in walls])
 
     def lacks_reflectance(self, scans, on_bad_scan="error") -> str:
@@ -250,14 +307,23 @@ def test_scans_that_are_no_files_are_a_kind_of_their_own(r2flow):
     assert torch.equal(scans[1:], torch.stack([scans[1], scans[2]]))
     assert scans.identity is None  # nobody knows what decides them: no statistics of them are kept
     assert not learns_reflectance("walls", root="5")
-    assert "kid_handcrafted_range" in r2flow("evaluate", "walls:5", "walls:4", "--size", "8x32", "--workers", 0).said
-    data = ScanDataModule("walls", SENSOR, Encoding(SENSOR, reflectance=False), root=10, batch_size=2)
+    assert (
+        "kid_handcrafted_range"
+        in r2flow("evaluate", "walls:5", "walls:4", "--size", "8x32", "--workers", 0).said
+    )
+    data = ScanDataModule(
+        "walls", SENSOR, Encoding(SENSOR, reflectance=False), root=10, batch_size=2
+    )
     assert [batch["x_1"].shape for batch in data.val_dataloader()] == [(1, 1, 8, 32)]
     assert data.names == [f"wall at {i} m" for i in range(2, 12)]
     sensors = SENSOR, replace(SENSOR, max_range=9000)
-    data, far = (ScanDataModule("walls", s, Encoding(s, reflectance=False), root=5000) for s in sensors)
+    data, far = (
+        ScanDataModule("walls", s, Encoding(s, reflectance=False), root=5000) for s in sensors
+    )
     assert next(iter(far.val_dataloader()))["x_1"].isfinite().all()  # walls of 4,752 to 5,001 m
-    with pytest.raises(InputError, match=r"wall at \d+ m: its median range is .* millimetres\? Give metres"):
+    with pytest.raises(
+        InputError, match=r"wall at \d+ m: its median range is .* millimetres\? Give metres"
+    ):
         next(iter(data.val_dataloader()))
 
 
@@ -270,7 +336,9 @@ def test_noise_has_the_shape_that_the_module_is_told(numbered: Path, shape):
     assert set(batch) == {"x_1", "x_0", "u", "k"}
     assert batch["x_1"].shape == (3, 2, 8, 32)
     for k in range(3):
-        assert torch.equal(batch["x_0"][k], standard_normal(shape or (2, 8, 32), 7, "validation", k))
+        assert torch.equal(
+            batch["x_0"][k], standard_normal(shape or (2, 8, 32), 7, "validation", k)
+        )
 
 
 def test_pairs_are_made_of_noise_of_their_own_shape(tmp_path: Path):
@@ -298,19 +366,35 @@ class TestRangeImagesForAModel:
     READ = Reading(SENSOR, within_limits=True, on_bad_scan="error")
 
     def image(self, path: Path, ranges: float, reflectance: float) -> Path:
-        np.save(path, np.stack([np.full((8, 32), ranges), np.full((8, 32), reflectance)]).astype(np.float32))
+        np.save(
+            path,
+            np.stack([np.full((8, 32), ranges), np.full((8, 32), reflectance)]).astype(np.float32),
+        )
         return path
 
     def test_reflectance_beyond_one_is_not_clipped_in_silence(self, tmp_path: Path):
         path = self.image(tmp_path / "0.npy", 5, 200)
-        with pytest.raises(InputError, match=r"reflectance of a range image lies in \[0, 1\], found up to 200; divide"):
+        with pytest.raises(
+            InputError,
+            match=r"reflectance of a range image lies in \[0, 1\], found up to 200; divide",
+        ):
             open_scans(path, self.READ).source[0]
-        assert open_scans(self.image(tmp_path / "1.npy", 5, 1.0005), self.READ).source[0][1].max() == 1
+        assert (
+            open_scans(self.image(tmp_path / "1.npy", 5, 1.0005), self.READ).source[0][1].max() == 1
+        )
 
-    @pytest.mark.parametrize(("ranges", "said"), [(90, "its ranges are 90 to 90, in metres"), (0, "80 m.")])
-    def test_one_without_a_return_is_refused_or_stays_empty(self, tmp_path: Path, ranges: float, said: str):
+    @pytest.mark.parametrize(
+        ("ranges", "said"), [(90, "its ranges are 90 to 90, in metres"), (0, "80 m.")]
+    )
+    def test_one_without_a_return_is_refused_or_stays_empty(
+        self, tmp_path: Path, ranges: float, said: str
+    ):
         path = self.image(tmp_path / "0.npy", ranges, 0.5)
         with pytest.raises(InputError, match="has no return from 1.45 to 80 m") as refused:
             open_scans(path, self.READ).source[0]
         assert str(refused.value).endswith(f"{said}.".replace("..", "."))
-        assert not open_scans(path, Reading(SENSOR, within_limits=True, on_bad_scan="empty")).source[0].any()
+        assert (
+            not open_scans(path, Reading(SENSOR, within_limits=True, on_bad_scan="empty"))
+            .source[0]
+            .any()
+        )

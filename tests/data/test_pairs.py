@@ -51,12 +51,14 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
     for index in (0, 17, 49):
         x_0, x_1 = pairs[0, index]["x_0"], pairs[0, index]["x_1"]
         assert torch.equal(x_0, standard_normal(SHAPE, 0, "pairs", 70 + index))
-        torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11 + 1e-4, atol=2e-5)  # half precision, solver
+        # half precision, solver
+        torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11 + 1e-4, atol=2e-5)
 
 
 def test_more_pairs_later_by_another_process_are_those_of_one_command(tmp_path: Path):
     make_pairs(store_in(tmp_path / "one"), grow)
-    for num, made in ((3, 4), (20, 20), (20, 0), (50, (13 - 3) * 4)):  # in batches of 4, and shards of 12
+    # in batches of 4, and shards of 12
+    for num, made in ((3, 4), (20, 20), (20, 0), (50, (13 - 3) * 4)):
         assert len(make_pairs(store_in(tmp_path / "grown", num=num), grow)) == made
         assert len(store_in(tmp_path / "grown", num=num).usable()) == num
     assert files(tmp_path / "one") == files(tmp_path / "grown")
@@ -98,14 +100,18 @@ def test_whole_shards_of_other_pairs_are_never_taken_for_damaged_ones(tmp_path: 
 
 
 def test_one_and_one_point_nought_are_one_tolerance(tmp_path: Path):
-    one, other = (store_in(tmp_path, sampler={"name": "dopri5", "tolerance": one}) for one in (1, 1.0))
+    one, other = (
+        store_in(tmp_path, sampler={"name": "dopri5", "tolerance": one}) for one in (1, 1.0)
+    )
     assert one.described == other.described
 
 
 def test_a_distilled_flow_draws_pairs_by_its_own_steps_alone(tmp_path: Path):
     flow = Field(lambda t, x: x, SHAPE)
     flow.run_by(build_sampler("euler", steps=2, grid="power:3"), fixed=True)
-    with pytest.raises(InputError, match="distilled for euler, 2 steps alone: use these, or its parent flow"):
+    with pytest.raises(
+        InputError, match="distilled for euler, 2 steps alone: use these, or its parent flow"
+    ):
         make_pairs(store_in(tmp_path / "others"), flow)
     assert not (tmp_path / "others").exists()
     own = store_in(tmp_path / "own", sampler={"name": "euler", "steps": 2, "grid": "power:3"})
@@ -123,7 +129,8 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
         return x
 
     children = [
-        in_child(lambda: make_pairs(store_in(tmp_path / "pairs", num=200), Field(slow, SHAPE))) for _ in range(2)
+        in_child(lambda: make_pairs(store_in(tmp_path / "pairs", num=200), Field(slow, SHAPE)))
+        for _ in range(2)
     ]
     assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
     assert begun.stat().st_size == 50  # batches, each by one of the two
@@ -167,7 +174,9 @@ def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
     again = pickle.loads(pickle.dumps(dataset))  # as a loader's worker has it
     assert all(torch.equal(again[(70, 11)][key], item[key]) for key in item)
     store.files(0)[0].write_bytes(b"damaged during the run")
-    with pytest.raises(InputError, match=r"pairs-000000.safetensors is not a readable .safetensors file"):
+    with pytest.raises(
+        InputError, match=r"pairs-000000.safetensors is not a readable .safetensors file"
+    ):
         dataset[(70, 11)]
 
 
@@ -181,11 +190,15 @@ def test_pairs_are_not_kept_among_scans_or_in_another_store(tmp_path: Path):
         store_in(tmp_path / "prepared")
 
 
-def test_who_waits_says_for_whom_and_who_does_not_leaves_the_rest(tmp_path: Path, monkeypatch, caplog):
+def test_who_waits_says_for_whom_and_who_does_not_leaves_the_rest(
+    tmp_path: Path, monkeypatch, caplog
+):
     monkeypatch.setattr("r2flow.store.QUIET", 0.1)
     store, (read, write) = store_in(tmp_path), os.pipe()
     child = in_child(
-        lambda: store.attempt(1, lambda item: (os.write(write, b"1"), os.kill(os.getpid(), signal.SIGSTOP)))
+        lambda: store.attempt(
+            1, lambda item: (os.write(write, b"1"), os.kill(os.getpid(), signal.SIGSTOP))
+        )
     )
     os.read(read, 1)
     assert (len(make_pairs(store, grow, wait=False)), store.missing(store.shards)) == (10 * 4, [1])
@@ -198,14 +211,19 @@ def test_who_waits_says_for_whom_and_who_does_not_leaves_the_rest(tmp_path: Path
     assert not store.missing(store.shards)
 
 
-def test_a_process_of_a_run_stops_drawing_when_the_one_that_launched_it_is_gone(tmp_path: Path, monkeypatch):
+def test_a_process_of_a_run_stops_drawing_when_the_one_that_launched_it_is_gone(
+    tmp_path: Path, monkeypatch
+):
     store = store_in(tmp_path)
-    monkeypatch.setattr("os.getppid", lambda: 1 if store.missing(store.shards) != [*store.shards] else 7)
+    monkeypatch.setattr(
+        "os.getppid", lambda: 1 if store.missing(store.shards) != [*store.shards] else 7
+    )
     monkeypatch.setenv("LOCAL_RANK", "1")
     with pytest.raises(Stopped) as stopped:
         make_pairs(store, grow)
     assert stopped.value.code == LATER
-    assert len(store.missing(store.shards)) == len(store.shards) - 1  # the shard that it was drawing
+    # the shard that it was drawing
+    assert len(store.missing(store.shards)) == len(store.shards) - 1
     monkeypatch.setenv("LOCAL_RANK", "0")  # the launching process outlives its shell
     monkeypatch.setattr("os.getppid", iter(range(100)).__next__)
     make_pairs(store, grow)
@@ -221,7 +239,12 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     folder = path.parent.parent / "pairs"
     assert default_folder(Path("models/flow.pth")) == Path("models/flow-pairs")
     assert default_folder(find_model("street")) == Path("runs/street-pairs")  # not in the package
-    for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
+    for words in (
+        "12 pairs",
+        "pairs/s",
+        "2.0 evaluations a pair",
+        f"{folder}: all 10 pairs, 1 shard",
+    ):
         assert words in said
     parent = find_parent(path)
     options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}

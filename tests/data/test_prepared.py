@@ -37,9 +37,18 @@ def write_cloud(path: Path, seed: int, levels: int | None = 256) -> None:
     """200 returns all around, at 1 to 90 m, reflectance in n / levels; none where `levels` is None."""
     draw = np.random.default_rng(seed)
     azimuth, elevation = draw.uniform(-np.pi, np.pi, 200), np.deg2rad(draw.uniform(-27, 5, 200))
-    ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
+    ray = np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        1,
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
-    reflectance = None if levels is None else (draw.integers(0, levels, 200) / levels).astype(np.float32)
+    reflectance = (
+        None if levels is None else (draw.integers(0, levels, 200) / levels).astype(np.float32)
+    )
     write_points(path, ray * draw.uniform(1, 90, (200, 1)), reflectance)
 
 
@@ -51,8 +60,12 @@ def clouds(tmp_path_factory) -> Path:
     return root
 
 
-def plan_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", shard_scans: int = 3, **how) -> PreparedStore:
-    return plan_files("unused", layout, root, find_drives(layout, root), Reading(sensor, **how), shard_scans)
+def plan_of(
+    root: Path, sensor: Sensor = SMALL, layout: str = "folder", shard_scans: int = 3, **how
+) -> PreparedStore:
+    return plan_files(
+        "unused", layout, root, find_drives(layout, root), Reading(sensor, **how), shard_scans
+    )
 
 
 def make(folder: Path, plan: PreparedStore, **options) -> Path:
@@ -60,7 +73,9 @@ def make(folder: Path, plan: PreparedStore, **options) -> Path:
     return folder
 
 
-def prepared_in(folder: Path, sensor: Sensor = SMALL, split=None, drives=None, reflectance=True, **how):
+def prepared_in(
+    folder: Path, sensor: Sensor = SMALL, split=None, drives=None, reflectance=True, **how
+):
     scans = Described(str(folder), SourceOptions("prepared", str(folder), split, drives))
     return scans.kind.open(scans, Reading(sensor, reflectance=reflectance, **how))
 
@@ -74,7 +89,9 @@ def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options
 def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | None):
     near, far = sensor.min_range, far or sensor.max_range
     codes = range_codes(near, far)
-    r = np.concatenate([np.random.default_rng(0).uniform(near, far, 50_000), [near, 65.0, far]]).astype(np.float32)
+    r = np.concatenate(
+        [np.random.default_rng(0).uniform(near, far, 50_000), [near, 65.0, far]]
+    ).astype(np.float32)
     r = r.clip(np.float32(near), np.float32(far))
     decoded = codes.values[codes.encode(r)]
     error = np.abs(decoded.astype(np.float64) - r)
@@ -87,7 +104,9 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
 
 @pytest.mark.parametrize("levels", [256, 100, 255])
 def test_reflectance_in_levels_is_kept_to_the_bit_and_the_levels_are_found(levels: int):
-    reflectance = np.array([step / levels for step in np.arange(min(levels + 1, 256))], dtype=np.float32)
+    reflectance = np.array(
+        [step / levels for step in np.arange(min(levels + 1, 256))], dtype=np.float32
+    )
     assert find_levels(reflectance) == levels
     codes = reflectance_codes(levels)
     assert np.array_equal(codes.values[codes.encode(reflectance)], reflectance)
@@ -109,7 +128,9 @@ def test_levels_are_found_although_somebody_multiplied_by_a_hundredth():
 @pytest.mark.parametrize("levels", [256, 100, 255])
 def test_the_scale_of_files_of_points_is_not_that_of_range_images(tmp_path: Path, levels: int):
     draw = np.random.default_rng(0)
-    image = np.stack([draw.uniform(2, 70, (4, 16)), draw.integers(0, levels, (4, 16)) / levels]).astype(np.float32)
+    image = np.stack(
+        [draw.uniform(2, 70, (4, 16)), draw.integers(0, levels, (4, 16)) / levels]
+    ).astype(np.float32)
     (tmp_path / "scans").mkdir()
     np.save(tmp_path / "scans" / "1.npy", image)
     assert plan_of(tmp_path / "scans", reflectance_scale=255.0).described["levels"] == levels
@@ -132,13 +153,17 @@ def test_prepared_scans_are_the_raw_ones_to_the_stated_quantisation(clouds: Path
 
 
 @pytest.mark.parametrize(
-    ("layout", "folder", "most"), [("kitti_360", "kitti360", 2), ("kitti_raw", "raw", 2), ("object", "object", 1)]
+    ("layout", "folder", "most"),
+    [("kitti_360", "kitti360", 2), ("kitti_raw", "raw", 2), ("object", "object", 1)],
 )
 def test_real_scans_keep_their_reflectance_to_the_bit(shared, tmp_path, layout, folder, most):
     sensor = SENSORS["hdl64e"]
     plan = plan_of(shared / "real" / folder, sensor, layout)
     few = PreparedStore(
-        tmp_path, {**plan.described, "scans": most}, [Drive("few", plan.drives[0].scans[:most])], plan.source
+        tmp_path,
+        {**plan.described, "scans": most},
+        [Drive("few", plan.drives[0].scans[:most])],
+        plan.source,
     )
     prepared = prepared_in(make(tmp_path, few), sensor)
     assert few.described["levels"] == (256 if layout == "kitti_360" else 100)
@@ -158,10 +183,15 @@ def test_a_shard_is_three_bytes_a_pixel_and_readable_by_anybody(clouds: Path, tm
     assert found == {"range": ("uint16", (1, 4, 16)), "reflectance": ("uint8", (1, 4, 16))}
 
 
-def test_nothing_tells_where_the_files_lie_or_how_many_processes_read_them(clouds: Path, tmp_path: Path):
+def test_nothing_tells_where_the_files_lie_or_how_many_processes_read_them(
+    clouds: Path, tmp_path: Path
+):
     moved = tmp_path / "elsewhere"
     shutil.copytree(clouds, moved)
-    one, other = make(tmp_path / "one", plan_of(clouds)), make(tmp_path / "other", plan_of(moved), workers=2)
+    one, other = (
+        make(tmp_path / "one", plan_of(clouds)),
+        make(tmp_path / "other", plan_of(moved), workers=2),
+    )
     assert files(one) == files(other)
     for content in files(one).values():
         assert str(clouds).encode() not in content
@@ -174,7 +204,9 @@ def test_scans_without_reflectance_give_shards_without_it(tmp_path: Path):
     size = 2 * 4 * 16 * 2
     assert size < (tmp_path / "out" / "scans-000000.safetensors").stat().st_size < size + 600
     assert prepared_in(tmp_path / "out", SMALL, reflectance=False)[1].shape == (1, 4, 16)
-    with pytest.raises(InputError, match=r"holds scans without reflectance. Set encoding.reflectance=false"):
+    with pytest.raises(
+        InputError, match=r"holds scans without reflectance. Set encoding.reflectance=false"
+    ):
         prepared_in(tmp_path / "out", SMALL)
 
 
@@ -188,19 +220,24 @@ def test_scans_without_reflectance_give_shards_without_it(tmp_path: Path):
         ({}, {"convention": "reference"}, "convention=centre there, reference here"),
     ],
 )
-def test_scans_prepared_for_other_images_are_refused(clouds, tmp_path, changes: dict, options: dict, said: str):
+def test_scans_prepared_for_other_images_are_refused(
+    clouds, tmp_path, changes: dict, options: dict, said: str
+):
     make(tmp_path, plan_of(clouds))
     with refused(said):
         prepared_in(tmp_path, replace(SMALL, **changes), **options)
     with pytest.raises(InputError, match="holds other scans: "):
         make(tmp_path, plan_of(clouds, replace(SMALL, **changes), **options))
-    prepared_in(tmp_path, replace(SMALL, name="mine", height=2.0, firing=(1, 0, 2, 3)))  # no pixel depends on these
+    # no pixel depends on these
+    prepared_in(tmp_path, replace(SMALL, name="mine", height=2.0, firing=(1, 0, 2, 3)))
     plan = plan_of(clouds, projection="unfolding")
     with refused("firing=None there"):
         refuse_other_images(plan, replace(plan.reading, sensor=replace(SMALL, firing=(1, 0, 2, 3))))
 
 
-def test_other_files_of_the_same_names_are_refused_and_a_mended_one_is_taken(clouds: Path, tmp_path: Path):
+def test_other_files_of_the_same_names_are_refused_and_a_mended_one_is_taken(
+    clouds: Path, tmp_path: Path
+):
     root, out = Path(shutil.copytree(clouds, tmp_path / "scans")), tmp_path / "out"
     bad, whole = root / "drive0" / "000004.bin", files(make(tmp_path / "whole", plan_of(clouds)))
     bad.write_bytes(b"")
@@ -228,20 +265,33 @@ def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch
     assert len(prepared_in(tmp_path)) == 10
 
 
-def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tmp_path: Path, caplog):
+def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(
+    clouds: Path, tmp_path: Path, caplog
+):
     root = tmp_path / "scans"
     shutil.copytree(clouds, root)
-    for name in ("drive0/000001.bin", "drive0/000003.bin", "drive0/000004.bin", "drive0/000005.bin"):
+    for name in (
+        "drive0/000001.bin",
+        "drive0/000003.bin",
+        "drive0/000004.bin",
+        "drive0/000005.bin",
+    ):
         (root / name).write_bytes(b"")
     plan = plan_of(root)
     with pytest.raises(InputError, match=r"000001.bin: it holds no points"):
         make(tmp_path / "out", plan)
-    with pytest.raises(InputError, match="is not finished: the same r2flow prepare command resumes"):
+    with pytest.raises(
+        InputError, match="is not finished: the same r2flow prepare command resumes"
+    ):
         prepared_in(tmp_path / "out", SMALL)
     make(tmp_path / "out", plan, on_bad_scan="skip")
     assert caplog.text.count("left out:") == 4
     shards = PreparedStore(tmp_path / "out", plan.described, plan.drives, plan.source)
-    assert (*prepare(shards), [shards.head(i)["left_out"] for i in shards.shards]) == (4, [], [[1], [3, 4, 5], [], []])
+    assert (*prepare(shards), [shards.head(i)["left_out"] for i in shards.shards]) == (
+        4,
+        [],
+        [[1], [3, 4, 5], [], []],
+    )
     prepared, raw = prepared_in(tmp_path / "out", SMALL), raw_of(clouds)
     assert prepared.names == [raw.names[i] for i in (0, 2, 6, 7, 8, 9)]  # the second shard is empty
     for index, number in enumerate((0, 2, 6, 7, 8, 9)):
@@ -256,13 +306,17 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tm
 
 def test_a_scan_that_has_no_reflectance_among_others_is_a_bad_one(tmp_path: Path):
     for number in range(40):
-        write_cloud(tmp_path / "scans" / f"{number:02d}.ply", number, levels=None if number == 1 else 100)
-    for convention in ("centre", "reference"):  # nothing is made, so that the folder takes another recipe
+        write_cloud(
+            tmp_path / "scans" / f"{number:02d}.ply", number, levels=None if number == 1 else 100
+        )
+    # nothing is made, so that the folder takes another recipe
+    for convention in ("centre", "reference"):
         with pytest.raises(InputError, match=r"01.ply has no reflectance"):
             make(tmp_path / "out", plan_of(tmp_path / "scans", convention=convention))
 
 
-# At any number of attempts, by any number of processes; test_pairs.py has stores that several commands share
+# At any number of attempts, by any number of processes; test_pairs.py has stores that several
+# commands share
 
 
 def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_path: Path):
@@ -303,7 +357,11 @@ def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_pat
     if damage not in ("swapped", "renamed"):
         with refused(path):
             opened[len(opened) // 2]
-    said = "scans-000001.safetensors is da" if damage in ("cut", "swapped", "renamed") else "is not finished"
+    said = (
+        "scans-000001.safetensors is da"
+        if damage in ("cut", "swapped", "renamed")
+        else "is not finished"
+    )
     with pytest.raises(InputError, match=said):
         prepared_in(tmp_path)
     if damage == "folder":
@@ -326,27 +384,50 @@ def test_a_manifest_that_is_damaged_or_missing_is_named(clouds: Path, tmp_path: 
 
 
 def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path, monkeypatch):
-    monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))  # no pause
+    # no pause
+    monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))
     out = tmp_path / "out"
-    typed = ("prepare", f"kitti_360:{kitti_360}", "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 2)
-    assert f"{out}: 6 scans in 3 shards, 0.0 MiB, reflectance as n/256" in r2flow(*typed, "--workers", 1).said
+    typed = (
+        "prepare",
+        f"kitti_360:{kitti_360}",
+        "--out",
+        out,
+        "--split",
+        "test",
+        "--size",
+        "4x16",
+        "--shard-scans",
+        2,
+    )
+    assert (
+        f"{out}: 6 scans in 3 shards, 0.0 MiB, reflectance as n/256"
+        in r2flow(*typed, "--workers", 1).said
+    )
     for shard in (1, 2):
         (out / f"scans-{shard:06d}.safetensors").unlink()
     done = r2flow(*typed, "--workers", 1)
     assert "6 scans in 3 shards, 0.0 MiB, reflectance as n/256, 1 there already" in done.said
     assert "preparing 2/2 shards" in done.stderr
     source = prepared_in(out)
-    assert np.abs(source[5] - read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))).max() <= 1e-3
+    assert (
+        np.abs(
+            source[5] - read_image(kitti_360 / source.names[5], Reading(SMALL, reflectance=True))
+        ).max()
+        <= 1e-3
+    )
 
 
 def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):
     config = yaml.safe_load((ROOT / "conf" / "data" / "nuscenes.yaml").read_text())
-    r, e = np.full(3, 10.0), np.deg2rad([10.0, 0.0, -30.0])  # the first and the last out of an HDL-64E's view
+    # the first and the last out of an HDL-64E's view
+    r, e = np.full(3, 10.0), np.deg2rad([10.0, 0.0, -30.0])
     points = np.stack([r * np.cos(e), np.zeros(3), r * np.sin(e), [0, 100, 255], [31, 23, 0]], 1)
     path = tmp_path / "scans" / "n015-2018-07-24-11-22-45+0800__LIDAR_TOP__1532402927647951.pcd.bin"
     path.parent.mkdir()
     path.write_bytes(points.astype("<f4").tobytes())
-    code, _, error = r2flow("prepare", f"nuscenes:{path.parent}", "--out", tmp_path / "out", "--workers", 1)
+    code, _, error = r2flow(
+        "prepare", f"nuscenes:{path.parent}", "--out", tmp_path / "out", "--workers", 1
+    )
     assert (code, error.split("error")[1:]) == (0, [])
     recipe = read_manifest(tmp_path / "out")["recipe"]["reading"]
     assert {"override /sensor@_global_.sensor": recipe["sensor"]["name"]} in config["defaults"]
@@ -363,7 +444,9 @@ def wide(numbered: Path, tmp_path: Path) -> Path:
     folder.mkdir()
     for path in numbered.iterdir():
         x, y, z, reflectance = np.fromfile(path, np.float32).reshape(-1, 4).T
-        np.save(folder / f"{path.stem}.npy", np.column_stack([x * 0 + 7, z, y, x, reflectance, x * 0]))
+        np.save(
+            folder / f"{path.stem}.npy", np.column_stack([x * 0 + 7, z, y, x, reflectance, x * 0])
+        )
     return folder
 
 
@@ -376,7 +459,12 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, wide, tmp_path):
     other = "prepare", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two"
     assert "reading.columns=" in r2flow(*other).refusal
     scan = wide / "000000.npy"
-    assert r2flow("show", scan, *columns, "--size", "4x16", "--format", "npy", "-o", tmp_path / "image")[0] == 0
+    assert (
+        r2flow(
+            "show", scan, *columns, "--size", "4x16", "--format", "npy", "-o", tmp_path / "image"
+        )[0]
+        == 0
+    )
     expected = read_image(numbered / "000000.bin", Reading(SMALL, reflectance=True))
     np.testing.assert_array_equal(np.load(tmp_path / "image" / "000000.npy"), expected)
     assert r2flow("evaluate", wide, scan, "--size", "4x16", "--metrics", "jsd", *columns)[0] == 0

@@ -17,7 +17,9 @@ IMAGE = np.random.default_rng(0).uniform(2, 70, (2, 8, 32)).astype(np.float32)
 
 
 def test_range_images_are_read_as_they_were(tmp_path: Path):
-    for number, array in enumerate((IMAGE, np.asfortranarray(IMAGE), IMAGE[:1], IMAGE.astype(np.float64))):
+    for number, array in enumerate(
+        (IMAGE, np.asfortranarray(IMAGE), IMAGE[:1], IMAGE.astype(np.float64))
+    ):
         path = tmp_path / f"{number}.npy"
         np.save(path, array)
         np.testing.assert_array_equal(read_range_image(path), array)
@@ -44,7 +46,9 @@ def test_no_more_memory_is_taken_than_a_few_times_the_file(tmp_path: Path):
 
 
 @pytest.mark.parametrize("absurd", [-5.0, 500.0, 1e30])
-def test_ranges_that_no_lidar_measures_are_reported_and_are_no_returns(tmp_path: Path, caplog, absurd: float):
+def test_ranges_that_no_lidar_measures_are_reported_and_are_no_returns(
+    tmp_path: Path, caplog, absurd: float
+):
     image = np.full((2, 8, 32), 0.5, np.float32)
     image[0] = 20
     np.save(tmp_path / "whole.npy", image)
@@ -55,6 +59,8 @@ def test_ranges_that_no_lidar_measures_are_reported_and_are_no_returns(tmp_path:
         read_range_image(tmp_path / f"{count}.npy")
     found = read_range_image(tmp_path / "4.npy")
     assert caplog.text.count("ranges below 0") == 1  # once a folder
-    assert f"{tmp_path / '1.npy'}: ranges below 0 or above 400 m are taken as no return" in caplog.text
+    assert (
+        f"{tmp_path / '1.npy'}: ranges below 0 or above 400 m are taken as no return" in caplog.text
+    )
     image[:, 3, 5:9] = 0
     assert np.array_equal(found, image)

@@ -28,7 +28,8 @@ def test_skipping_takes_the_next_good_scan_of_the_same_block(numbered: Path, cap
     assert caplog.text.count("left out") == 3  # each is said once
     with memory_below(4 << 20):  # two lists of 120,000 paths; as many numbers take 5 MB more
         ScanFiles(source.paths * 10_000, source.reading)[2]
-    # A block never reaches into its neighbour: scan 11 is not replaced by scan 0 of the training block.
+    # A block never reaches into its neighbour: scan 11 is not replaced by scan 0 of the training
+    # block.
     assert numbers(source.subset(range(9, 12))) == [9, 10, 9]
     # The same length and order in memory, or a run could not go on with other memory.
     kept = InMemory(source.batch(range(12)).numpy(), source.names)
@@ -41,24 +42,33 @@ def test_skipping_takes_the_next_good_scan_of_the_same_block(numbered: Path, cap
 
 def test_a_scan_out_of_range_says_its_numbers(tmp_path: Path):
     write_scan(tmp_path / "far.bin", 200)
-    with pytest.raises(InputError, match=r"far.bin: none of its 1 points lies within 1.45-80 m .* 205-205 m"):
+    with pytest.raises(
+        InputError, match=r"far.bin: none of its 1 points lies within 1.45-80 m .* 205-205 m"
+    ):
         read_image(tmp_path / "far.bin", STRICT)
 
 
 def test_reflectance_out_of_scale_names_the_key(tmp_path: Path):
     words = r"in \[0, 1\], found up to {0}\..*reflectance_scale={1},"
-    for stored, said in (-1, "negative, found -1;"), (4e4, words.format(40000, 65535)), (204, words.format(204, 255)):
+    for stored, said in (
+        (-1, "negative, found -1;"),
+        (4e4, words.format(40000, 65535)),
+        (204, words.format(204, 255)),
+    ):
         write_points(tmp_path / "scan.ply", np.array([[10, 0, -1]]), np.array([stored]))
         with pytest.raises(InputError, match=said):
             read_image(tmp_path / "scan.ply", STRICT)
-    assert read_image(tmp_path / "scan.ply", replace(STRICT, reflectance_scale=255))[1].max() == pytest.approx(0.8)
+    assert read_image(tmp_path / "scan.ply", replace(STRICT, reflectance_scale=255))[
+        1
+    ].max() == pytest.approx(0.8)
 
 
 def test_the_held_out_block_is_contiguous_and_last():
     training, held = holdout_block(19, 0.1)
     assert (list(training), list(held)) == (list(range(17)), [17, 18])
     assert [len(part) for part in holdout_block(3, 0.0)] == [3, 0]
-    assert [len(part) for part in holdout_block(1, 0.5)] == [1, 0]  # something must be left to learn from
+    # something must be left to learn from
+    assert [len(part) for part in holdout_block(1, 0.5)] == [1, 0]
 
 
 def test_whole_drives_are_held_out_where_they_come_within_half_of_the_share():

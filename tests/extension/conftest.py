@@ -1,4 +1,6 @@
-"""Families that come from outside, as a user gives them: a file, `--plugin`, and what the config says of it."""
+"""Families that come from outside, as a user gives them: a file, `--plugin`, and what the config
+says of it.
+"""
 
 import contextlib
 import copy
@@ -9,10 +11,10 @@ from pathlib import Path
 
 import pytest
 from hydra.core.config_store import ConfigStore
+from r2flow.callbacks import CALLBACKS
 
 from r2flow import cli, plugins
 from r2flow.backbones import BACKBONES
-from r2flow.callbacks import CALLBACKS
 from r2flow.flow.losses import LOSSES
 from r2flow.generators import GENERATORS
 from r2flow.runs.composing import REGISTRIES
@@ -47,16 +49,24 @@ class Family:
 
 
 GAN = Family("gan", "toy_gan", ("stage=toy_gan", "stage.width=16"))
-COMPLETION = Family("completion", "toy_completion", ("stage=toy_completion", "sampler={name: sde, steps: 2}"))
+COMPLETION = Family(
+    "completion", "toy_completion", ("stage=toy_completion", "sampler={name: sde, steps: 2}")
+)
 BACKBONE = Family("backbone", "toy_backbone", ("backbone=toy_backbone", "sampler.steps=2"))
 ALL = (GAN, COMPLETION, BACKBONE)
 
 
 @contextlib.contextmanager
 def loaded(*families: Family) -> Iterator[None]:
-    """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
-    tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS, SAMPLERS, LOSSES), ConfigStore.instance()
-    choices = {group: copy.deepcopy(store.repo.get(group, {})) for group in REGISTRIES}  # Hydra's own stay
+    """Families' files imported for the length of a block: what comes after is as if in a process of
+    its own.
+    """
+    tables, store = (
+        (GENERATORS, STAGES, BACKBONES, CALLBACKS, SAMPLERS, LOSSES),
+        ConfigStore.instance(),
+    )
+    # Hydra's own stay
+    choices = {group: copy.deepcopy(store.repo.get(group, {})) for group in REGISTRIES}
     before, known = [dict(table.items()) for table in tables], dict(plugins._loaded)
     try:
         plugins.load_plugins([str(FAMILIES / f"{family.file}.py") for family in families])
@@ -84,7 +94,9 @@ def train(run: Path, family: Family, *more: str) -> Done:
 
 
 @pytest.fixture(scope="session", params=ALL, ids=str)
-def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Family, Path]:
+def trained(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Family, Path]:
     return request.param, run_of(request.param, tmp_path_factory)
 
 

@@ -32,8 +32,14 @@ from tests.training.test_train import assert_bit_equal
 
 def test_training_leaves_pictures_checkpoints_and_samples(trained: tuple[Family, Path]):
     _, run = trained
-    assert [path.name for path in sorted((run / "pictures").iterdir())] == ["step-00000003.png", "step-00000006.png"]
-    assert [path.name for path in checkpoints_of(run)] == ["step-00000006.ckpt", "step-00000004.ckpt"]
+    assert [path.name for path in sorted((run / "pictures").iterdir())] == [
+        "step-00000003.png",
+        "step-00000006.png",
+    ]
+    assert [path.name for path in checkpoints_of(run)] == [
+        "step-00000006.ckpt",
+        "step-00000004.ckpt",
+    ]
     image = np.load(run / "samples" / "000000.npy")
     assert image.shape == (2, 16, 64)
     assert np.isfinite(image).all()
@@ -55,18 +61,43 @@ def test_info_names_the_family(trained: tuple[Family, Path]):
         BACKBONE: ("rectified_flow", "toy_backbone"),
     }  # fmt: skip
     assert (about["generator"], about["backbone"]) == expected[family]
-    assert (about["config"]["backbone"] is None) == (family is GAN)  # which has a network of its own kind
+    # which has a network of its own kind
+    assert (about["config"]["backbone"] is None) == (family is GAN)
     assert about["config"]["plugins"] == [str(FAMILIES / f"{family.file}.py")]
-    if family is GAN:  # options of its stage, without a file of theirs: as given, as it says, as of every stage
-        assert [about["config"]["stage"][key] for key in ("width", "learning_rate", "parent")] == [16, 2e-3, None]
+    # options of its stage, without a file of theirs: as given, as it says, as of every stage
+    if family is GAN:
+        assert [about["config"]["stage"][key] for key in ("width", "learning_rate", "parent")] == [
+            16,
+            2e-3,
+            None,
+        ]
 
 
 def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
     family, run = trained
-    how = ("--metrics", "jsd", "--num", 2, "--real-num", 2, "--workers", 0, "--no-cache", "--steps", "1,2")
-    assert "JSD" in r2flow("evaluate", family.plugin, "simulated:7", run, *how, "--json", tmp_path / "e.json").said
+    how = (
+        "--metrics",
+        "jsd",
+        "--num",
+        2,
+        "--real-num",
+        2,
+        "--workers",
+        0,
+        "--no-cache",
+        "--steps",
+        "1,2",
+    )
+    assert (
+        "JSD"
+        in r2flow(
+            "evaluate", family.plugin, "simulated:7", run, *how, "--json", tmp_path / "e.json"
+        ).said
+    )
     comparisons = json.loads((tmp_path / "e.json").read_text())["comparisons"]
-    steps = [one["generated"]["sampler"].get("steps") for one in comparisons if one["kind"] == "judged"]
+    steps = [
+        one["generated"]["sampler"].get("steps") for one in comparisons if one["kind"] == "judged"
+    ]
     assert steps == ([None] if family is GAN else [1, 2])
 
 
@@ -86,7 +117,14 @@ def test_a_flow_is_straightened(tmp_path: Path, tmp_path_factory: pytest.TempPat
     sampler = ("data.pairs.sampler.name=euler", "data.pairs.sampler.steps=2")
     pairs = ("data.pairs.num=6", "data.pairs.batch_size=3", *sampler)
     tiny = [one for one in TINY if not one.startswith("data.scenes")]  # which are of scans
-    options = [BACKBONE.plugin, *tiny, "sampler.steps=2", *pairs, f"stage.parent={run}", f"run_dir={tmp_path / 'two'}"]
+    options = [
+        BACKBONE.plugin,
+        *tiny,
+        "sampler.steps=2",
+        *pairs,
+        f"stage.parent={run}",
+        f"run_dir={tmp_path / 'two'}",
+    ]
     assert r2flow("train", "experiment=reflow", *options).said
     with loaded(BACKBONE):
         first, second = load_checkpoint(run), load_checkpoint(tmp_path / "two")
@@ -99,7 +137,8 @@ CANNOT = {
     "interpolate": (
         ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "needs the velocity of a flow from noise; a ToyGenerator"
     ),
-    "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow from noise; a ToyGenerator"),
+    "report "
+    "curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow from noise; a ToyGenerator"),
     "report solvers": (["RUN", "-o", "OUT"], "report solvers needs the velocity of a flow"),
     "export": (["RUN", "-o", "OUT.onnx", "--steps", "4"], "only rectified flows and flow maps can be exported"),
     "pairs": (["RUN"], "a reflow pair needs the velocity of a flow from noise; a ToyGenerator"),
@@ -108,9 +147,15 @@ CANNOT = {
 
 
 @pytest.mark.parametrize("verb", CANNOT)
-def test_what_a_gan_cannot_do_is_one_line(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, verb: str):
+def test_what_a_gan_cannot_do_is_one_line(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, verb: str
+):
     gan, (arguments, said) = run_of(GAN, tmp_path_factory), CANNOT[verb]
-    for name, value in (("RUN", gan), ("SCAN", gan / "samples" / "000000.ply"), ("OUT", tmp_path / "out")):
+    for name, value in (
+        ("RUN", gan),
+        ("SCAN", gan / "samples" / "000000.ply"),
+        ("OUT", tmp_path / "out"),
+    ):
         arguments = [one.replace(name, str(value)) for one in arguments]
     assert said in r2flow(*verb.split(), GAN.plugin, *arguments).refusal
     assert not list(tmp_path.iterdir())
@@ -122,8 +167,20 @@ SHRUNKEN = Family("sampler", "toy_sampler", ("sampler={name: shrunken, steps: 3,
 @pytest.fixture(scope="module")
 def shrunken_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shrunken_run = tmp_path_factory.mktemp("sampler") / "run"
-    given = ["sampler.name=shrunken", "sampler.steps=3", "+sampler.share=0.25", "trainer.max_steps=2"]
-    options = ["data=simulated", "backbone=hdit_tiny", *TINY, *given, SHRUNKEN.plugin, f"run_dir={shrunken_run}"]
+    given = [
+        "sampler.name=shrunken",
+        "sampler.steps=3",
+        "+sampler.share=0.25",
+        "trainer.max_steps=2",
+    ]
+    options = [
+        "data=simulated",
+        "backbone=hdit_tiny",
+        *TINY,
+        *given,
+        SHRUNKEN.plugin,
+        f"run_dir={shrunken_run}",
+    ]
     assert r2flow("train", *options).said
     return shrunken_run
 
@@ -138,7 +195,9 @@ def test_a_checkpoint_notes_it_and_needs_the_plugin(shrunken_run: Path, tmp_path
         torch.testing.assert_close(made.x, noise + 0.25 * (euler - noise))
         assert made.evaluations.tolist() == [1]
         found = tableau(generator, build_sampler("shrunken", steps=2, share=0.5))
-        torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.25, 0], [1, 0.25, 0.25]]).double())
+        torch.testing.assert_close(
+            found.states, torch.tensor([[1, 0, 0], [1, 0.25, 0], [1, 0.25, 0.25]]).double()
+        )
         with pytest.raises(InputError, match="share"):
             build_sampler("shrunken", share="x")
     assert "--plugin" in r2flow("sample", shrunken_run, "-o", tmp_path / "out").refusal
@@ -146,7 +205,9 @@ def test_a_checkpoint_notes_it_and_needs_the_plugin(shrunken_run: Path, tmp_path
 
 def test_verbs_take_it(shrunken_run: Path, tmp_path: Path):
     given = (SHRUNKEN.plugin, shrunken_run, "--sampler", "shrunken:share=0.75", "--steps", 2)
-    assert r2flow("sample", *given, "--num", 1, "--format", "npy", "--pictures", 0, "-o", tmp_path / "scans").said
+    assert r2flow(
+        "sample", *given, "--num", 1, "--format", "npy", "--pictures", 0, "-o", tmp_path / "scans"
+    ).said
     assert np.isfinite(np.load(tmp_path / "scans" / "000000.npy")).all()
     note = json.loads((tmp_path / "scans" / "manifest.json").read_text())["recipe"]["sampler"]
     assert note == {"name": "shrunken", "steps": 2, "grid": "uniform", "share": 0.75}
@@ -154,7 +215,9 @@ def test_verbs_take_it(shrunken_run: Path, tmp_path: Path):
     assert "shrunken" in r2flow("info", shrunken_run, SHRUNKEN.plugin).stdout
 
 
-def test_known_rays_are_given_back_and_the_others_depend_on_them(tmp_path_factory: pytest.TempPathFactory):
+def test_known_rays_are_given_back_and_the_others_depend_on_them(
+    tmp_path_factory: pytest.TempPathFactory,
+):
     with loaded(COMPLETION):
         checkpoint = load_checkpoint(run_of(COMPLETION, tmp_path_factory))
     space = checkpoint.generator.space
@@ -162,8 +225,14 @@ def test_known_rays_are_given_back_and_the_others_depend_on_them(tmp_path_factor
     mask[:, :, ::2] = 1
     for image in (torch.full((2, *space.shape), 0.5), torch.full((2, *space.shape), -0.5)):
         known = {"image": image, "mask": mask}
-        alone = torch.cat([one.images for one in sample(checkpoint, 2, batch_size=1, condition=known)])
+        alone = torch.cat(
+            [one.images for one in sample(checkpoint, 2, batch_size=1, condition=known)]
+        )
         together = next(sample(checkpoint, 2, batch_size=2, condition=known)).images
         torch.testing.assert_close(alone, together, rtol=1e-4, atol=1e-4)
-        torch.testing.assert_close(alone[:, :, ::2], space.decode(image)[:, :, ::2], rtol=1e-5, atol=1e-5)
-    assert not torch.allclose(next(sample(checkpoint, 2, batch_size=2)).images[:, :, 1::2], alone[:, :, 1::2])
+        torch.testing.assert_close(
+            alone[:, :, ::2], space.decode(image)[:, :, ::2], rtol=1e-5, atol=1e-5
+        )
+    assert not torch.allclose(
+        next(sample(checkpoint, 2, batch_size=2)).images[:, :, 1::2], alone[:, :, 1::2]
+    )

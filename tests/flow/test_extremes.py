@@ -11,7 +11,15 @@ import torch
 from benchmarks.solvers import Mixed
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
-from r2flow.flow.problems import PROBLEMS, Gaussian, GaussianMixture, PointMass, Rotating, StiffLinear, Straight
+from r2flow.flow.problems import (
+    PROBLEMS,
+    Gaussian,
+    GaussianMixture,
+    PointMass,
+    Rotating,
+    StiffLinear,
+    Straight,
+)
 from r2flow.flow.solvers import LEAST_TOLERANCE, SOLVERS, solve
 from r2flow.noise import Draws
 
@@ -23,7 +31,9 @@ class Spoiled(Mixed):
     """Scene 2 becomes NaN once t passes .5."""
 
     def __call__(self, t, x):
-        late = torch.tensor([problem is SPOILED for problem in self.problems])[:, None] & (expand_time(t, x) > 0.5)
+        late = torch.tensor([problem is SPOILED for problem in self.problems])[:, None] & (
+            expand_time(t, x) > 0.5
+        )
         return torch.where(late, math.nan, super().__call__(t, x))
 
 
@@ -45,7 +55,14 @@ def test_a_scene_whose_velocity_becomes_nan_is_flagged_and_the_others_are_right(
 def test_a_start_that_is_not_finite_is_flagged_at_once(method):
     x_0 = X_0.clone()
     x_0[1, 3], x_0[2, 0] = math.nan, math.inf
-    solution = solve(lambda t, x: torch.ones_like(x), x_0, method=method, steps=8, tolerance=1e-4, global_error=True)
+    solution = solve(
+        lambda t, x: torch.ones_like(x),
+        x_0,
+        method=method,
+        steps=8,
+        tolerance=1e-4,
+        global_error=True,
+    )
     assert solution.converged.tolist() == [True, False, False, True]
     assert solution.x[[0, 3]].isfinite().all()
     if method == "dopri5":
@@ -83,12 +100,16 @@ def test_an_empty_interval_or_batch_returns_the_start_without_evaluations(method
 
 
 @pytest.mark.parametrize("method", ["dopri5", "torchdiffeq:dopri5"])
-def test_a_tolerance_that_float32_cannot_hold_is_raised_with_a_warning_in_every_call(method, caplog):
+def test_a_tolerance_that_float32_cannot_hold_is_raised_with_a_warning_in_every_call(
+    method, caplog
+):
     floored = solve(Gaussian(), X_0, method=method, tolerance=1e-12)
     solve(Gaussian(), X_0, method=method, tolerance=1e-12, global_error=True)
     said = "a tolerance of 1e-12 is below what float32 can hold: 1e-07 is used."
     assert [record.message for record in caplog.records] == [said, said]
-    assert torch.equal(floored.x, solve(Gaussian(), X_0, method=method, tolerance=LEAST_TOLERANCE[torch.float32]).x)
+    assert torch.equal(
+        floored.x, solve(Gaussian(), X_0, method=method, tolerance=LEAST_TOLERANCE[torch.float32]).x
+    )
     assert floored.converged.all()
     torch.testing.assert_close(floored.x.double(), Gaussian().solution(X_0, 1.0), rtol=0, atol=3e-6)
 
@@ -131,7 +152,10 @@ def test_the_type_of_the_weights_or_autocast_sets_the_precision(method, caplog):
         "a tolerance of 1e-06 is below what bfloat16 can hold: 0.0001 is used."
     ] * 3
     assert torch.equal(floored.x, by_method.x)
-    assert floored.evaluations.max() <= 3 * solve(single, X_0, method=method, tolerance=1e-4).evaluations.max()
+    assert (
+        floored.evaluations.max()
+        <= 3 * solve(single, X_0, method=method, tolerance=1e-4).evaluations.max()
+    )
     for found in (floored, cast):
         torch.testing.assert_close(found.x, math.exp(0.5) * X_0, rtol=2e-2, atol=2e-2)
 
@@ -141,21 +165,32 @@ def test_many_short_steps_have_a_gradient():
     assert solve(lambda t, x: -w * x, X_0, method="dopri5").x.requires_grad
 
 
-@pytest.mark.parametrize("method", [method for method in METHODS if method != "exprb43"])  # it gives no gradient
+# it gives no gradient
+@pytest.mark.parametrize("method", [method for method in METHODS if method != "exprb43"])
 def test_a_network_that_is_being_trained_can_be_solved(method):
-    # x' = W x: the end is exp(W) x_0, its sum's gradient is not zero; the budget is that of adaptive methods
+    # x' = W x: the end is exp(W) x_0, its sum's gradient is not zero; the budget is that of
+    # adaptive methods
     network = torch.nn.Linear(16, 16, bias=False)
     exact = X_0 @ torch.matrix_exp(network.weight.detach().T)
-    solution = solve(lambda t, x: network(x), X_0, method=method, steps=256, tolerance=1e-5, max_evaluations=255)
-    torch.testing.assert_close(solution.x.detach(), exact, rtol=0, atol=2e-2 if method == "euler" else 1e-3)
+    solution = solve(
+        lambda t, x: network(x), X_0, method=method, steps=256, tolerance=1e-5, max_evaluations=255
+    )
+    torch.testing.assert_close(
+        solution.x.detach(), exact, rtol=0, atol=2e-2 if method == "euler" else 1e-3
+    )
     solution.x.sum().backward()
     assert network.weight.grad.abs().max() > 0
 
 
 def test_exponential_steps_refuse_to_lose_a_gradient():
-    for weight, x in ((torch.ones(1, requires_grad=True), X_0), (torch.ones(1), X_0.clone().requires_grad_())):
+    for weight, x in (
+        (torch.ones(1, requires_grad=True), X_0),
+        (torch.ones(1), X_0.clone().requires_grad_()),
+    ):
         velocity = partial(lambda weight, t, x: weight * StiffLinear(1e6)(t, x), weight)
-        with pytest.raises(InputError, match=r"no gradient: solve with dopri5 or under torch.no_grad\(\)"):
+        with pytest.raises(
+            InputError, match=r"no gradient: solve with dopri5 or under torch.no_grad\(\)"
+        ):
             solve(velocity, x, method="exprb43")
         with torch.no_grad():
             assert solve(velocity, x, method="exprb43").converged.all()
@@ -169,7 +204,9 @@ def test_a_scene_that_exhausts_its_budget_is_flagged(method):
     assert solution.converged.tolist() == [True, False, True]
     assert (solution.evaluations <= 200).all()
     assert solution.x.isfinite().all()
-    torch.testing.assert_close(solution.x[[0, 2]].double(), easy.solution(X_0[[0, 2]], 1.0), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        solution.x[[0, 2]].double(), easy.solution(X_0[[0, 2]], 1.0), rtol=0, atol=1e-4
+    )
 
 
 def test_a_point_mass_needs_an_euler_step_at_the_end():
@@ -197,7 +234,9 @@ def most_alive(method: str, steps: int, tolerance: float) -> tuple[int, int]:
         seen.extend([weakref.ref(x), weakref.ref(v)])
         return v
 
-    solution = solve(velocity, torch.randn(2, 2, 4, 8), method=method, steps=steps, tolerance=tolerance)
+    solution = solve(
+        velocity, torch.randn(2, 2, 4, 8), method=method, steps=steps, tolerance=tolerance
+    )
     return most, int(solution.evaluations.max())
 
 
@@ -215,23 +254,34 @@ X = torch.randn(1, 8, generator=torch.Generator().manual_seed(0), dtype=torch.fl
 @pytest.mark.parametrize("method", sorted(SOLVERS))
 def test_a_velocity_may_edit_its_arguments_and_write_each_output_into_the_same_buffer(method: str):
     buffer = torch.empty_like(X)
-    pure = solve(lambda t, x: torch.cos(9 * t).reshape(-1, 1) - 3 * x, X, method=method, tolerance=1e-6)
-    edits = solve(lambda t, x: buffer.copy_(t.mul_(9).cos_() - x.mul_(3)), X, method=method, tolerance=1e-6)
+    pure = solve(
+        lambda t, x: torch.cos(9 * t).reshape(-1, 1) - 3 * x, X, method=method, tolerance=1e-6
+    )
+    edits = solve(
+        lambda t, x: buffer.copy_(t.mul_(9).cos_() - x.mul_(3)), X, method=method, tolerance=1e-6
+    )
     assert torch.equal(edits.x, pure.x)
 
 
 @pytest.mark.parametrize("place", [0.31, 0.4567, 0.5, 0.6180339, 0.777])
-@pytest.mark.parametrize(("power", "tolerance"), [(1, 1e-2), (1, 1e-3), (1, 1e-4), (2, 1e-2), (2, 1e-4)])
+@pytest.mark.parametrize(
+    ("power", "tolerance"), [(1, 1e-2), (1, 1e-3), (1, 1e-4), (2, 1e-2), (2, 1e-4)]
+)
 def test_no_solution_crosses_a_pole(place: float, power: int, tolerance: float):
     for x_0 in (X, X[0, :1]):  # a scene of 8 numbers, (1, 8), and of one, (1,)
-        solution = solve(lambda t, x: (t - place) ** -power + 0 * x, x_0, method="dopri5", tolerance=tolerance)
+        solution = solve(
+            lambda t, x: (t - place) ** -power + 0 * x, x_0, method="dopri5", tolerance=tolerance
+        )
         assert not solution.converged.item()
 
 
 def test_noise_in_a_velocity_is_no_jacobian():
     noise = torch.Generator().manual_seed(1)
     solution = solve(
-        lambda t, x: 0.1 * torch.randn(x.shape, generator=noise, dtype=x.dtype) - x, X, method="exprb43", tolerance=1e-4
+        lambda t, x: 0.1 * torch.randn(x.shape, generator=noise, dtype=x.dtype) - x,
+        X,
+        method="exprb43",
+        tolerance=1e-4,
     )
     assert not solution.converged.item()
     assert solution.evaluations.item() == 2  # two answers to the start differ
@@ -247,17 +297,28 @@ def test_exact_ends_of_a_mixture_in_the_far_tail(x_0: float):
 
 JET = "narrow_jet"  # the known exception: nothing evaluated on either side of it shows it
 # The type of the state, and of the network where that is half precision.
-PRECISIONS = [(torch.float64, None)] + [(torch.float32, network) for network in (None, torch.bfloat16, torch.float16)]
+PRECISIONS = [(torch.float64, None)] + [
+    (torch.float32, network) for network in (None, torch.bfloat16, torch.float16)
+]
 
 
 def verdict(name: str, method: str, tolerance: float, state=torch.float64, network=None) -> str:
-    """'silent': more than ten tolerances off, not flagged, and an estimate more than a factor of five off."""
+    """'silent': more than ten tolerances off, not flagged, and an estimate more than a factor of
+    five off.
+    """
     problem, x_0 = PROBLEMS[name](), Draws(0, range(4)).start((32,)).to(state)
-    velocity = problem if network is None else lambda t, x: problem(t, x.to(network).to(x.dtype)).to(network)
-    found = solve(velocity, x_0, method=method, tolerance=tolerance, global_error=True, max_evaluations=4000)
+    velocity = (
+        problem
+        if network is None
+        else lambda t, x: problem(t, x.to(network).to(x.dtype)).to(network)
+    )
+    found = solve(
+        velocity, x_0, method=method, tolerance=tolerance, global_error=True, max_evaluations=4000
+    )
     difference = (found.x.double() - problem.solution(x_0, 1.0).double()).flatten(1)
     largest = difference.abs().amax(1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
-    errors = largest[:, 0] * (difference / largest).square().mean(1).sqrt()  # squares of stiff problems' overflow
+    # squares of stiff problems' overflow
+    errors = largest[:, 0] * (difference / largest).square().mean(1).sqrt()
     failed, estimate = errors > 10 * tolerance, found.global_error
     flagged = found.stiff | ~found.converged | ~estimate.isfinite()
     honest = (estimate >= errors / 5) & (estimate <= errors * 5)
@@ -272,7 +333,12 @@ def test_only_failures_on_the_jet_are_silent():
     cells = list(product(PROBLEMS, methods, (1e-3, 1e-5), PRECISIONS))
     found = {cell: verdict(*cell[:3], *cell[3]) for cell in cells}
     assert {name for (name, *_), seen in found.items() if seen == "silent"} == {JET}
-    assert sum(seen in ("failed", "silent") for seen in found.values()) > 30  # so that there is something to judge
-    smooth = [seen for (name, *_), seen in found.items() if name in ("straight", "gaussian", "two_modes", "rotating")]
+    # so that there is something to judge
+    assert sum(seen in ("failed", "silent") for seen in found.values()) > 30
+    smooth = [
+        seen
+        for (name, *_), seen in found.items()
+        if name in ("straight", "gaussian", "two_modes", "rotating")
+    ]
     assert "flagged" not in smooth
     assert verdict("stiff_1e4", "exprb43", 1e-3) == verdict("gaussian", "exprb43", 1e-3) == "solved"

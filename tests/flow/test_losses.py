@@ -8,7 +8,9 @@ from r2flow.flow.losses import LOSSES, mse, pseudo_huber_elementwise
 
 def test_the_reference_pseudo_huber_is_per_element(shared):
     case = torch.load(shared / "oracle" / "training.pt", weights_only=False)["pseudo_huber"]
-    torch.testing.assert_close(pseudo_huber_elementwise(case["v"], case["u"]).mean(), case["loss"], rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        pseudo_huber_elementwise(case["v"], case["u"]).mean(), case["loss"], rtol=1e-6, atol=0
+    )
     torch.testing.assert_close(
         pseudo_huber_elementwise(case["v2"], case["u2"]).mean(), case["loss2"], rtol=1e-6, atol=0
     )
@@ -35,7 +37,8 @@ def test_pseudo_huber_is_finite_wherever_its_value_is(size):
 
 D = 2 * 4 * 8
 C = 0.00054 * math.sqrt(D)
-# of one residual r in all D elements: mean square; sqrt(D r^2 + C^2) - C over sqrt(D); sqrt(r^2 + C^2) - C
+# of one residual r in all D elements: mean square; sqrt(D r^2 + C^2) - C over sqrt(D); sqrt(r^2 +
+# C^2) - C
 EXPECTED = {
     "mse": lambda r: r**2,
     "pseudo_huber": lambda r: (math.sqrt(D * r**2 + C**2) - C) / math.sqrt(D),
@@ -57,9 +60,13 @@ class TestHalfPrecision:
         assert loss.item() == pytest.approx(EXPECTED[name](residual), rel=1e-3)
         h = residual / 1000 or 1e-9
         slope = (EXPECTED[name](residual + h) - EXPECTED[name](residual - h)) / (2 * h)
-        torch.testing.assert_close(v.grad.float(), torch.full(v.shape, -slope / D), rtol=0.02, atol=1e-7)
+        torch.testing.assert_close(
+            v.grad.float(), torch.full(v.shape, -slope / D), rtol=0.02, atol=1e-7
+        )
 
     def test_infinity_and_nan_are_not_hidden(self, name, dtype):
         for value in (math.inf, math.nan):
-            loss = LOSSES[name](torch.full((1, 2, 4, 8), value, dtype=dtype), torch.zeros(1, 2, 4, 8))
+            loss = LOSSES[name](
+                torch.full((1, 2, 4, 8), value, dtype=dtype), torch.zeros(1, 2, 4, 8)
+            )
             assert not loss.isfinite().any()  # the stage's guard sees it

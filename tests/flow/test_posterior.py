@@ -6,7 +6,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.completion import Case, Correlated, bures, gaussian, map_of, moments, ring, velocity_of
+from benchmarks.completion import (
+    Case,
+    Correlated,
+    bures,
+    gaussian,
+    map_of,
+    moments,
+    ring,
+    velocity_of,
+)
 from r2flow.errors import InputError
 from r2flow.flow.solvers import named_grid
 from r2flow.generators import build_generator
@@ -32,7 +41,9 @@ def times(steps: int, grid: str = "uniform") -> Tensor:
     return named_grid(grid)(0.0, 1.0, steps)
 
 
-def sample_posterior(u, x_0: Tensor, y: Tensor, known: Tensor, method: str, times: Tensor, noise=None) -> Tensor:
+def sample_posterior(
+    u, x_0: Tensor, y: Tensor, known: Tensor, method: str, times: Tensor, noise=None
+) -> Tensor:
     return build_sampler(method).given(u, x_0, y, known, times, noise)
 
 
@@ -48,16 +59,23 @@ def test_the_linear_system_is_solved_by_conjugate_gradients():
         with torch.device("meta"):  # a default device of the user's
             found = _solved(lambda p: (p, p @ spread), r, steps)
         for row, x in zip(r, found, strict=True):
-            directions = torch.stack([torch.linalg.matrix_power(spread, k) @ row for k in range(steps)], 1)
+            directions = torch.stack(
+                [torch.linalg.matrix_power(spread, k) @ row for k in range(steps)], 1
+            )
             inner = directions.T @ spread @ directions
-            torch.testing.assert_close(x, directions @ torch.linalg.solve(inner, directions.T @ row))
+            torch.testing.assert_close(
+                x, directions @ torch.linalg.solve(inner, directions.T @ row)
+            )
 
 
 def test_each_scan_whose_residual_grows_tenfold_gets_the_least_one():
     vectors = torch.linalg.qr(randn(WIDTH, WIDTH, seed=5))[0]
     # not quite symmetric, as a network's Jacobian; these are the eigenvectors of its symmetric part
-    matrix = vectors * torch.logspace(-4, 0, WIDTH).double() @ vectors.T + 0.002 * randn(WIDTH, WIDTH, seed=6)
-    r = torch.stack([5 * vectors[:, 0] + vectors[:, -1], vectors[:, -1]])  # most of the first lies where S is least
+    matrix = vectors * torch.logspace(-4, 0, WIDTH).double() @ vectors.T + 0.002 * randn(
+        WIDTH, WIDTH, seed=6
+    )
+    # most of the first lies where S is least
+    r = torch.stack([5 * vectors[:, 0] + vectors[:, -1], vectors[:, -1]])
     found = _solved(lambda p: (p, p @ matrix.T), r, 1)
     moved = r @ matrix.T
     left = r - (r * r).sum(1, keepdim=True) / (r * moved).sum(1, keepdim=True) * moved
@@ -71,7 +89,9 @@ def test_a_system_ends_where_the_matrix_is_not_positive_or_nothing_is_left():
     matrix = torch.diag(torch.tensor([1.0, -1.0, 2.0]).double())
     r = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [1.0, 0, 1.0], [0, 0, 0]]).double()
     found = _solved(lambda p: (p, p @ matrix.T), r, 4)
-    torch.testing.assert_close(found, torch.tensor([[1.0, 0, 0], [0, 0, 0], [1.0, 0, 0.5], [0, 0, 0]]).double())
+    torch.testing.assert_close(
+        found, torch.tensor([[1.0, 0, 0], [0, 0, 0], [1.0, 0, 0.5], [0, 0, 0]]).double()
+    )
 
 
 def test_behind_a_direction_that_is_not_positive_nothing_is_searched():
@@ -96,13 +116,17 @@ def test_mmps_has_the_posterior_s_own_velocity_on_any_gaussian(t):
     y = case.measure(prior.sample(1, draws(4)))
     x, end = randn(1, WIDTH), torch.tensor([t, 1.0], dtype=torch.float64)
     posterior = prior.posterior(case.matrix, y[0], 0.0)
-    found = MMPS(products=WIDTH).run(velocity_of(prior), x, *case.measurement(y), end, numbered((1, WIDTH)))
+    found = MMPS(products=WIDTH).run(
+        velocity_of(prior), x, *case.measurement(y), end, numbered((1, WIDTH))
+    )
     torch.testing.assert_close(found, x + (1 - t) * posterior(end[0], x), rtol=1e-6, atol=1e-8)
 
 
 def test_with_an_exact_flow_map_steps_are_jumps():
     prior, x_0 = gaussian(), randn(2, WIDTH)
-    jumped = sample_posterior(map_of(prior), x_0, x_0, torch.zeros_like(x_0, dtype=torch.bool), "replace", times(3))
+    jumped = sample_posterior(
+        map_of(prior), x_0, x_0, torch.zeros_like(x_0, dtype=torch.bool), "replace", times(3)
+    )
     torch.testing.assert_close(jumped, prior.solution(x_0, 1.0))
 
 
@@ -116,7 +140,9 @@ def test_mmps_takes_a_flow_map_s_velocity():
 def test_mmps_samples_the_posterior_of_a_gaussian():
     prior, case = gaussian(), Case(ROWS)
     y = case.measure(prior.sample(3, draws(4)))
-    means, covariance = moments(velocity_of(prior), "mmps:products=12", case, y, times(40, "power:1.5"))
+    means, covariance = moments(
+        velocity_of(prior), "mmps:products=12", case, y, times(40, "power:1.5")
+    )
     total = 0.0
     for one, mean in zip(y, means, strict=True):
         posterior = prior.posterior(case.matrix, one, 0.0)
@@ -126,20 +152,25 @@ def test_mmps_samples_the_posterior_of_a_gaussian():
 
 
 def test_replacement_s_mean_is_biased_by_what_quadrature_says():
-    """Two values of unit variance and correlation c, one known: y = 1, noise 0. The posterior's mean is c."""
+    """Two values of unit variance and correlation c, one known: y = 1, noise 0. The posterior's
+    mean is c.
+    """
     c = 0.8
     prior = Correlated(torch.zeros(1, 2).double(), torch.tensor([[[1.0, c], [c, 1.0]]]).double())
     t = torch.linspace(0, 1, 20_001, dtype=torch.float64)
     values = torch.tensor([[1 + c], [1 - c]], dtype=torch.float64)
     variance = (1 - t) ** 2 + t**2 * values
-    rate = (t * values - (1 - t)) / variance  # the ODE x_2' = mean(rate) x_2 + half their difference t y
+    # the ODE x_2' = mean(rate) x_2 + half their difference t y
+    rate = (t * values - (1 - t)) / variance
     carried = (values / variance).prod(0) ** 0.25
     expected = float(torch.trapezoid((rate[0] - rate[1]) / 2 * t * carried, t))
     assert expected < 0.75 * c
     x_0 = torch.zeros(1, 2).double()
     y = torch.tensor([[1.0, 0.0]]).double()
     for method in ("replace", "repaint:repeats=1"):
-        found = sample_posterior(velocity_of(prior), x_0, y, y > 0, method, times(400), lambda j: x_0)
+        found = sample_posterior(
+            velocity_of(prior), x_0, y, y > 0, method, times(400), lambda j: x_0
+        )
         assert float(found[0, 1]) == pytest.approx(expected, abs=5e-3)
 
 
@@ -160,7 +191,9 @@ def test_repaint_leaves_less_of_replacement_s_bias_the_more_often_it_repeats():
 @pytest.mark.parametrize("method", ["replace", "repaint:repeats=3", "mmps"])
 def test_with_nothing_measured_it_draws_from_the_prior(method):
     prior, case = Correlated(torch.full((1, 4), 0.3).double(), ring(4)[None]), Case(torch.zeros(4))
-    means, covariance = moments(velocity_of(prior), method, case, torch.zeros(1, 0).double(), times(100, "power:1.5"))
+    means, covariance = moments(
+        velocity_of(prior), method, case, torch.zeros(1, 0).double(), times(100, "power:1.5")
+    )
     torch.testing.assert_close(means[0], prior.means[0], rtol=0, atol=1e-3)
     assert float(bures(covariance, ring(4))) < 0.03**2 * float(torch.trace(ring(4)))
 
@@ -171,7 +204,9 @@ def test_a_scan_s_answer_does_not_depend_on_its_batch(method):
     known = (torch.rand(4, WIDTH, generator=draws(1)) < 0.4).float()
     known[2] = 1
     condition, how = {"image": y, "known": known}, build_sampler(method, steps=4)
-    whole = flow(Draws(3, range(4)).start((WIDTH,)), condition, sampler=how, draws=Draws(3, range(4)))
+    whole = flow(
+        Draws(3, range(4)).start((WIDTH,)), condition, sampler=how, draws=Draws(3, range(4))
+    )
     assert whole.evaluations.tolist() == [how.evaluations()] * 4
     assert torch.equal(whole.x[2], y[2])
     for i in range(4):
@@ -184,7 +219,8 @@ def test_a_scan_s_answer_does_not_depend_on_its_batch(method):
 @pytest.mark.parametrize("method", ALL)
 def test_every_flow_completes_a_scan(family, method):
     flow, seen = build_generator({**CONFIG, "generator": {"name": family}}).eval(), []
-    how, who = build_sampler(method, grid=[0, 0.5, 1 - 1e-8, 1]), Draws(0, range(2))  # the third is 1 in float32
+    # the third is 1 in float32
+    how, who = build_sampler(method, grid=[0, 0.5, 1 - 1e-8, 1]), Draws(0, range(2))
     x_0 = who.start(flow.noise_shape)
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1

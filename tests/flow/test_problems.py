@@ -24,11 +24,14 @@ def test_a_time_for_each_scene_is_as_one_for_all_in_any_shape(name):
     problem, t = PROBLEMS[name](), torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
     whole = problem(t, X_0)
     torch.testing.assert_close(problem(t, X_0.view(3, 2, 2, 2)), whole.view(3, 2, 2, 2))
-    torch.testing.assert_close(problem.solution(X_0.view(3, 2, 2, 2), t).flatten(1), problem.solution(X_0, t))
+    torch.testing.assert_close(
+        problem.solution(X_0.view(3, 2, 2, 2), t).flatten(1), problem.solution(X_0, t)
+    )
     for scene in range(3):
         torch.testing.assert_close(whole[scene], problem(t[scene], X_0[scene : scene + 1])[0])
         torch.testing.assert_close(
-            problem.solution(X_0, t)[scene], problem.solution(X_0[scene : scene + 1], t[scene].item())[0]
+            problem.solution(X_0, t)[scene],
+            problem.solution(X_0[scene : scene + 1], t[scene].item())[0],
         )
 
 

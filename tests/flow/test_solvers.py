@@ -45,10 +45,13 @@ def test_an_adaptive_method_of_equal_steps_has_its_order(method):
         return (solution.x - logistic_solution(X_0, 1)).abs().max().item()
 
     assert math.log2(error(32) / error(64)) == pytest.approx(SOLVERS[method].order, abs=0.35)
-    # Between the stages, a path is of order 4 (Hairer II.6): exact, as its slope, for a velocity t^q up to q = 3.
+    # Between the stages, a path is of order 4 (Hairer II.6): exact, as its slope, for a velocity
+    # t^q up to q = 3.
     nodes, theta = np.array([0.0, *SOLVERS[method].nodes]), np.linspace(0, 1, 9)
     exact = [[theta ** (q + 1) / (q + 1), theta**q] for q in range(4)]
-    found = [[weights.T @ nodes**q for weights in SOLVERS[method].interpolant(theta)] for q in range(4)]
+    found = [
+        [weights.T @ nodes**q for weights in SOLVERS[method].interpolant(theta)] for q in range(4)
+    ]
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-12)
 
 
@@ -58,12 +61,16 @@ def test_halving_the_steps_shrinks_the_error_by_the_order(method, grid):
     def error(steps):
         times = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
         waves = times + 0.1 * torch.sin(2 * math.pi * times)
-        end = solve(logistic, X_0, method=method, steps=steps, grid=waves if grid == "waves" else grid).x
+        end = solve(
+            logistic, X_0, method=method, steps=steps, grid=waves if grid == "waves" else grid
+        ).x
         return (end - logistic_solution(X_0, 1)).abs().max().item()
 
     few = 128 if SOLVERS[method].multistep else 16  # a multistep method has a start to get over
     steps, within = (few, 0.25) if grid == "uniform" else (2 * few, 0.3)
-    assert math.log2(error(steps) / error(2 * steps)) == pytest.approx(SOLVERS[method].order, abs=within)
+    assert math.log2(error(steps) / error(2 * steps)) == pytest.approx(
+        SOLVERS[method].order, abs=within
+    )
 
 
 @pytest.mark.parametrize("by", ["", "torchdiffeq:"])
@@ -111,8 +118,12 @@ def test_the_finish_is_one_euler_step(method):
 @pytest.mark.parametrize("method", ["dopri5", "exprb43", "torchdiffeq:bosh3"])
 def test_the_global_error_is_estimated_and_its_cost_counted(method):
     asked = {"method": method, "tolerance": 1e-4}
-    with torch.device("cpu" if method.startswith("torchdiffeq") else "meta"):  # a default device of the user's
-        plain, owned = solve(logistic, X_0, **asked), solve(logistic, X_0, **asked, global_error=True)
+    # a default device of the user's
+    with torch.device("cpu" if method.startswith("torchdiffeq") else "meta"):
+        plain, owned = (
+            solve(logistic, X_0, **asked),
+            solve(logistic, X_0, **asked, global_error=True),
+        )
     error = (owned.x - logistic_solution(X_0, 1)).square().mean(1).sqrt()
     assert torch.equal(plain.x, owned.x)
     assert plain.global_error is None
@@ -122,7 +133,9 @@ def test_the_global_error_is_estimated_and_its_cost_counted(method):
 
 
 def test_an_unknown_or_wrong_grid_is_refused():
-    assert torch.equal(solve(logistic, X_0, np.float32(0), grid=[0, 0.5, 1]).x, solve(logistic, X_0, steps=2).x)
+    assert torch.equal(
+        solve(logistic, X_0, np.float32(0), grid=[0, 0.5, 1]).x, solve(logistic, X_0, steps=2).x
+    )
     for grid in ("power", "power:0.5", "power:nan", "power:11", "start-power:2"):
         with pytest.raises(InputError, match=f"P from 1 to 10; found '{grid}'"):
             solve(logistic, X_0, grid=grid)
@@ -133,7 +146,9 @@ def test_an_unknown_or_wrong_grid_is_refused():
         solve(logistic, X_0, steps=0)
 
 
-@pytest.mark.parametrize("method", [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4", "torchdiffeq:midpoint"])
+@pytest.mark.parametrize(
+    "method", [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4", "torchdiffeq:midpoint"]
+)
 def test_backward_in_time_returns_to_the_start(method):
     end = solve(logistic, X_0, 0, 1, method, steps=256, tolerance=1e-9).x
     back = solve(logistic, end, 1, 0, method, steps=256, tolerance=1e-9).x

@@ -1,4 +1,6 @@
-"""Steps of every scene's own: fewer evaluations, no influence of other scenes, nothing outside the interval."""
+"""Steps of every scene's own: fewer evaluations, no influence of other scenes, nothing outside the
+interval.
+"""
 
 import math
 
@@ -23,7 +25,9 @@ from r2flow.noise import standard_normal
 
 
 def noise(scenes, elements=256, seed=0):
-    return torch.stack([standard_normal((elements,), seed, "evaluation", scene) for scene in range(scenes)])
+    return torch.stack(
+        [standard_normal((elements,), seed, "evaluation", scene) for scene in range(scenes)]
+    )
 
 
 def worst(x, exact):
@@ -31,12 +35,26 @@ def worst(x, exact):
 
 
 def test_a_scene_s_result_is_the_same_alone_in_any_batch_and_in_any_place():
-    problems = [Straight(), TwoModes(), RayDrop(), Gaussian(), Gaussian(std=0.01), StiffLinear(), Rotating()]
+    problems = [
+        Straight(),
+        TwoModes(),
+        RayDrop(),
+        Gaussian(),
+        Gaussian(std=0.01),
+        StiffLinear(),
+        Rotating(),
+    ]
     problems += [Discontinuous(), Pulse()]
     x_0 = noise(len(problems), 96)
     together = solve(Mixed(problems), x_0, method="dopri5", tolerance=1e-4, global_error=True)
     order = torch.tensor([3, 6, 8, 0, 5, 1, 7, 4, 2])
-    shuffled = solve(Mixed(problems).select(order), x_0[order], method="dopri5", tolerance=1e-4, global_error=True)
+    shuffled = solve(
+        Mixed(problems).select(order),
+        x_0[order],
+        method="dopri5",
+        tolerance=1e-4,
+        global_error=True,
+    )
     assert len(set(together.evaluations.tolist())) > 3
     for name in ("x", "evaluations", "accepted", "rejected", "stiff", "converged", "global_error"):
         assert torch.equal(getattr(together, name)[order], getattr(shuffled, name)), name
@@ -54,7 +72,9 @@ def test_a_scene_that_has_arrived_is_not_evaluated():
             seen.append(len(x))
             return super().__call__(t, x)
 
-    solution = solve(Watched([Straight()] * 3 + [TwoModes()]), noise(4), method="dopri5", tolerance=1e-4)
+    solution = solve(
+        Watched([Straight()] * 3 + [TwoModes()]), noise(4), method="dopri5", tolerance=1e-4
+    )
     assert seen[0] == 4
     assert seen[-1] == 1
     assert sum(seen) == solution.evaluations.sum().item()
@@ -81,9 +101,14 @@ def test_nothing_is_evaluated_outside_the_interval(method, t_0, t_1, dtype):
 
 
 def test_stiff_scenes_are_flagged_and_smooth_ones_are_not():
-    stiff, smooth = [StiffLinear(10.0**k) for k in (2, 4, 6)], [Straight(), Gaussian(), Gaussian(std=0.01), TwoModes()]
+    stiff, smooth = (
+        [StiffLinear(10.0**k) for k in (2, 4, 6)],
+        [Straight(), Gaussian(), Gaussian(std=0.01), TwoModes()],
+    )
     batch = Mixed([*stiff, *smooth, RayDrop()])
-    solution = solve(batch, noise(8).double(), method="dopri5", tolerance=1e-3, max_evaluations=3000)
+    solution = solve(
+        batch, noise(8).double(), method="dopri5", tolerance=1e-3, max_evaluations=3000
+    )
     assert solution.stiff.tolist() == [True] * 3 + [False] * 5
     assert solution.converged[0]  # where stability limits the steps
 
@@ -98,7 +123,9 @@ def test_jumps_in_time_are_located(tolerance):
     drawn = zip((0.02 + 0.96 * at).tolist(), (0.5 + 2.5 * by).tolist(), strict=True)
     jumps = Mixed([Discontinuous(jump, where) for where, jump in drawn])
     x_0 = noise(60, 16).double()
-    error = in_tolerances(solve(jumps, x_0, method="dopri5", tolerance=tolerance), jumps.solution(x_0, 1.0), tolerance)
+    error = in_tolerances(
+        solve(jumps, x_0, method="dopri5", tolerance=tolerance), jumps.solution(x_0, 1.0), tolerance
+    )
     assert error.median() < 2
     assert error.max() < 30
 
@@ -119,7 +146,9 @@ def test_a_jump_in_some_of_the_elements_is_located():
 @pytest.mark.parametrize("width", [0.16, 0.2])
 def test_no_pulse_longer_than_0_16_of_the_interval_is_missed(width):
     # v is 0 before and after: nothing else makes the steps short.
-    pulses = Mixed([Pulse(width, at) for at in torch.linspace(width / 2, 1 - width / 2, 40).tolist()])
+    pulses = Mixed(
+        [Pulse(width, at) for at in torch.linspace(width / 2, 1 - width / 2, 40).tolist()]
+    )
     for tolerance in (1e-2, 1e-4):
         x_0 = torch.zeros(40, 4, dtype=torch.float64)
         found = solve(pulses, x_0, method="dopri5", tolerance=tolerance)
@@ -138,11 +167,14 @@ def test_a_velocity_that_does_not_depend_on_x_is_not_stiff():
 
 
 def test_looking_for_pulses_and_jumps_costs_at_most_a_twentieth():
-    # Of what the steps take, and the two evaluations of a start by Hairer's rule, over the exact flows.
+    # Of what the steps take, and the two evaluations of a start by Hairer's rule, over the exact
+    # flows.
     looked = stepped = 0.0
     for name in ("straight", "gaussian", "two_modes", "ray_drop", "narrow_gaussian", "anisotropic"):
         for tolerance in (1e-3, 1e-5):
-            found = solve(PROBLEMS[name](), noise(8, 64).double(), method="dopri5", tolerance=tolerance)
+            found = solve(
+                PROBLEMS[name](), noise(8, 64).double(), method="dopri5", tolerance=tolerance
+            )
             assert name != "straight" or not found.rejected.any()
             looked += found.evaluations.sum().item()
             stepped += (2 + 6 * (found.accepted + found.rejected)).sum().item()
@@ -188,9 +220,13 @@ def test_rates_that_lie_far_apart_are_solved():
     assert found.evaluations.max() < 2000
 
 
-@pytest.mark.parametrize(("k", "t_1", "tolerance"), [(1e4, 0.1, 1e-2), (1e6, 0.02, 1e-3), (1e6, 0.1, 1e-2)])
+@pytest.mark.parametrize(
+    ("k", "t_1", "tolerance"), [(1e4, 0.1, 1e-2), (1e6, 0.02, 1e-3), (1e6, 0.1, 1e-2)]
+)
 def test_a_quadratic_remainder_has_an_error(k, t_1, tolerance):
-    """x' = 1 - k x^2 from 0, where J = 0: x = tanh(sqrt(k) t) / sqrt(k). Below -1 / sqrt(k) it runs away."""
+    """x' = 1 - k x^2 from 0, where J = 0: x = tanh(sqrt(k) t) / sqrt(k). Below -1 / sqrt(k) it runs
+    away.
+    """
     x_0 = torch.zeros(1, 1, dtype=torch.float64)
     found = solve(lambda t, x: 1 - k * x**2, x_0, 0.0, t_1, "exprb43", tolerance=tolerance)
     exact = math.tanh(math.sqrt(k) * t_1) / math.sqrt(k)
@@ -205,14 +241,20 @@ def test_the_order_is_at_least_4():
 
     x_0 = X_0[:1, :4].clone()
     exact = solve(velocity, x_0, method="dopri5", tolerance=1e-13).x
-    coarse, fine = (solve(velocity, x_0, method="exprb43", tolerance=tolerance) for tolerance in (1e-4, 1e-7))
+    coarse, fine = (
+        solve(velocity, x_0, method="exprb43", tolerance=tolerance) for tolerance in (1e-4, 1e-7)
+    )
     gained = math.log(worst(coarse.x, exact) / worst(fine.x, exact))
     assert gained / math.log(fine.accepted[0] / coarse.accepted[0]) > 3.5
-    assert solve(velocity, x_0, method="exprb43", tolerance=0.1, max_step=1 / 32).accepted.item() == 32
+    assert (
+        solve(velocity, x_0, method="exprb43", tolerance=0.1, max_step=1 / 32).accepted.item() == 32
+    )
 
 
 def test_a_scene_that_runs_away_does_not_end_its_batch():
-    """Robertson's reactions to t = 40 at a tolerance above their smallest component, beside the same in balance."""
+    """Robertson's reactions to t = 40 at a tolerance above their smallest component, beside the
+    same in balance.
+    """
 
     def reactions(t, x):
         a, b, c = x.unbind(-1)

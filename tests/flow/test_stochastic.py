@@ -1,4 +1,6 @@
-"""Samplers with fresh noise on the way, against closed forms: they draw the same scans, along other paths."""
+"""Samplers with fresh noise on the way, against closed forms: they draw the same scans, along other
+paths.
+"""
 
 import math
 from itertools import pairwise
@@ -34,7 +36,9 @@ def variance(t: float) -> float:
 
 
 def variances(steps: int, c: float, grid: str = "power:2") -> list[float]:
-    """Var x_t after each step, exactly: of a linear method, the squares of what each draw of noise becomes."""
+    """Var x_t after each step, exactly: of a linear method, the squares of what each draw of noise
+    becomes.
+    """
     units = torch.eye(steps + 1, dtype=torch.float64)[:, :, None]
     states = sde(estimate, units[0], times(steps, grid), c, lambda j: units[j])
     return [float(x.square().sum()) for x in states]
@@ -44,7 +48,8 @@ def variances(steps: int, c: float, grid: str = "power:2") -> list[float]:
 def test_at_any_share_of_fresh_noise_the_law_of_x_t_is_the_flow_s_and_its_error_of_order_2(c):
     errors = []
     for steps in (40, 80, 160):
-        grid = times(steps).tolist()[1:-1]  # the last step is Euler's, of a length that shrinks as its square
+        # the last step is Euler's, of a length that shrinks as its square
+        grid = times(steps).tolist()[1:-1]
         found = variances(steps, c)
         errors.append(max(abs(v / variance(t) - 1) for t, v in zip(grid, found[:-1], strict=True)))
         assert found[-1] == pytest.approx(STD**2, rel=2 * errors[-1] + 2e-3)
@@ -54,7 +59,9 @@ def test_at_any_share_of_fresh_noise_the_law_of_x_t_is_the_flow_s_and_its_error_
 
 @pytest.mark.parametrize("c", [0.0, 1.0, 2.5])
 def test_a_step_is_exact_where_the_estimate_is_linear_in_time(c):
-    """Against the mean's own equation, dx/dt = (D - x) / (1 - t) - c (x - t D) / (t (1 - t)), by scipy."""
+    """Against the mean's own equation, dx/dt = (D - x) / (1 - t) - c (x - t D) / (t (1 - t)), by
+    scipy.
+    """
     t_b, t, s, a, b, x = 0.1, 0.35, 0.8, 0.7, -1.9, 0.3
     step = sde_step(t, s, c, t_b)
 
@@ -63,7 +70,9 @@ def test_a_step_is_exact_where_the_estimate_is_linear_in_time(c):
         return (end - x) / (1 - t) - c * (x - t * end) / (t * (1 - t))
 
     expected = solve_ivp(slope, (t, s), [x], rtol=1e-11, atol=1e-12).y[0, -1]
-    assert step.keep * x + step.now * (a + b * t) + step.before * (a + b * t_b) == pytest.approx(expected, abs=1e-9)
+    assert step.keep * x + step.now * (a + b * t) + step.before * (a + b * t_b) == pytest.approx(
+        expected, abs=1e-9
+    )
 
 
 def test_the_first_step_is_euler_s_and_the_last_one_goes_to_the_estimate():
@@ -75,11 +84,15 @@ def test_the_first_step_is_euler_s_and_the_last_one_goes_to_the_estimate():
 def test_going_back_by_fresh_noise_keeps_the_law(r):
     units, s = torch.eye(2, dtype=torch.float64)[:, :, None], 0.55
     there = math.sqrt(variance(r)) * units[0]  # the flow map of a Gaussian scales its deviation
-    assert float(back(there, r, s, units[1]).square().sum()) == pytest.approx(variance(s), rel=1e-12)
+    assert float(back(there, r, s, units[1]).square().sum()) == pytest.approx(
+        variance(s), rel=1e-12
+    )
 
 
 def normal() -> Field:
-    return Field(lambda t, x: (estimate(t, x) - x) / (1 - t), (2, 8, 32), build_generator(CONFIG).space)
+    return Field(
+        lambda t, x: (estimate(t, x) - x) / (1 - t), (2, 8, 32), build_generator(CONFIG).space
+    )
 
 
 @pytest.mark.parametrize("method", ["sde", "sde:churn=3"])
@@ -88,7 +101,8 @@ def test_a_flow_draws_the_data_s_distribution(method):
     how = build_sampler(method, steps=32, grid="power:2", finish=1 / 64)
     made = flow(who.start(flow.noise_shape), sampler=how, draws=who)
     count = made.x.numel()  # 24,576 values
-    # Of an Euler step over 1/64 the deviation lacks (1/64)^2 / (2 STD^2), the rest is the steps' error of order 2.
+    # Of an Euler step over 1/64 the deviation lacks (1/64)^2 / (2 STD^2), the rest is the steps'
+    # error of order 2.
     assert float(made.x.std()) == pytest.approx(STD, abs=5 * STD / (2 * count) ** 0.5 + 0.004)
     assert float(made.x.mean()) == pytest.approx(0, abs=5 * STD / count**0.5)
     assert made.evaluations.tolist() == [32] * 48
@@ -109,14 +123,18 @@ def test_another_sampler_has_its_own_defaults_and_the_number_of_steps():
     assert flow.sampler == USUAL
     assert flow.choose("sde") == build_sampler("sde", steps=16, grid="power:2.5", finish=1 / 128)
     assert flow.choose("dopri5") == build_sampler("dopri5")
-    assert flow.choose("adams3", steps=8) == build_sampler("adams3", steps=8, grid="power:1.5", finish=1 / 32)
+    assert flow.choose("adams3", steps=8) == build_sampler(
+        "adams3", steps=8, grid="power:1.5", finish=1 / 32
+    )
     assert flow.choose("euler", grid=(0.0, 0.5, 1.0), steps=None).times().tolist() == [0, 0.5, 1]
-    assert type("Own", (SDE,), {})(steps=9).text.startswith("Own:steps=9:")  # one that is not registered
+    # one that is not registered
+    assert type("Own", (SDE,), {})(steps=9).text.startswith("Own:steps=9:")
 
 
 @pytest.mark.parametrize("method", ["sde", "mmps", "repaint:repeats=2"])
 def test_a_part_has_the_noise_of_the_whole(method):
-    flow, how = build_generator(CONFIG).eval(), build_sampler(method, steps=3)  # untrained: no ray sees another
+    # untrained: no ray sees another
+    flow, how = build_generator(CONFIG).eval(), build_sampler(method, steps=3)
     region, who = Region((8, 32), 0, 8, 8, 16), Draws(5, [0])
     x_0 = who.start(flow.noise_shape)
     known = torch.zeros_like(x_0)
@@ -133,4 +151,6 @@ def test_without_fresh_noise_mmps_needs_no_draws():
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
     told = {"image": 0.3 * known, "known": known}
-    assert flow(x_0, told, sampler=build_sampler("mmps", products=1, churn=0, steps=2)).converged.all()
+    assert flow(
+        x_0, told, sampler=build_sampler("mmps", products=1, churn=0, steps=2)
+    ).converged.all()

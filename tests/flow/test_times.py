@@ -39,11 +39,14 @@ def test_the_discrete_density_takes_each_of_its_times_equally_often():
         values, counts = Discrete(k)(U).unique(return_counts=True)
         assert values.tolist() == [i / k for i in range(k)]
         assert (counts / N - 1 / k).abs().max() < 1e-5
-    assert Discrete(4, "power:2")(U).unique().tolist() == pytest.approx([0, 7 / 16, 12 / 16, 15 / 16])
+    assert Discrete(4, "power:2")(U).unique().tolist() == pytest.approx(
+        [0, 7 / 16, 12 / 16, 15 / 16]
+    )
 
 
 @pytest.mark.parametrize(
-    "options", [{"name": n} for n in ("uniform", "u_shaped", "logit_normal")] + [{"name": "discrete", "k": 4}]
+    "options",
+    [{"name": n} for n in ("uniform", "u_shaped", "logit_normal")] + [{"name": "discrete", "k": 4}],
 )
 def test_times_stay_on_the_path_in_float32(options):
     last = torch.tensor([0.0, 0.5, math.nextafter(0.5, 0), 1 - 2**-24], dtype=torch.float32)
@@ -54,7 +57,9 @@ def test_times_stay_on_the_path_in_float32(options):
         assert (t < 1).all()
 
 
-@pytest.mark.parametrize("density", [lambda u: 1.1 * u, lambda u: u - 0.1, lambda u: u[:1], lambda u: 0.5])
+@pytest.mark.parametrize(
+    "density", [lambda u: 1.1 * u, lambda u: u - 0.1, lambda u: u[:1], lambda u: 0.5]
+)
 def test_a_density_that_is_no_inverse_cdf_is_refused(monkeypatch, density):
     monkeypatch.setitem(TIMES._entries, "mine", lambda: density)
     with pytest.raises(InputError, match=r"'mine' must map u in \[0, 1\)"):

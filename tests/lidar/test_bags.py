@@ -70,7 +70,9 @@ def record(
     kind: str = "cloud",
     stamps: tuple[int, ...] = (1, 2, 3),
 ) -> Path:
-    """A recording of the three clouds in each topic, the last without header.stamp; the file that a user would name."""
+    """A recording of the three clouds in each topic, the last without header.stamp; the file that a
+    user would name.
+    """
     one = storage == "bag"
     store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
     writer = (

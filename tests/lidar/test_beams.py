@@ -27,7 +27,9 @@ HEIGHT, WALL = 1.6, 25.0
 
 
 def street(sensor: Sensor, seed: int) -> np.ndarray:
-    """Ground HEIGHT below the sensor and a round wall about it, with holes: range and reflectance, (2, H, W)."""
+    """Ground HEIGHT below the sensor and a round wall about it, with holes: range and reflectance,
+    (2, H, W).
+    """
     draw = np.random.default_rng(seed)
     e = sensor.rays().numpy().astype(np.float64)[0]
     ground = np.where(e < 0, HEIGHT / np.sin(np.maximum(-e, 1e-9)), np.inf)
@@ -170,8 +172,8 @@ def real(shared, pattern: str, step: int = 1, most: int | None = None) -> list[P
 @pytest.mark.parametrize(
     ("scans", "step", "name", "order", "off", "steps"),
     [
-        # Another car each, whose rings differ. 1.3 million shots a second of 64 lasers, 10 turns a second: 2,083 steps,
-        # which the turns' speed makes 2,000 to 2,200.
+        # Another car each, whose rings differ. 1.3 million shots a second of 64 lasers, 10 turns a
+        # second: 2,083 steps, which the turns' speed makes 2,000 to 2,200.
         ("kitti360/**/*.bin", 5, "hdl64e_rings", RING_AFTER_RING, 0.25, 2100),
         ("raw/**/*.bin", 10, "hdl64e_rings", RING_AFTER_RING, 0.25, 2100),
         ("odometry/**/*.bin", 1, "hdl64e_rings", RING_AFTER_RING, 0.25, 2100),
@@ -247,7 +249,8 @@ SIZED = {
     "vlp16 8x128": SENSORS["vlp16"].resized(8, 128),
     "pandar64 32x512": SENSORS["pandar64"].resized(32, 512),
 }
-# Real scans: how many are looked at, and whose they are. Alone, each of KITTI's calibrations must do.
+# Real scans: how many are looked at, and whose they are. Alone, each of KITTI's calibrations must
+# do.
 REAL = {
     "kitti360/**/*.bin": (3, "hdl64e"),
     "raw/**/*0005*/**/*.bin": (3, "hdl64e"),
@@ -393,7 +396,9 @@ def test_rows_between_the_beams_of_ones_own_sensor_are_no_other_sensors(tmp_path
 
 
 def without_beams(pattern: str) -> Points:
-    """The ground and a wall, seen by scanners whose pattern does not repeat: two sweeps whose rates have no ratio."""
+    """The ground and a wall, seen by scanners whose pattern does not repeat: two sweeps whose rates
+    have no ratio.
+    """
     t, turn = np.linspace(0, 1, 60_000), 2 * np.pi
     if pattern == "turning":  # all around, up and down
         azimuth, elevation = turn * 431.7 * t, np.radians(22.5 + 29.5 * np.sin(turn * 1093.37 * t))

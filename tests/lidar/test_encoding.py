@@ -31,7 +31,8 @@ def test_encode_then_decode_is_exact_to_a_millimetre_or_to_float32(sensor, forma
     assert x.shape == (1, encoding.channels, *sensor.shape)
     assert x.abs().max() <= 1
     decoded = encoding.decode(x)[0]
-    # x in float32 tells y = r_min / r apart to 2^-26, hence r to r^2 / r_min of that: 2 mm at the pandar64's 200 m.
+    # x in float32 tells y = r_min / r apart to 2^-26, hence r to r^2 / r_min of that: 2 mm at the
+    # pandar64's 200 m.
     held = (
         image[0] ** 2 / sensor.min_range * 2**-26 + 1e-4
         if format.startswith("inverse")

@@ -230,7 +230,9 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
 
 
 def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):
-    """VeloView's numbers of lasers, a sign of degrees in the header, and no numbers in the row of a lost ray."""
+    """VeloView's numbers of lasers, a sign of degrees in the header, and no numbers in the row of a
+    lost ray.
+    """
     table = zip(XYZ, INTENSITY, RING, strict=True)
     rows = "\n".join(
         f"{x:.3f},{y:.3f},{z:.3f},{strength},{ring},0" for (x, y, z), strength, ring in table

@@ -97,7 +97,9 @@ def test_interpolation_keeps_what_is_measured_and_fills_the_rest(rule):
 
 @pytest.mark.parametrize("rule", ["linear", "inverse"])
 def test_interpolation_follows_columns_and_then_the_ring(rule):
-    """Against numpy.interp, where every ray returns: between the known rows of a column, else around its row."""
+    """Against numpy.interp, where every ray returns: between the known rows of a column, else
+    around its row.
+    """
     random = draws(3)
     image = np.stack([random.uniform(2, 80, SHAPE), random.random(SHAPE)]).astype(np.float32)
     measured = parse_mask("random:0.5+sector:150,-150")(WHOLE, draws(4))

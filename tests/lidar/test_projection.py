@@ -77,7 +77,9 @@ def test_a_return_too_near_does_not_hide_what_is_behind_it():
 @pytest.mark.parametrize("convention", ["centre", "reference", "lidargen", "lidm"])
 @pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
 def test_points_that_are_not_finite_are_no_returns(convention, lost):
-    """Neither in their own pixel nor in one that another point falls into, as the one at azimuth and elevation 0."""
+    """Neither in their own pixel nor in one that another point falls into, as the one at azimuth
+    and elevation 0.
+    """
     xyz = np.array([[10, 0, 0], [3, -4, 0.1], [-8, 1, -1]], dtype=np.float32)
     with_lost = np.concatenate([xyz, [[lost, 0, 0], [1, lost, 2], [lost, lost, lost]]]).astype(
         np.float32
@@ -166,7 +168,9 @@ def test_a_point_near_an_edge_of_a_bin_is_in_its_pixel(sensor, share):
 
 
 def cloud(sensor: Sensor, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a random image, (W, H, 3), a firing after the other, each from the top; a fifth without return."""
+    """Points of a random image, (W, H, 3), a firing after the other, each from the top; a fifth
+    without return.
+    """
     image = random_image(sensor, seed)[0]
     e, a = sensor.rays().numpy()
     xyz = np.stack(

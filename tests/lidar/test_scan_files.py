@@ -45,7 +45,8 @@ def test_pcd_ascii_in_any_order_and_case_with_other_fields(tmp_path):
 def test_pcd_binary_of_mixed_types_with_a_field_of_several_numbers(tmp_path):
     # Padding fields share the name "_" in PCL's own files.
     header = (
-        "VERSION .7\nFIELDS _ x y z _ intensity normal ring\nSIZE 1 8 4 4 1 1 4 1\nTYPE U F F F U U F I\n"
+        "VERSION .7\nFIELDS _ x y z _ intensity normal ring\nSIZE 1 8 4 4 1 1 4 1\nTYPE U F F F U "
+        "U F I\n"
         "COUNT 3 1 1 1 2 1 3 1\nWIDTH 1\nHEIGHT 3\nPOINTS 3\nDATA binary\n"
     )
     rows = [
@@ -95,8 +96,10 @@ def test_ply_ascii_before_other_elements(tmp_path):
 def test_ply_binary_in_both_byte_orders_before_other_elements(tmp_path, order, name):
     header = (
         f"ply\nformat binary_{name}_endian 1.0\nelement vertex 3\n"
-        "property uchar red\nproperty float x\nproperty double y\nproperty float32 z\nproperty ushort ring\n"
-        "property uint8 reflectance\nelement pose 2\nproperty short p\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "property uchar red\nproperty float x\nproperty double y\nproperty float32 z\nproperty "
+        "ushort ring\n"
+        "property uint8 reflectance\nelement pose 2\nproperty short p\nelement face 1\nproperty "
+        "list uchar int vertex_indices\nend_header\n"
     )
     rows = [struct.pack(order + "BfdfHB", 9, *row[:3], row[4], int(row[3] * 2)) for row in ROWS]
     body = b"".join(rows) + struct.pack(order + "hhB3i", 1, 2, 3, 0, 1, 2)

@@ -17,7 +17,8 @@ from tests.conftest import memory_below
 # A reader that warns has met something it was not made for.
 pytestmark = pytest.mark.filterwarnings("error")
 
-COUNT = 64  # small, so that every cut and every header bit can be tried; 16 divides 20 COUNT and 12 COUNT
+# small, so that every cut and every header bit can be tried; 16 divides 20 COUNT and 12 COUNT
+COUNT = 64
 RNG = np.random.default_rng(7)
 XYZ = np.round(RNG.standard_normal((COUNT, 3)) * [20, 20, 2], 2).astype(np.float32)
 REFLECTANCE = np.round(RNG.random(COUNT), 2).astype(np.float32)
@@ -72,7 +73,9 @@ def compressed(plain: bytes) -> bytes:
 
 
 def read(path: Path) -> Points | None:
-    """The points, checked for what every caller relies on, or None when the file was refused as it should be."""
+    """The points, checked for what every caller relies on, or None when the file was refused as it
+    should be.
+    """
     began, points, refusal = time.perf_counter(), None, ""
     try:
         points = read_points(path)
@@ -232,7 +235,8 @@ def declarations() -> dict[str, tuple[str, bytes]]:
         files |= {
             kind: ("ply", PLY.format(HUGE, kind, "").encode() + ROWS_OF_3["binary"]),
             f"{kind} lists": ("ply", PLY.format(HUGE, kind, long_list).encode() + b"\x7f" * 999),
-            f"{kind} negative list": ("ply", PLY.format(9, kind, long_list).encode() + b"\xff" * 999),
+            f"{kind} negative "
+            "list": ("ply", PLY.format(9, kind, long_list).encode() + b"\xff" * 999),
             f"{kind} empty element": (
                 "ply", PLY.format(HUGE, kind, "").replace("element vertex", empty).encode() + bytes(99)
             ),

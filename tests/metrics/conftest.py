@@ -19,7 +19,9 @@ SMALL = SENSORS["hdl64e"].resized(8, 32)
 
 
 class Summary(Extractor):
-    """Six plain averages of a scan instead of a network: each metric of features can be built on it."""
+    """Six plain averages of a scan instead of a network: each metric of features can be built on
+    it.
+    """
 
     layer = "averages"
     dim = 6
@@ -33,7 +35,9 @@ class Summary(Extractor):
         r = scans.images[:, 0]
         quarters = r.unflatten(2, (4, -1)).mean((1, 3))
         both = torch.stack([r.amax((1, 2)), scans.returned.float().mean((1, 2, 3))], 1)
-        return torch.where(scans.returned.flatten(1).any(1)[:, None], torch.cat([quarters, both], 1), torch.nan)
+        return torch.where(
+            scans.returned.flatten(1).any(1)[:, None], torch.cat([quarters, both], 1), torch.nan
+        )
 
 
 def untrained(network: type[Extractor], seed: int = 0) -> Extractor:
@@ -57,7 +61,9 @@ def one_of_each_class() -> list[str]:
 def scans_of(n: int, seed: int = 0, scale: float = 40.0, sensor: Sensor = SMALL) -> Scans:
     """Random scans, (n, 2, H, W): as far as `scale` metres, decided by a seed."""
     g = torch.Generator().manual_seed(seed)
-    r = 4 + scale * torch.rand(n, 1, *sensor.shape, generator=g) * torch.rand(n, 1, 1, 1, generator=g)
+    r = 4 + scale * torch.rand(n, 1, *sensor.shape, generator=g) * torch.rand(
+        n, 1, 1, 1, generator=g
+    )
     r = r * (torch.rand(n, 1, *sensor.shape, generator=g) < 0.8)
     return Scans(torch.cat([r, torch.rand(r.shape, generator=g) * (r > 0)], 1), sensor)
 

@@ -19,7 +19,8 @@ def test_reference_figures(shared):
     seen = np.stack([birds_eye_histogram(points.numpy()) for points in case["point_clouds"]])
     np.testing.assert_array_equal(seen, case["hists"])
     real, generated = seen[:12].astype(float), seen[12:].astype(float)
-    assert given(JSD(), real, generated)["jsd"] == pytest.approx(case["jsd"], rel=1e-7)  # made of float32 histograms
+    # made of float32 histograms
+    assert given(JSD(), real, generated)["jsd"] == pytest.approx(case["jsd"], rel=1e-7)
     assert given(MMD(), real, generated)["mmd"] == pytest.approx(case["mmd_float64"], rel=1e-10)
     assert given(JSD(), real, real)["jsd"] == case["jsd_same"]
     assert given(MMD(), real, real)["mmd"] == pytest.approx(case["mmd_same"], abs=1e-15)
@@ -30,7 +31,8 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
     p = counts.reshape(17, -1) / counts.sum((1, 2))[:, None]
 
     def mean(a, b):
-        return np.mean([math.exp(-2 * ((x - y) ** 2).sum()) for x, y in product(a, b)])  # 1 / (2 sigma^2) = 2
+        # 1 / (2 sigma^2) = 2
+        return np.mean([math.exp(-2 * ((x - y) ** 2).sum()) for x, y in product(a, b)])
 
     expected = mean(p[:10], p[:10]) + mean(p[10:], p[10:]) - 2 * mean(p[:10], p[10:])
 
@@ -60,7 +62,9 @@ def test_jsd_of_the_other_toolbox_counts_scans_that_hold_a_cell():
     for a, b in ((p, q), (q, p)):
         divergence += sum(x * math.log(2 * x / (x + b.get(cell, 0))) for cell, x in a.items()) / 2
     assert 0.01 < divergence < 0.69
-    assert measured(JSDLiDM(), real, generated).compute()["jsd_lidm"] == pytest.approx(math.sqrt(divergence), rel=1e-9)
+    assert measured(JSDLiDM(), real, generated).compute()["jsd_lidm"] == pytest.approx(
+        math.sqrt(divergence), rel=1e-9
+    )
 
 
 def test_mmd_of_the_other_toolbox_is_the_mean_distance_to_the_best_match(monkeypatch):
@@ -71,9 +75,14 @@ def test_mmd_of_the_other_toolbox_is_the_mean_distance_to_the_best_match(monkeyp
         d = ((a[:, None] - b) ** 2).sum(-1)
         return (d.min(0).mean() + d.min(1).mean()) / 2
 
-    sets = [[np.array(sorted(cells(p.numpy(), 0.5))) / 200 for p in side.points] for side in (real, generated)]
+    sets = [
+        [np.array(sorted(cells(p.numpy(), 0.5))) / 200 for p in side.points]
+        for side in (real, generated)
+    ]
     expected = np.mean([min(chamfer(a, b) for b in sets[1]) for a in sets[0]])
-    assert measured(MMDLiDM(), real, generated).compute()["mmd_lidm"] == pytest.approx(expected, rel=1e-6)
+    assert measured(MMDLiDM(), real, generated).compute()["mmd_lidm"] == pytest.approx(
+        expected, rel=1e-6
+    )
     assert measured(MMDLiDM(), real, real).compute()["mmd_lidm"] == 0
 
 

@@ -26,7 +26,8 @@ def test_every_figure_of_a_case_worked_out_by_hand():
     assert found["mae_m"] == pytest.approx((2 + 0) / 2)
     assert found["drop_wrong"] == pytest.approx(2 / 4)
     assert found["reflectance_mae"] == pytest.approx(0.25)
-    # By 10 m and rays 90 degrees and 14 degrees apart, five points agree and two differ on either side.
+    # By 10 m and rays 90 degrees and 14 degrees apart, five points agree and two differ on either
+    # side.
     assert found["iou"] == pytest.approx(5 / 9)
     apart = 2 * 10 * math.sin(math.radians(14) / 2)  # of two rows at 10 m
     # Truth's (0, 2) is 2 m from the answer's, its (1, 2) a row or the moved point away.
@@ -42,7 +43,8 @@ def test_an_empty_scan_has_no_figures_that_do_not_exist():
     found = errors(empty, empty, hidden, SENSOR)
     assert found.pop("drop_wrong") == found.pop("mae_all_m") == 0
     assert all(map(math.isnan, found.values()))
-    found = errors(scan([[10] * 4] * 2), empty, hidden, SENSOR)  # far away: means would leave NaN out
+    # far away: means would leave NaN out
+    found = errors(scan([[10] * 4] * 2), empty, hidden, SENSOR)
     assert (found["iou"], found["chamfer_m"], found["chamfer_m2"]) == (0, math.inf, math.inf)
 
 
@@ -60,6 +62,8 @@ def test_coverage_is_nominal_where_the_truth_is_one_more_answer(dropped):
 
 def test_answers_without_spread_have_the_crps_of_their_error():
     answers = np.full((4, 1, 2, 2), 12.0, dtype=np.float32)
-    found = spread_errors(np.full((1, 2, 2), 10.0, dtype=np.float32), answers, np.ones((2, 2), dtype=bool))
+    found = spread_errors(
+        np.full((1, 2, 2), 10.0, dtype=np.float32), answers, np.ones((2, 2), dtype=bool)
+    )
     assert found["crps_m"] == found["mae_of_median_m"] == 2
     assert found["coverage"] == 0

@@ -27,15 +27,20 @@ def test_features_are_of_each_scan_alone(name):
     images[3, 0, 8, 7] = 10
     features = network.features(Scans(images, SMALL))
     assert features.shape == (4, network.dim)
-    assert features.isfinite().all(1).tolist() == [True, False, True, True]  # also of a single return
+    # also of a single return
+    assert features.isfinite().all(1).tolist() == [True, False, True, True]
     assert features[1].isnan().all()
-    torch.testing.assert_close(features[2:], network.features(Scans(images[2:], SMALL)), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        features[2:], network.features(Scans(images[2:], SMALL)), rtol=1e-5, atol=1e-5
+    )
     assert not features.requires_grad
     darker = images * torch.tensor([1.0, 0.5]).view(1, 2, 1, 1)
     if network.needs_reflectance:
         assert (network.features(Scans(darker, SMALL))[0] != features[0]).any()
     else:
-        torch.testing.assert_close(network.features(Scans(images[:, :1], SMALL)), features, equal_nan=True)
+        torch.testing.assert_close(
+            network.features(Scans(images[:, :1], SMALL)), features, equal_nan=True
+        )
 
 
 @torch.inference_mode()
@@ -55,7 +60,9 @@ def test_a_dropped_ray_is_the_origin_in_units_of_80_m():
     batch = Scans(images, SMALL)
     points = torch.cat([batch.points[0], torch.zeros(1, 3)]).T[None] / 80
     order = torch.randperm(points.shape[2])
-    torch.testing.assert_close(network.features(batch), network(points[:, :, order]), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        network.features(batch), network(points[:, :, order]), rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.fixture(scope="module")
@@ -85,16 +92,23 @@ def test_rangenet21_is_the_reference(shared):
 
 
 def test_the_published_depth_is_bands_of_rows(network):
-    maps = torch.arange(64.0).view(1, 1, 64, 1).expand(1, 2, 64, 32) * torch.tensor([1.0, -1.0]).view(1, 2, 1, 1)
+    maps = torch.arange(64.0).view(1, 1, 64, 1).expand(1, 2, 64, 32) * torch.tensor(
+        [1.0, -1.0]
+    ).view(1, 2, 1, 1)
     rows = torch.arange(16.0) * 4 + 1.5  # mean of rows 4 i .. 4 i + 3
     torch.testing.assert_close(network.pool(maps), torch.cat([rows, -rows])[None])
 
 
-@pytest.mark.parametrize(("cls", "blocks"), [(RangeNet21, (1, 1, 2, 2, 1)), (RangeNet53, (1, 2, 8, 8, 4))])
+@pytest.mark.parametrize(
+    ("cls", "blocks"), [(RangeNet21, (1, 1, 2, 2, 1)), (RangeNet53, (1, 2, 8, 8, 4))]
+)
 def test_names_of_the_original_release_are_ours(cls, blocks):
     with torch.device("meta"):
         network = cls(num_classes=20)
-    assert tuple(len(network.get_submodule(f"enc{level}.residual_blocks")) for level in range(1, 6)) == blocks
+    assert (
+        tuple(len(network.get_submodule(f"enc{level}.residual_blocks")) for level in range(1, 6))
+        == blocks
+    )
     ours = set(network.state_dict())
     assert {translate(name) for name in ours} == ours
     for theirs, name in {
@@ -113,7 +127,9 @@ def test_names_of_the_original_release_are_ours(cls, blocks):
 
 
 def test_weights_bring_their_classes(network):
-    tensors = {name: tensor for name, tensor in network.state_dict().items() if not name.startswith("head")}
+    tensors = {
+        name: tensor for name, tensor in network.state_dict().items() if not name.startswith("head")
+    }
     assert RangeNet21.from_tensors(tensors).head is None
     with pytest.raises(InputError, match="not the weights of rangenet21.*stem.0.weight"):
         RangeNet21.from_tensors({name: t for name, t in tensors.items() if name != "stem.0.weight"})
@@ -121,7 +137,9 @@ def test_weights_bring_their_classes(network):
 
 def test_ranges_are_normalised_where_there_is_a_return(network):
     image = torch.tensor([12.12, 10.88 + 11.47, 0.23, 0.0]).view(1, 4, 1, 1)
-    torch.testing.assert_close(network.normalise(image).flatten(), torch.tensor([0, 1, 0, 1.04 / 0.86]))
+    torch.testing.assert_close(
+        network.normalise(image).flatten(), torch.tensor([0, 1, 0, 1.04 / 0.86])
+    )
     assert not network.normalise(image * 0).any()
 
 
@@ -137,7 +155,9 @@ def test_voxels_and_their_pooling_are_the_reference_s(shared):
     torch.testing.assert_close(coords, case["voxel_coords"], rtol=0, atol=0)
     torch.testing.assert_close(features, case["voxel_feats"], rtol=1e-4, atol=1e-4)
     features = case["post_features_in"]
-    torch.testing.assert_close(mean_by_distance(features, coords)[None], case["post_depth"], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        mean_by_distance(features, coords)[None], case["post_depth"], rtol=1e-4, atol=1e-4
+    )
 
 
 def test_voxels_by_hand():
@@ -161,7 +181,8 @@ def test_sectors_by_hand():
 @pytest.mark.parametrize("cls", [MinkowskiNet, SPVCNN])
 def test_sizes_are_read_off_the_weights(cls):
     saved = cls((2, 3, 4, 5, 6, 7, 8, 9, 10), num_classes=11).state_dict()
-    loaded = cls.from_tensors({**saved, "criterion.weight": torch.ones(11)})  # and what the loss left there
+    # and what the loss left there
+    loaded = cls.from_tensors({**saved, "criterion.weight": torch.ones(11)})
     assert loaded.dim == 160
     assert all(torch.equal(value, saved[name]) for name, value in loaded.state_dict().items())
     assert not any(module.training for module in loaded.modules())

@@ -7,7 +7,9 @@ from r2flow.metrics.extractors.voxels import SPVCNN, MinkowskiNet
 
 
 def occupied(size: int, share: float) -> tuple[torch.Tensor, ...]:
-    """Voxels of a random cube in a random order, (N, 3), and whether each place is one, (1, 1, size^3)."""
+    """Voxels of a random cube in a random order, (N, 3), and whether each place is one, (1, 1,
+    size^3).
+    """
     mask = torch.rand(size, size, size) < share
     coords = mask.nonzero()
     return coords[torch.randperm(len(coords))], mask[None, None].double()
@@ -26,7 +28,9 @@ def at(dense: torch.Tensor, coords: torch.Tensor) -> torch.Tensor:
 
 
 class Dense:
-    """The sparse U-Nets once more, on dense cubes: everything outside the voxels is put to 0 after each layer."""
+    """The sparse U-Nets once more, on dense cubes: everything outside the voxels is put to 0 after
+    each layer.
+    """
 
     def __init__(self, network: MinkowskiNet, coords: torch.Tensor, mask: torch.Tensor) -> None:
         self.network, self.coords = network, coords
@@ -37,13 +41,19 @@ class Dense:
             if isinstance(module, SparseConv3d) and module.size == 1:
                 x = torch.einsum("bcxyz,co->boxyz", x, module.kernel)
             elif isinstance(module, SparseConv3d):
-                # (C_out, C_in, x, y, z) of (K, C_in, C_out): torchsparse counts x fastest in odd kernels, z in even
+                # (C_out, C_in, x, y, z) of (K, C_in, C_out): torchsparse counts x fastest in odd
+                # kernels, z in even
                 cube = module.kernel.view(*[module.size] * 3, *module.kernel.shape[1:])
                 weight = cube.permute((4, 3, 2, 1, 0) if module.size % 2 else (4, 3, 0, 1, 2))
                 if module.transposed:
                     x = F.conv_transpose3d(x, weight.transpose(0, 1), stride=2)
                 else:
-                    x = F.conv3d(x, weight, stride=2 if module.size == 2 else 1, padding=1 if module.size == 3 else 0)
+                    x = F.conv3d(
+                        x,
+                        weight,
+                        stride=2 if module.size == 2 else 1,
+                        padding=1 if module.size == 3 else 0,
+                    )
             elif isinstance(module, nn.BatchNorm1d):
                 parameters = (module.running_mean, module.running_var, module.weight, module.bias)
                 x = F.batch_norm(x, *parameters, eps=module.eps)
@@ -70,11 +80,15 @@ class Dense:
         return self.residuals(list(blocks), torch.cat([x, kept], 1), 4 - number)
 
     def to_points(self, x: torch.Tensor, level: int) -> torch.Tensor:
-        """The eight voxels from a point's own on, by the share of the way to each, as far as they exist."""
+        """The eight voxels from a point's own on, by the share of the way to each, as far as they
+        exist.
+        """
         mask = self.masks[level]
         grid = 2 * self.coords.flip(1) / 2**level / (mask.shape[2] - 1) - 1  # -1 to 1, z first
         held = torch.cat([x, mask], 1)
-        there = F.grid_sample(held, grid[None, None, None].double(), align_corners=True)[0, :, 0, 0].T
+        there = F.grid_sample(held, grid[None, None, None].double(), align_corners=True)[
+            0, :, 0, 0
+        ].T
         return there[:, :-1] / there[:, -1:]
 
     def to_voxels(self, points: torch.Tensor, level: int) -> torch.Tensor:
@@ -116,7 +130,8 @@ def test_spvcnn_is_its_dense_self():
     y = dense.up(3, dense.to_voxels(points, 2), maps[1])
     y = dense.up(4, y, maps[0])
     expected = at(y, coords) + network.point_transforms[2](points)
-    # 1e-8 is added to the sum of the eight weights, as torchsparse does, and weights are float32 there.
+    # 1e-8 is added to the sum of the eight weights, as torchsparse does, and weights are float32
+    # there.
     torch.testing.assert_close(network(coords, x), expected, rtol=0, atol=1e-6)
 
 
@@ -140,4 +155,6 @@ def test_parameters_have_torchsparse_s_names_and_shapes():
     }.items():
         assert shapes[name] == shape
     assert "stage1.1.downsample.0.kernel" not in shapes  # 16 to 16: nothing to change
-    assert {name for name in shapes if not name.startswith("point_transforms.")} == set(MinkowskiNet().state_dict())
+    assert {name for name in shapes if not name.startswith("point_transforms.")} == set(
+        MinkowskiNet().state_dict()
+    )

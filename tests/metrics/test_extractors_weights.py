@@ -43,7 +43,9 @@ def saved(content) -> bytes:
 
 def pack(folder, kind):
     """The release's files as a folder or a .tar.gz, one folder deep as they are published."""
-    files = {name: saved(content) for name, content in PARTS.items()} | {"arch_cfg.yaml": b"date: 2020-01-01"}
+    files = {name: saved(content) for name, content in PARTS.items()} | {
+        "arch_cfg.yaml": b"date: 2020-01-01"
+    }
     if kind == "folder":
         for name, data in files.items():
             (folder / name).write_bytes(data)
@@ -61,12 +63,18 @@ def pack(folder, kind):
 
 
 def test_every_network_says_where_its_weights_are_got(folder):
-    assert set(SOURCES) == {"rangenet53", "rangenet21", "pointnet", "minkowskinet", "spvcnn"} <= set(EXTRACTORS)
+    assert (
+        set(SOURCES)
+        == {"rangenet53", "rangenet21", "pointnet", "minkowskinet", "spvcnn"}
+        <= set(EXTRACTORS)
+    )
     for name, page in SOURCES.items():
         assert page.startswith("http")
         assert kept(name) is None
         assert EXTRACTORS[name].name == name
-        with pytest.raises(InputError, match=f"no weights of {name} in {folder}.*r2flow info --add {name} FILE"):
+        with pytest.raises(
+            InputError, match=f"no weights of {name} in {folder}.*r2flow info --add {name} FILE"
+        ):
             EXTRACTORS[name].trained()
     with pytest.raises(InputError, match="no extractor named 'pointnett'"):
         EXTRACTORS["pointnett"].trained()
@@ -81,10 +89,13 @@ def test_weights_that_are_added_are_those_that_are_loaded(pointnet, folder):
     x = torch.randn(1, 3, 50)
     assert torch.equal(loaded(x), network(x))
     assert not loaded.training
-    torch.save({"state_dict": network.state_dict(), "epoch": 39}, path)  # the hash is the weights', not the file's
+    # the hash is the weights', not the file's
+    torch.save({"state_dict": network.state_dict(), "epoch": 39}, path)
     assert add("pointnet", path) == weights
     assert add("pointnet", folder / "pointnet.safetensors") == weights
-    tensors = {name: value for name, value in network.state_dict().items() if "num_batches" not in name}
+    tensors = {
+        name: value for name, value in network.state_dict().items() if "num_batches" not in name
+    }
     torch.save(tensors, path)  # counts that old files lack are not asked for
     assert add("pointnet", path) == weights
     assert weights_hash(untrained(PointNet, 4)) != weights
@@ -101,13 +112,24 @@ def test_damaged_weights_are_not_used(pointnet, folder):
 
 def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, folder):
     network, path = pointnet
-    with pytest.raises(InputError, match=rf"{path}: not the weights of rangenet21: .*stem.0.weight"):
+    with pytest.raises(
+        InputError, match=rf"{path}: not the weights of rangenet21: .*stem.0.weight"
+    ):
         add("rangenet21", path)
     tensors = network.state_dict()
     refused = [
-        (saved({**tensors, "fc3.weight": torch.zeros(40, 256), "fc3.bias": torch.zeros(40)}), "size mismatch for fc3"),
+        (
+            saved({**tensors, "fc3.weight": torch.zeros(40, 256), "fc3.bias": torch.zeros(40)}),
+            "size mismatch for fc3",
+        ),
     ]
-    odd = ({0: torch.ones(1)}, {"a": torch.eye(2).to_sparse()}, {"a": torch.ones(1) * 1j}, {"a": 1}, [1])
+    odd = (
+        {0: torch.ones(1)},
+        {"a": torch.eye(2).to_sparse()},
+        {"a": torch.ones(1) * 1j},
+        {"a": 1},
+        [1],
+    )
     odd += ({"a": torch.ones(1, device="meta")},)
     none = (b"", b"\x80\x02}q\x00.", b"nonsense" * 100, *map(saved, odd))
     refused += [(one, "not a checkpoint|not the weights|not a readable|is empty") for one in none]
@@ -126,7 +148,9 @@ def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, fo
 def test_the_release_of_several_files_is_read_as_one(tmp_path, kind):
     tensors = read_published(pack(tmp_path, kind))
     expected = {name: value for part in PARTS.values() for name, value in part.items()}
-    assert {name: value.tolist() for name, value in tensors.items()} == {n: v.tolist() for n, v in expected.items()}
+    assert {name: value.tolist() for name, value in tensors.items()} == {
+        n: v.tolist() for n, v in expected.items()
+    }
 
 
 def test_archives_of_nothing_of_several_and_of_halves_are_said(tmp_path):
@@ -165,7 +189,15 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path):
 def test_the_table_says_which_weights_are_here(r2flow, pointnet, folder):
     def here() -> set[str]:
         said = r2flow("info").said
-        for words in ("FRD", "FRID", "FPD", "FSVD", "FPVD", "darknet53-1024.tar.gz", f"Looked for in {folder}"):
+        for words in (
+            "FRD",
+            "FRID",
+            "FPD",
+            "FSVD",
+            "FPVD",
+            "darknet53-1024.tar.gz",
+            f"Looked for in {folder}",
+        ):
             assert words in said
         rows = [line.split() for line in said.splitlines() if line.split(" ")[0] in SOURCES]
         assert len(rows) == len(SOURCES)

@@ -14,7 +14,9 @@ from tests.metrics.conftest import Summary, given
 
 
 def figures(real, generated, metric=Manifold):
-    return list(given(metric(Summary()), *(torch.as_tensor(x).float() for x in (real, generated))).values())
+    return list(
+        given(metric(Summary()), *(torch.as_tensor(x).float() for x in (real, generated))).values()
+    )
 
 
 def kernel_distance(real, generated):
@@ -27,10 +29,19 @@ def brute_force(real, generated, k):
     def radius(rows, i):
         return np.sort(np.linalg.norm(np.delete(rows, i, 0) - rows[i], axis=1))[k - 1]
 
-    r_real, r_generated = ([radius(rows, i) for i in range(len(rows))] for rows in (real, generated))
+    r_real, r_generated = (
+        [radius(rows, i) for i in range(len(rows))] for rows in (real, generated)
+    )
     inside = [[np.linalg.norm(g - r) <= r_real[i] for i, r in enumerate(real)] for g in generated]
-    recalled = [any(np.linalg.norm(g - r) <= r_generated[j] for j, g in enumerate(generated)) for r in real]
-    return [np.any(inside, 1).mean(), np.mean(recalled), np.sum(inside) / k / len(generated), np.any(inside, 0).mean()]
+    recalled = [
+        any(np.linalg.norm(g - r) <= r_generated[j] for j, g in enumerate(generated)) for r in real
+    ]
+    return [
+        np.any(inside, 1).mean(),
+        np.mean(recalled),
+        np.sum(inside) / k / len(generated),
+        np.any(inside, 0).mean(),
+    ]
 
 
 @pytest.mark.parametrize(("k", "block"), [(1, 7), (3, 2000), (5, 10)])
@@ -38,9 +49,14 @@ def test_as_pair_by_pair(k, block, monkeypatch):
     monkeypatch.setattr(features, "BLOCK", block)
     monkeypatch.setattr(features, "NEIGHBOURS", k)
     draw = np.random.default_rng(k)
-    real, generated = draw.normal(size=(31, 3)).astype("f4"), draw.normal(0.7, 0.6, size=(24, 3)).astype("f4")
+    real, generated = (
+        draw.normal(size=(31, 3)).astype("f4"),
+        draw.normal(0.7, 0.6, size=(24, 3)).astype("f4"),
+    )
     found = figures(real, generated)
-    assert found == pytest.approx(brute_force(real.astype(float), generated.astype(float), k), abs=1e-12)
+    assert found == pytest.approx(
+        brute_force(real.astype(float), generated.astype(float), k), abs=1e-12
+    )
     assert 0 < found[1] < found[0] < 1
 
 
@@ -49,29 +65,40 @@ def test_repeated_scans_lie_on_each_other_however_far_from_zero():
     # Every ball has the radius 0, and holds the six that are one: density 6 / 5.
     assert figures(rows, rows) == pytest.approx([1, 1, 6 / 5, 1])
     x = torch.from_numpy(rows)
-    assert not squared_distances(x, x).diagonal().any()  # where two ways to add up are rounded differently
+    # where two ways to add up are rounded differently
+    assert not squared_distances(x, x).diagonal().any()
 
 
 def test_the_kernel_distance_of_two_gaussians_is_that_of_their_moments():
-    # k = 1 + 3 a b + 3 (a b)^2 + (a b)^3 on one feature, so that MMD^2 = sum of 3, 3, 1 times the squared differences
-    # of the first three moments: mu, mu^2 + s^2, mu^3 + 3 mu s^2. The samples are the quantiles of the Gaussians.
+    # k = 1 + 3 a b + 3 (a b)^2 + (a b)^3 on one feature, so that MMD^2 = sum of 3, 3, 1 times the
+    # squared differences of the first three moments: mu, mu^2 + s^2, mu^3 + 3 mu s^2. The samples
+    # are the quantiles of the Gaussians.
     quantiles = torch.special.ndtri((torch.arange(4000, dtype=torch.float64) + 0.5) / 4000)[:, None]
     moments = [np.array([m, m**2 + s**2, m**3 + 3 * m * s**2]) for m, s in ((0.5, 1.0), (0.0, 1.5))]
     expected = float(np.array([3, 3, 1]) @ (moments[0] - moments[1]) ** 2)
-    assert kernel_distance(0.5 + quantiles, 1.5 * quantiles[::2]) == pytest.approx(expected, rel=0.02)
+    assert kernel_distance(0.5 + quantiles, 1.5 * quantiles[::2]) == pytest.approx(
+        expected, rel=0.02
+    )
 
 
 def test_the_kernel_distance_is_the_mean_over_all_subsets_in_blocks_of_any_size(monkeypatch):
-    real, generated = torch.randn(6, 3, dtype=torch.float64).float(), torch.randn(7, 3, dtype=torch.float64).float()
+    real, generated = (
+        torch.randn(6, 3, dtype=torch.float64).float(),
+        torch.randn(7, 3, dtype=torch.float64).float(),
+    )
     sides = [list(combinations(range(len(rows)), 3)) for rows in (real, generated)]
-    expected = np.mean([kernel_distance(real[list(a)], generated[list(b)]) for a, b in product(*sides)])
+    expected = np.mean(
+        [kernel_distance(real[list(a)], generated[list(b)]) for a, b in product(*sides)]
+    )
     for block in (2, 1000):
         monkeypatch.setattr(features, "BLOCK", block)
         assert kernel_distance(real, generated) == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_kernel_distance_is_the_reference_on_its_own_subsets(shared):
-    for case in torch.load(shared / "oracle" / "distribution_metrics.pt", weights_only=True).values():
+    for case in torch.load(
+        shared / "oracle" / "distribution_metrics.pt", weights_only=True
+    ).values():
         f_1, f_2 = case["f1"].double(), case["f2"].double()
         for subsets, most, expected in (
             (100, 1000, case["kid_like_mmd_seed0"]),
@@ -80,7 +107,10 @@ def test_the_kernel_distance_is_the_reference_on_its_own_subsets(shared):
             draw = np.random.RandomState(0)
             size, values = min(len(f_1), len(f_2), most), []
             for _ in range(subsets):
-                x, y = (f[torch.from_numpy(draw.choice(len(f), size, replace=False))] for f in (f_2, f_1))
+                x, y = (
+                    f[torch.from_numpy(draw.choice(len(f), size, replace=False))]
+                    for f in (f_2, f_1)
+                )
                 values.append(kernel_distance(x, y))
             assert np.mean(values) == pytest.approx(expected, rel=1e-6)  # theirs is float32
 
@@ -94,12 +124,15 @@ def test_gaussians_have_the_area_of_their_distance(apart):
     draw = torch.Generator().manual_seed(4)
     x, y = torch.randn(4000, 3, generator=draw), torch.randn(4000, 3, generator=draw)
     y[:, 1] += apart
-    # P(N(apart, 1) > N(0, 1)) = Phi(apart / sqrt 2); the error of an area of 2 x 4,000 scores is below 0.007
+    # P(N(apart, 1) > N(0, 1)) = Phi(apart / sqrt 2); the error of an area of 2 x 4,000 scores is
+    # below 0.007
     assert auc(x, y) == pytest.approx((1 + math.erf(apart / 2)) / 2, abs=0.02)
 
 
 def test_halves_are_blocks_so_that_neighbours_do_not_help():
-    """Each half of the generated set differs from the real one in the other direction: nothing that generalises."""
+    """Each half of the generated set differs from the real one in the other direction: nothing that
+    generalises.
+    """
     draw = torch.Generator().manual_seed(6)
     x, y = torch.randn(400, 2, generator=draw), torch.randn(400, 2, generator=draw)
     y[:200, 0] += 3
@@ -121,4 +154,5 @@ def test_the_interval_of_equal_sets_covers_one_half():
     sets = torch.randn(300, 2, 40, 60, generator=torch.Generator().manual_seed(8))
     found = [given(METRICS["auc"](), *pair) for pair in sets]
     covered = np.mean([one["auc_low"] <= 0.5 <= one["auc_high"] for one in found])
-    assert 0.92 < covered < 0.99  # of 300 intervals, 1.3 % of error; 0.86 if the halves' errors were independent
+    # of 300 intervals, 1.3 % of error; 0.86 if the halves' errors were independent
+    assert 0.92 < covered < 0.99

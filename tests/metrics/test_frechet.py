@@ -14,17 +14,29 @@ from tests.metrics.conftest import Summary, measured, scans_of
 
 
 def positive(d, seed, rank=None):
-    a = torch.randn(d, rank or d, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    a = torch.randn(
+        d, rank or d, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     return a @ a.T / d
 
 
 @pytest.mark.parametrize(
     ("d", "rank_1", "rank_t", "tolerance"),
-    # Full rank, but eigenvalues down to 1e-13 of the largest, whose roots are known to that much less.
-    [(20, 20, 20, 1e-6), (60, 60, 60, 1e-6), (40, 7, 40, 1e-11), (40, 40, 5, 1e-11), (40, 9, 12, 1e-11)],
+    # Full rank, but eigenvalues down to 1e-13 of the largest, whose roots are known to that much
+    # less.
+    [
+        (20, 20, 20, 1e-6),
+        (60, 60, 60, 1e-6),
+        (40, 7, 40, 1e-11),
+        (40, 40, 5, 1e-11),
+        (40, 9, 12, 1e-11),
+    ],
 )
-def test_non_commuting_and_singular_covariances_cost_what_the_optimal_map_costs(d, rank_1, rank_t, tolerance):
-    # A positive T carries N(0, S_1) to N(0, T S_1 T) optimally (Brenier): at the cost tr (I - T) S_1 (I - T).
+def test_non_commuting_and_singular_covariances_cost_what_the_optimal_map_costs(
+    d, rank_1, rank_t, tolerance
+):
+    # A positive T carries N(0, S_1) to N(0, T S_1 T) optimally (Brenier): at the cost tr (I - T)
+    # S_1 (I - T).
     s_1, t = positive(d, 1, rank_1), positive(d, 2, rank_t)
     move = torch.eye(d, dtype=torch.float64) - t
     expected = float((move @ s_1 @ move).trace())
@@ -41,7 +53,9 @@ def test_equal_and_degenerate_gaussians():
 
 
 def test_reference_figures(shared):
-    for case in torch.load(shared / "oracle" / "distribution_metrics.pt", weights_only=True).values():
+    for case in torch.load(
+        shared / "oracle" / "distribution_metrics.pt", weights_only=True
+    ).values():
         found = frechet_distance(*gaussian(case["f1"]), *gaussian(case["f2"]))
         assert found == pytest.approx(case["frechet"], rel=1e-9)
 
@@ -59,13 +73,18 @@ def test_float32_features_far_from_zero_lose_nothing(monkeypatch):
 def test_fewer_scans_than_dimensions_is_exact_and_said(summary):
     real, generated = scans_of(4, 1), scans_of(5, 2)
     metric = measured(FrechetDistance(summary), real, generated)
-    # tr (S_1 S_2)^(1/2) is the nuclear norm of the centred features' product: no covariance is made.
+    # tr (S_1 S_2)^(1/2) is the nuclear norm of the centred features' product: no covariance is
+    # made.
     x, y = (summary.features(s).double().numpy() for s in (real, generated))
     a, b = (z - z.mean(0) for z in (x, y))
     common = np.linalg.norm(a @ b.T, "nuc") / math.sqrt(3 * 4)
-    expected = ((x.mean(0) - y.mean(0)) ** 2).sum() + (a**2).sum() / 3 + (b**2).sum() / 4 - 2 * common
+    expected = (
+        ((x.mean(0) - y.mean(0)) ** 2).sum() + (a**2).sum() / 3 + (b**2).sum() / 4 - 2 * common
+    )
     assert metric.compute() == {"frechet_summary": pytest.approx(expected, rel=1e-9)}
-    assert any("fewer scans than features" in said and "too large" in said for said in metric.remarks)
+    assert any(
+        "fewer scans than features" in said and "too large" in said for said in metric.remarks
+    )
 
 
 def test_random_weights_never_have_the_field_s_name(summary):

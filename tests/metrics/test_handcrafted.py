@@ -40,20 +40,28 @@ def by_name(rows, extractor=BOTH):
 def statistics(some):
     """Of a scan whose rays all returned: the features taken back to the statistics' own units."""
     whole = FAR_OUT * (BOTH.features(some) / FAR_OUT).sinh() * (1 + FEW)
-    return {name: SCALES[name][0] + SCALES[name][1] * x[0].numpy() for name, x in by_name(whole).items()}
+    return {
+        name: SCALES[name][0] + SCALES[name][1] * x[0].numpy() for name, x in by_name(whole).items()
+    }
 
 
 def test_a_constant_image():
     found = statistics(scans(7.0, 0.3))
     expected = {
         "returns": 1, "row changes": 0, "single losses": 0, "log-range": 3, "beyond 5 m": 1, "beyond 10 m": 0,
-        "row edges": 0, "row equal": 1, "row step": math.log2(FINE), "row step of 64": math.log2(FINE),
-        "row bend": math.log2(FINE), "row smooth": 0, "rows agree": 0, "row step, spread": 0, "log-range, spread": 0,
-        "log-range, beams": 0, "reflectance": 0.3, "reflectance, spread": 0, "reflectance from 0.25": 1,
-        "reflectance row step": math.log2(FINE), "log-range, sectors": 3, "reflectance, sectors": 0.3,
+        "row "
+        "edges": 0, "row equal": 1, "row step": math.log2(FINE), "row step of 64": math.log2(FINE),
+        "row "
+        "bend": math.log2(FINE), "row smooth": 0, "rows agree": 0, "row step, spread": 0, "log-range, spread": 0,
+        "log-range, "
+        "beams": 0, "reflectance": 0.3, "reflectance, spread": 0, "reflectance from 0.25": 1,
+        "reflectance row "
+        "step": math.log2(FINE), "log-range, sectors": 3, "reflectance, sectors": 0.3,
     }  # fmt: skip
     for name, value in expected.items():
-        np.testing.assert_allclose(found[name], value, atol=2e-3 * max(1, 30 * SCALES[name][1]), err_msg=name)
+        np.testing.assert_allclose(
+            found[name], value, atol=2e-3 * max(1, 30 * SCALES[name][1]), err_msg=name
+        )
 
 
 def test_one_wall_before_another_has_two_edges_in_every_row():
@@ -99,7 +107,8 @@ def test_features_of_simulated_scans_have_the_centre_and_the_spread_of_the_table
         assert 0.2 < x.std(0).mean() < 1.4, name
 
 
-@pytest.mark.parametrize("shape", [(16, 100), (3, 5), (40, 800)])  # three of the last are computed in parts
+# three of the last are computed in parts
+@pytest.mark.parametrize("shape", [(16, 100), (3, 5), (40, 800)])
 @pytest.mark.parametrize("sensor", ["vlp16", "os1_64"])
 def test_any_sensor_and_size_with_and_without_reflectance(sensor, shape):
     resized = SENSORS[sensor].resized(*shape)
@@ -109,5 +118,7 @@ def test_any_sensor_and_size_with_and_without_reflectance(sensor, shape):
     torch.testing.assert_close(BOTH.features(some), torch.cat(alone).view(3, BOTH.dim))
     of_range = RANGE.features(Scans(some.images[:, :1], resized))
     assert of_range.shape == (3, RANGE.dim)
-    same = {name: x for name, x in by_name(BOTH.features(some)).items() if "reflectance" not in name}
+    same = {
+        name: x for name, x in by_name(BOTH.features(some)).items() if "reflectance" not in name
+    }
     torch.testing.assert_close(of_range, torch.cat(list(same.values()), 1))

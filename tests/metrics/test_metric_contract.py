@@ -66,9 +66,14 @@ def test_figures_do_not_depend_on_processes_or_the_order_of_scans(build, sets, p
         for k, first in enumerate(range(0, len(scans), 2)):
             numbers = range(len(scans))[first : first + 2]
             ranks[k % processes].update(part(scans, numbers), side == "real", numbers)
-    for name, reduce in ranks[0]._reductions.items():  # put together as torchmetrics does it, in the first one
+    # put together as torchmetrics does it, in the first one
+    for name, reduce in ranks[0]._reductions.items():
         values = [getattr(one, name) for one in ranks]
-        setattr(ranks[0], name, [*chain(*values)] if isinstance(values[0], list) else reduce(torch.stack(values)))
+        setattr(
+            ranks[0],
+            name,
+            [*chain(*values)] if isinstance(values[0], list) else reduce(torch.stack(values)),
+        )
     shuffled = {s: part(scans, torch.randperm(len(scans))) for s, scans in sets.items()}
     orders = [] if build().name in ORDERED else [give(build(), shuffled).compute()]
     for values in (backwards, ranks[0].compute(), *orders):
@@ -108,7 +113,10 @@ def test_equal_sets_are_at_no_distance(build, sets):
 
 def test_statistics_of_the_real_set_replace_its_scans(build, sets):
     whole = give(build(), sets)
-    state = {name: value.clone() for name, value in give(build(), {"real": sets["real"]}).real_state().items()}
+    state = {
+        name: value.clone()
+        for name, value in give(build(), {"real": sets["real"]}).real_state().items()
+    }
     again = build()
     for _ in range(2):
         again.reset()
@@ -138,16 +146,25 @@ def test_in_a_collection_every_metric_has_its_own_figures(summary, sets):
     collection = MetricCollection({name: METRICS[name]() for name in names})
     assert collection(sets["real"], real=True) == {}  # a batch has no distance of its own
     collection.reset()
-    together = {key.split("/")[-1]: value for key, value in give(collection, sets).compute().items()}
-    alone = {key: value for name in names for key, value in give(METRICS[name](), sets).compute().items()}
+    together = {
+        key.split("/")[-1]: value for key, value in give(collection, sets).compute().items()
+    }
+    alone = {
+        key: value for name in names for key, value in give(METRICS[name](), sets).compute().items()
+    }
     assert together == pytest.approx(alone, rel=1e-10)
 
 
 def test_a_network_runs_once_for_all_metrics_of_it(summary, sets, monkeypatch):
     ran = []
     features = type(summary).features
-    monkeypatch.setattr(type(summary), "features", lambda self, scans: ran.append(self) or features(self, scans))
-    metrics = [METRICS[name]() for name in ("frechet_handcrafted", "manifold_handcrafted", "kid_handcrafted", "frid")]
+    monkeypatch.setattr(
+        type(summary), "features", lambda self, scans: ran.append(self) or features(self, scans)
+    )
+    metrics = [
+        METRICS[name]()
+        for name in ("frechet_handcrafted", "manifold_handcrafted", "kid_handcrafted", "frid")
+    ]
     for metric in metrics:
         metric.update(sets["real"], real=True)
     assert [network.name for network in ran] == ["handcrafted", "rangenet21"]
@@ -181,7 +198,9 @@ def test_merged_states_are_those_of_all_scans(build, sets):
     expected = give(build(), sets).compute()
     if build().name in ORDERED:
         pytest.skip("the scans of a merged state are numbered from 0 again")
-    halves = [{s: part(x, numbers) for s, x in sets.items()} for numbers in (slice(0, 5), slice(5, None))]
+    halves = [
+        {s: part(x, numbers) for s, x in sets.items()} for numbers in (slice(0, 5), slice(5, None))
+    ]
     parts = [told(build(sensor=SMALL), half) for half in halves]
     parts[1].persistent(True)
     for incoming in (parts[1], parts[1].state_dict()):
@@ -208,7 +227,8 @@ def test_a_loaded_state_goes_on_where_the_saved_one_was(build, sets, tmp_path):
 def test_moving_and_setting_a_dtype_change_no_figure(build, sets):
     expected = give(build(), sets).compute()
     metric = told(build(sensor=SMALL), sets).set_dtype(torch.float16).half()
-    torch.nn.ModuleList([metric]).to("cpu", torch.bfloat16)  # as a trainer does, which also computes in autocast
+    # as a trainer does, which also computes in autocast
+    torch.nn.ModuleList([metric]).to("cpu", torch.bfloat16)
     assert metric.compute() == expected
     metric.reset()
     with torch.autocast("cpu", torch.bfloat16):

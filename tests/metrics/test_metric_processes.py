@@ -1,4 +1,6 @@
-"""One, two and three real processes: the same figures; test_cli_evaluate.py has all classes of metrics by the verb."""
+"""One, two and three real processes: the same figures; test_cli_evaluate.py has all classes of
+metrics by the verb.
+"""
 
 import json
 
@@ -24,7 +26,9 @@ def images(seed, n):
 
 
 def measure(rank, ranks):
-    """Figures and remarks without a common folder, of images that nobody numbers; twice, with scans in between."""
+    """Figures and remarks without a common folder, of images that nobody numbers; twice, with scans
+    in between.
+    """
     network, found = EXTRACTORS["handcrafted"].trained(), []
     metrics = [METRICS[name](sensor=SENSOR) for name in ("jsd", "mmd")]
     metrics += [FrechetDistance(network, sensor=SENSOR), Manifold(network, sensor=SENSOR)]
@@ -41,7 +45,9 @@ def measure(rank, ranks):
 
 def work(rank, ranks, folder):
     torch.set_num_threads(1)
-    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=ranks)
+    dist.init_process_group(
+        "gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=ranks
+    )
     (folder / f"{rank}.json").write_text(json.dumps(measure(rank, ranks)))
     dist.destroy_process_group()
 
@@ -52,6 +58,8 @@ def test_processes_have_the_figures_of_one(ranks, tmp_path):
     expected = measure(0, 1)
     mp.start_processes(work, (ranks, tmp_path), nprocs=ranks, start_method="spawn")
     for rank in range(ranks):
-        for one, other in zip(json.loads((tmp_path / f"{rank}.json").read_text()), expected, strict=True):
+        for one, other in zip(
+            json.loads((tmp_path / f"{rank}.json").read_text()), expected, strict=True
+        ):
             assert one[0] == pytest.approx(other[0], rel=1e-10, abs=1e-14)
             assert one[1] == other[1]

@@ -66,16 +66,20 @@ def test_the_histograms_are_numpy_s_and_every_member_has_its_size():
         counts = member.counts(scan).ravel()
         assert counts.size == member.size, name
         np.testing.assert_array_equal(counts, expected.get(name, counts).ravel(), err_msg=name)
-    assert (lines.changes_row(scan_of(np.indices((1030, 64)).sum(0)[None] % 2))[:2] == 64).all()  # of 1024 rows
+    # of 1024 rows
+    assert (lines.changes_row(scan_of(np.indices((1030, 64)).sum(0)[None] % 2))[:2] == 64).all()
 
 
 def test_the_metric_has_the_distances_of_the_sets_and_their_mean():
     real, other = walls(5, 1), walls(7, 2)
     expected = apart(real, other)
-    figures = measured(METRICS["panel"](), *(Scans(torch.from_numpy(x), SENSOR) for x in (real, other))).compute()
+    figures = measured(
+        METRICS["panel"](), *(Scans(torch.from_numpy(x), SENSOR) for x in (real, other))
+    ).compute()
     assert figures.pop("panel") == pytest.approx(np.mean(list(expected.values())))
     assert figures == pytest.approx(expected)
-    limits = replace(SENSOR, min_range=1.0, max_range=56.0)  # of LiDM: the same scans have the same counts
+    # of LiDM: the same scans have the same counts
+    limits = replace(SENSOR, min_range=1.0, max_range=56.0)
     np.testing.assert_array_equal(panel(real, limits), panel(real, SENSOR))
 
 
@@ -84,7 +88,13 @@ def test_scenes_of_the_same_sort_are_nearer_than_every_baseline():
     d = apart(other, real)
     far = {name: apart(baseline(name, training, 40), real) for name in BASELINES}
     # Losses and reflectances are independent from pixel to pixel here, as the shuffled ones are.
-    alike = {"changes per row", "run lengths", "drop rate by range", "drop rate by incidence", "reflectance pairs"}
+    alike = {
+        "changes per row",
+        "run lengths",
+        "drop rate by range",
+        "drop rate by incidence",
+        "reflectance pairs",
+    }
     for line in set(PANEL) - alike:
         assert d[line] < min(found[line] for found in far.values()), line
 
@@ -116,43 +126,68 @@ def test_a_turn_changes_no_run_of_returns():
     images[0, 0, 0, 4:17], images[0, 0, 1, 30:], images[0, 0, 1, :5], images[1, 0, 2] = 9, 9, 9, 9
     expected = np.histogram([13, 15, 40], RUNS, weights=[13, 15, 40])[0]
     for by in (0, 7, 20):
-        counts = sum(PANEL["run lengths"].counts(scan_of(image)) for image in np.roll(images, by, -1))
+        counts = sum(
+            PANEL["run lengths"].counts(scan_of(image)) for image in np.roll(images, by, -1)
+        )
         np.testing.assert_array_equal(counts, expected)
 
 
 def test_mirrored_scans_of_a_car_that_keeps_to_the_right_are_seen():
     e, a = SENSOR.rays().numpy()
     draw = np.random.default_rng(0)
-    away = np.where(np.sin(a) > 0, 9, 3)[None] * draw.uniform(0.9, 1.1, (60, 1, 1))  # walls to the left and right
-    images = (np.minimum(away / np.maximum(np.abs(np.sin(a)), 0.05), 60) / np.cos(e)).astype(np.float32)[:, None]
+    # walls to the left and right
+    away = np.where(np.sin(a) > 0, 9, 3)[None] * draw.uniform(0.9, 1.1, (60, 1, 1))
+    images = (np.minimum(away / np.maximum(np.abs(np.sin(a)), 0.05), 60) / np.cos(e)).astype(
+        np.float32
+    )[:, None]
 
     def steps(scans: np.ndarray) -> np.ndarray:
         return sum(steps_by_sector(scan_of(image)) for image in scans)
 
     one, other = steps(images[:30]), steps(images[30:])
     mirrored = steps(np.roll(images[30:, ..., ::-1], 1, axis=-1))  # about the first column
-    np.testing.assert_array_equal(mirrored, other[::-1, ::-1])  # sectors and signs change sides, nothing else
+    # sectors and signs change sides, nothing else
+    np.testing.assert_array_equal(mirrored, other[::-1, ::-1])
     assert js_distance(one, mirrored) > 5 * js_distance(one, other)
 
 
 def test_a_set_without_surfaces_is_not_near_in_the_drop_rate():
     draw, real = np.random.default_rng(0), walls(20, 1)
     lossy = real * (draw.random((20, 1, *SENSOR.shape)) > 0.05)
-    random = (real > 0) * draw.uniform([[[2]], [[0]]], [[[60]], [[1]]], real.shape).astype(np.float32)
-    found = [apart(images, real)["drop rate by incidence"] for images in (real, lossy, random, 0 * real)]
+    random = (real > 0) * draw.uniform([[[2]], [[0]]], [[[60]], [[1]]], real.shape).astype(
+        np.float32
+    )
+    found = [
+        apart(images, real)["drop rate by incidence"] for images in (real, lossy, random, 0 * real)
+    ]
     assert found[0] == 0 < found[1] < 0.2
     assert found[3] == 1 > found[2] > 0.8
     counts = np.array([[1, 18], [10, 90], [200, 200]])  # missing, all, of the image
-    for rates, expected in (([[2, 9], [10, 90]], 0.1), ([[2, 0], [10, 0]], 0.9), ([[1, 0], [10, 0.5]], 0.4)):
+    for rates, expected in (
+        ([[2, 9], [10, 90]], 0.1),
+        ([[2, 0], [10, 0]], 0.9),
+        ([[1, 0], [10, 0.5]], 0.4),
+    ):
         other = np.array([*rates, [200, 200]])
-        assert rate_distance(counts, other) == rate_distance(other, counts) == pytest.approx(expected)
-    lines = distances(*(panel(x[:, :, 9:11], SENSORS["vlp16"].resized(2, 64)) for x in (real, lossy)))  # of two rows
-    assert {*filter(lambda x: np.isnan(lines[x]), lines)} == {"surface normals", "incidence", "drop rate by incidence"}
+        assert (
+            rate_distance(counts, other) == rate_distance(other, counts) == pytest.approx(expected)
+        )
+    # of two rows
+    lines = distances(
+        *(panel(x[:, :, 9:11], SENSORS["vlp16"].resized(2, 64)) for x in (real, lossy))
+    )
+    assert {*filter(lambda x: np.isnan(lines[x]), lines)} == {
+        "surface normals",
+        "incidence",
+        "drop rate by incidence",
+    }
 
 
 def test_range_alone_leaves_reflectance_out():
     images = walls(4, 0)
-    metric = measured(METRICS["panel"](), *(Scans(torch.from_numpy(x), SENSOR) for x in (images, images[:, :1])))
+    metric = measured(
+        METRICS["panel"](), *(Scans(torch.from_numpy(x), SENSOR) for x in (images, images[:, :1]))
+    )
     assert np.isnan(metric.compute()["reflectance pairs"])
     assert metric.compute()["panel"] == pytest.approx(0, abs=1e-9)
     assert any("no reflectance" in remark for remark in metric.remarks)
@@ -164,7 +199,8 @@ def test_the_baselines_are_what_they_say():
     flat = baseline("flat ground", training, 1)[0, 0]
     np.testing.assert_allclose(flat[flat > 0], -1.73 / np.sin(e[flat > 0]), rtol=1e-5)
     assert (flat > 0)[(-1.73 / np.sin(np.minimum(e, -1e-6)) < 80) & (e < 0)].all()
-    shuffled = baseline("shuffled pixels", training, 30)[:, 0, 2, 20]  # where walls stand before the ground
+    # where walls stand before the ground
+    shuffled = baseline("shuffled pixels", training, 30)[:, 0, 2, 20]
     assert set(shuffled.tolist()) <= set(training[:, 0, 2, 20].tolist())
     assert len(np.unique(shuffled)) > 5
     mean = baseline("mean scan", training, 1)[0, 0]

@@ -44,7 +44,9 @@ def test_the_normal_of_the_ground_leans_as_it_does_and_its_incidence_is_the_angl
     near = inner(r) & (r < 7)  # farther away rows lie more than 15 % apart
     assert near.sum() > 1000
     np.testing.assert_allclose(up[near], upright, atol=1e-3)
-    np.testing.assert_allclose(cosine[near], (lean * np.cos(E) * np.cos(A) - np.sin(E))[near] * upright, atol=1e-3)
+    np.testing.assert_allclose(
+        cosine[near], (lean * np.cos(E) * np.cos(A) - np.sin(E))[near] * upright, atol=1e-3
+    )
     assert np.isnan(up[r == 0]).all()
 
 
@@ -67,8 +69,11 @@ def test_edges_have_no_normal():
 
 def test_gaps_are_bridged_by_the_mean_of_their_ends_around_the_ring():
     x = np.array([[1.0, 0, 0, 4, 5, 0, 0, 0]])
-    np.testing.assert_array_equal(bridged(x, x > 0, gap=2), [[1, 2.5, 2.5, 4, 5, np.nan, np.nan, np.nan]])
-    np.testing.assert_array_equal(bridged(x, x > 0, gap=3)[0, 5:], [3, 3, 3])  # between 5 and, around, 1
+    np.testing.assert_array_equal(
+        bridged(x, x > 0, gap=2), [[1, 2.5, 2.5, 4, 5, np.nan, np.nan, np.nan]]
+    )
+    # between 5 and, around, 1
+    np.testing.assert_array_equal(bridged(x, x > 0, gap=3)[0, 5:], [3, 3, 3])
     for width in (2, 8, 16, 25):  # of narrow images too
         x = np.zeros((1, width))
         assert np.isnan(bridged(x, x > 0)).all()
@@ -83,18 +88,24 @@ def test_the_drop_rate_is_the_share_that_a_mask_takes():
     lost = rng.random(r.shape) < np.where(r == near, 0.05, 0.25)
     rate = share(drop_range, np.where(lost, 0, r)[:, None].astype(np.float32))
     bin_of = np.searchsorted(np.geomspace(3, 80, 13), [near, far]) - 1
-    assert rate[bin_of] == pytest.approx([0.05, 0.25], abs=0.01)  # deviations of 32,768 draws: 0.0012 and 0.0024
+    # deviations of 32,768 draws: 0.0012 and 0.0024
+    assert rate[bin_of] == pytest.approx([0.05, 0.25], abs=0.01)
     # between them there are but gaps across the edge, at 27.5 m: nothing that is not lost
     assert rate.sum() == pytest.approx(0.05 + 0.25 + 1, abs=0.01)
-    counts = drop_rate(np.array([1.0, 2, 3, np.nan]), np.array([True, False, True, True]), np.array([0.0, 2.5, 5]))
+    counts = drop_rate(
+        np.array([1.0, 2, 3, np.nan]), np.array([True, False, True, True]), np.array([0.0, 2.5, 5])
+    )
     np.testing.assert_array_equal(counts, [[1, 1], [2, 1], [4, 4]])
 
 
 def test_losses_on_flat_ground_fall_into_the_bins_of_its_elevations():
     r = ground()
     rng = np.random.default_rng(1)
-    images = np.stack([np.where(rng.random(r.shape) < 0.02, 0, r)[None] for _ in range(8)]).astype(np.float32)
-    rate = share(drop_incidence, images)  # bins of 9 degrees, from 90 down: 63 to 90 is what -27 to 0 looks like
+    images = np.stack([np.where(rng.random(r.shape) < 0.02, 0, r)[None] for _ in range(8)]).astype(
+        np.float32
+    )
+    # bins of 9 degrees, from 90 down: 63 to 90 is what -27 to 0 looks like
+    rate = share(drop_incidence, images)
     assert (rate[3:] == 0).all()
     assert rate[1] == pytest.approx(0.02, abs=0.01)
     upward = sum(PANEL["surface normals"].counts(scan) for scan in scans_of(images))

@@ -1,4 +1,6 @@
-"""Things in known scenes: rays cast against rooms, poles and parked boxes, at both sizes, exact and with 2 cm noise."""
+"""Things in known scenes: rays cast against rooms, poles and parked boxes, at both sizes, exact and
+with 2 cm noise.
+"""
 
 import math
 
@@ -43,7 +45,9 @@ def box(sensor, x, y, yaw, length, width, height):
     c, s = math.cos(yaw), math.sin(yaw)
     middle = (c * x + s * y, c * y - s * x, -1.73 + height / 2)
     near, far = np.full(sensor.shape, -np.inf), np.full(sensor.shape, np.inf)
-    for d, at, side in zip((c * dx + s * dy, c * dy - s * dx, dz), middle, (length, width, height), strict=True):
+    for d, at, side in zip(
+        (c * dx + s * dy, c * dy - s * dx, dz), middle, (length, width, height), strict=True
+    ):
         with np.errstate(divide="ignore"):
             ends = np.stack([(at - side / 2) / d, (at + side / 2) / d])
         near, far = np.maximum(near, ends.min(0)), np.minimum(far, ends.max(0))
@@ -77,7 +81,8 @@ def found(finder, scans):
 @pytest.mark.parametrize("yaw", [0, 0.3, 0.7])
 def test_a_box_room_is_straight_and_square_however_it_is_turned(sensor, noise, yaw):
     values = figures(scan(sensor, noise, box(sensor, 2, -1, yaw, 24, 16, 30)))
-    # 2 cm over a piece of 4 m and 10 returns: a direction is known to 0.02 x sqrt(12 / 10) / 4 = 0.006 rad
+    # 2 cm over a piece of 4 m and 10 returns: a direction is known to 0.02 x sqrt(12 / 10) / 4 =
+    # 0.006 rad
     assert [values[line] for line in LINES] == pytest.approx([1, 1, 0, 0], abs=0.01)
 
 
@@ -88,7 +93,9 @@ def test_the_directions_of_a_hexagon_add_up_to_nothing(sensor, noise):
 
 
 def test_a_round_room_is_nowhere_straight(sensor, noise):
-    """An arc of 4 m, radius 10 m, is 0.2 m deep and so 0.2 x sqrt(4 / 45) = 0.06 m rms off its line."""
+    """An arc of 4 m, radius 10 m, is 0.2 m deep and so 0.2 x sqrt(4 / 45) = 0.06 m rms off its
+    line.
+    """
     values = figures(scan(sensor, noise, cylinder(sensor, 0, 0, 10)))
     assert [values["straight walls"], values["right angles"]] == pytest.approx([0, 0], abs=0.05)
 
@@ -99,7 +106,8 @@ def test_an_empty_plane_holds_nothing_level_or_not(sensor, noise, slope):
 
 
 def test_poles_are_counted_and_what_is_wide_low_far_or_at_a_wall_is_not(sensor, noise):
-    row = [(-10, 5), (-8, 0), (-6, 5), (-2, 5), (2, 5), (6, 5), (10, 5)]  # one in the first and the last column
+    # one in the first and the last column
+    row = [(-10, 5), (-8, 0), (-6, 5), (-2, 5), (2, 5), (6, 5), (10, 5)]
     others = [
         box(sensor, 0, -7, 0.2, 1.2, 1.2, 3), cylinder(sensor, 6, -6, 0.15, 0.6), cylinder(sensor, -25, 3, 0.6, 3),
         box(sensor, 0, 11, 0, 60, 1, 6), cylinder(sensor, 3, 10.3, 0.15, 6), box(sensor, -8, -6, 0.4, *CAR),
@@ -111,7 +119,15 @@ def test_poles_are_counted_and_what_is_wide_low_far_or_at_a_wall_is_not(sensor, 
 
 
 def test_parked_cars_are_counted_from_every_side_and_other_boxes_are_not(sensor, noise):
-    parked = [(-9, 4, 0), (-1, 5, 0.05), (7, 4, 0), (13, -2, 0), (3, -8, math.pi / 2), (-6, -7, 0.8), (-13, 0, 1.5)]
+    parked = [
+        (-9, 4, 0),
+        (-1, 5, 0.05),
+        (7, 4, 0),
+        (13, -2, 0),
+        (3, -8, math.pi / 2),
+        (-6, -7, 0.8),
+        (-13, 0, 1.5),
+    ]
     others = [
         box(sensor, 6, -13, 0, 12, 2.5, 3.5), box(sensor, -2, -6, 0, 0.5, 0.5, 1.7), box(sensor, 2, 11, 0, 14, 1, 1.5),
         cylinder(sensor, 8, -6, 0.15, 4), box(sensor, 32, 8, 0, *CAR), box(sensor, 9, 9, 0, 4, 1.8, 0.4),
@@ -120,7 +136,8 @@ def test_parked_cars_are_counted_from_every_side_and_other_boxes_are_not(sensor,
     at = found(cars, scans)
     distance = np.linalg.norm(at[:, None, :2] - np.array(parked)[:, :2], axis=2)
     assert sorted(distance.argmin(1)) == [*range(len(parked))]
-    assert distance.min(1).max() < 2.3  # half a diagonal: the middle of what is seen lies in the car
+    # half a diagonal: the middle of what is seen lies in the car
+    assert distance.min(1).max() < 2.3
     assert (np.abs(at[:, 4] - 1.4) < 0.2).all()
     assert figures(scans)["cars"] == len(parked)
 
@@ -135,5 +152,10 @@ def test_figures_of_both_sets_stand_side_by_side(sensor, noise):
         scan(sensor, noise, cylinder(sensor, 6, 2, 0.15, 3)),
         scan(sensor, noise, box(sensor, 2, -1, 0.3, 24, 16, 30), box(sensor, 0, 5, 0, *CAR)),
     )
-    assert [values["poles"], values["poles, real"], values["cars"], values["cars, real"]] == [1, 0, 0, 1]
+    assert [values["poles"], values["poles, real"], values["cars"], values["cars, real"]] == [
+        1,
+        0,
+        0,
+        1,
+    ]
     assert values["straight walls"] < 0.1 < 0.9 < values["straight walls, real"]

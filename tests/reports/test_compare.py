@@ -21,7 +21,12 @@ from r2flow.reports.tables import short_names
 from r2flow.reports.training import curves_figure, read_curves, smooth
 from tests.conftest import CONFIG as FLOW
 
-CONFIG: dict[str, Any] = {**FLOW, "name": "small", "trainer": {"max_steps": 40}, "scans": "8 of 8 scans, abc"}
+CONFIG: dict[str, Any] = {
+    **FLOW,
+    "name": "small",
+    "trainer": {"max_steps": 40},
+    "scans": "8 of 8 scans, abc",
+}
 
 
 def make_run(
@@ -47,7 +52,9 @@ def make_run(
         logs = folder / "metrics" / "version_0" / "metrics.csv"
         logs.parent.mkdir(parents=True)
         with logs.open("w", newline="") as file:
-            writer = csv.DictWriter(file, ["step", "train/loss", "val/loss", "curvature/s", "curvature/bend"])
+            writer = csv.DictWriter(
+                file, ["step", "train/loss", "val/loss", "curvature/s", "curvature/bend"]
+            )
             writer.writeheader()
             writer.writerows(rows)
     if checkpoint is not None:
@@ -83,8 +90,11 @@ def test_networks_of_other_generators_are_counted_apart(tmp_path, order):
     folders = [make_run(tmp_path / name, change) for name, change in made.items()]
     read = {run.label: run.values for run in read_runs(folders[::order])}
     for name, change in made.items():
-        assert read[name]["parameters"] == sum(p.numel() for p in build_generator(CONFIG | change).parameters())
-    assert read["flow_map"]["parameters"] > read["rectified_flow"]["parameters"]  # it embeds a second time
+        assert read[name]["parameters"] == sum(
+            p.numel() for p in build_generator(CONFIG | change).parameters()
+        )
+    # it embeds a second time
+    assert read["flow_map"]["parameters"] > read["rectified_flow"]["parameters"]
     assert read["diffusion"]["gmac"] == read["rectified_flow"]["gmac"] > 0  # the same backbone
     assert read["vanilla_gan"]["gmac"] is None
 
@@ -92,8 +102,11 @@ def test_networks_of_other_generators_are_counted_apart(tmp_path, order):
 def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
     for seed, value in enumerate([0.2, 0.4, 0.9]):
         make_run(tmp_path / f"net-seed={seed}", {"seed": seed}, val=[value], checkpoint=40)
-    make_run(tmp_path / "other-seed=0", {"stage.learning_rate": 2e-3}, val=[math.nan, 0.1], checkpoint=40)
-    make_run(tmp_path / "other-seed=1", {"stage.learning_rate": 2e-3, "seed": 1}, checkpoint=40)  # not validated yet
+    make_run(
+        tmp_path / "other-seed=0", {"stage.learning_rate": 2e-3}, val=[math.nan, 0.1], checkpoint=40
+    )
+    # not validated yet
+    make_run(tmp_path / "other-seed=1", {"stage.learning_rate": 2e-3, "seed": 1}, checkpoint=40)
     groups = group_runs(read_runs([tmp_path]))
     assert {label: len(runs) for label, runs in groups.items()} == {"net": 3, "other": 2}
     rows = group_rows(groups)
@@ -107,18 +120,24 @@ def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
 
 def test_two_sweeps_are_told_apart_by_what_was_swept(tmp_path):
     for loss, seed in (("mse", 1), ("mse", 2), ("absolute", 1), ("absolute", 2)):
-        make_run(tmp_path / f"seed={seed}_stage.loss={loss}-abcde{seed}", {"seed": seed, "stage.loss": loss})
+        make_run(
+            tmp_path / f"seed={seed}_stage.loss={loss}-abcde{seed}",
+            {"seed": seed, "stage.loss": loss},
+        )
     groups = group_runs(read_runs([tmp_path]))
-    assert {label: [run.config["stage"]["loss"] for run in runs] for label, runs in groups.items()} == {
-        f"stage.loss={loss}": [loss, loss] for loss in ("absolute", "mse")
-    }
+    assert {
+        label: [run.config["stage"]["loss"] for run in runs] for label, runs in groups.items()
+    } == {f"stage.loss={loss}": [loss, loss] for loss in ("absolute", "mse")}
 
 
 def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_another(tmp_path):
     def child(parent: Path, weights: str, **change: Any) -> dict[str, Any]:
         config = copy.deepcopy(CONFIG)
         config["data"] = {"name": "pairs", "batch_size": 4, "pairs": {"num": 8, "parent": weights}}
-        config["parent"] = {"path": str(parent / "checkpoints" / "step-00000040.ckpt"), "weights": weights}
+        config["stage"]["parent"] = {
+            "path": str(parent / "checkpoints" / "step-00000040.ckpt"),
+            "weights": weights,
+        }
         return config | {"scans": f"8 pairs, {weights}"} | change
 
     first = child(make_run(tmp_path / "a", {"seed": 0}), "aaa")
@@ -132,7 +151,10 @@ def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_an
 
 @pytest.mark.parametrize("key", ["trainer.precision", "parent.step", "data.pairs.of"])
 def test_what_is_free_on_resumption_still_tells_configurations_apart(tmp_path, key):
-    parent = {"path": str(make_run(tmp_path / "a") / "checkpoints" / "step-00000040.ckpt"), "weights": "aaa"}
+    parent = {
+        "path": str(make_run(tmp_path / "a") / "checkpoints" / "step-00000040.ckpt"),
+        "weights": "aaa",
+    }
     drawn = {"data.name": "pairs"} if key.count(".") > 1 and key.startswith("data.") else {}
     make_run(tmp_path / "b", {"parent": parent, **drawn, key: 20})
     make_run(tmp_path / "c", {"parent": parent, **drawn, key: 40, "seed": 1})
@@ -189,7 +211,9 @@ def test_the_page_is_written_with_its_picture(tmp_path):
 def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path):
     run = make_run(tmp_path / "run", train=[2.0, 1.0, 0.5], checkpoint=3)
     log = run / "metrics" / "version_0" / "metrics.csv"
-    log.write_bytes(log.read_bytes() + b"3,0.2" + b"\0\xff" * 20 + b"\n4,0.x\n5,0.2" + bytes(200_000))
+    log.write_bytes(
+        log.read_bytes() + b"3,0.2" + b"\0\xff" * 20 + b"\n4,0.x\n5,0.2" + bytes(200_000)
+    )
     (run / "metrics" / "version_x").mkdir()
     (run / "metrics" / "version_x" / "metrics.csv").touch()
     steps, values = read_curves(run)["train/loss"]
@@ -197,7 +221,9 @@ def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path):
     assert list(steps[:3]) == [1, 2, 3]
 
 
-@pytest.mark.parametrize("content", ["a: 1", "{stage: {name: rectify}, backbone: {name: hdit}, data: {}}"])
+@pytest.mark.parametrize(
+    "content", ["a: 1", "{stage: {name: rectify}, backbone: {name: hdit}, data: {}}"]
+)
 def test_a_folder_that_is_no_run_is_named(tmp_path, content):
     (tmp_path / "thing").mkdir()
     (tmp_path / "thing" / "config.yaml").write_text(content)
@@ -205,19 +231,32 @@ def test_a_folder_that_is_no_run_is_named(tmp_path, content):
         read_runs([tmp_path / "thing"])
 
 
-@pytest.mark.parametrize(("losses", "runs", "y"), [([5, 6], 1, "linear"), ([1, 9], 10, "log"), ([0, 1], 11, "linear")])
+@pytest.mark.parametrize(
+    ("losses", "runs", "y"), [([5, 6], 1, "linear"), ([1, 9], 10, "log"), ([0, 1], 11, "linear")]
+)
 def test_losses_have_a_logarithmic_axis_and_a_legend_where_these_say_something(losses, runs, y):
-    figure = curves_figure([(f"{i:040}", {"train/loss": (np.array([1, 2]), np.array(losses))}) for i in range(runs)])
+    figure = curves_figure(
+        [(f"{i:040}", {"train/loss": (np.array([1, 2]), np.array(losses))}) for i in range(runs)]
+    )
     figure.draw_without_rendering()
     assert (figure.axes[0].get_yscale(), not figure.legends) == (y, runs > 10)  # of 10 styles
-    assert not any(figure.axes[0].bbox.overlaps(legend.get_window_extent()) for legend in figure.legends)
+    assert not any(
+        figure.axes[0].bbox.overlaps(legend.get_window_extent()) for legend in figure.legends
+    )
 
 
 @pytest.mark.parametrize(
     ("steps", "roots", "loss"),
-    [((40, 40), "xx", "mse"), ((40, 20), "xx", "mse"), ((40, 40), "xy", "mse"), ((40, 40), "xx", "absolute")],
+    [
+        ((40, 40), "xx", "mse"),
+        ((40, 20), "xx", "mse"),
+        ((40, 40), "xy", "mse"),
+        ((40, 40), "xx", "absolute"),
+    ],
 )
-def test_the_verb_tells_runs_of_different_lengths_losses_and_data(r2flow, tmp_path, steps, roots, loss):
+def test_the_verb_tells_runs_of_different_lengths_losses_and_data(
+    r2flow, tmp_path, steps, roots, loss
+):
     for name, step, root, one in zip("ab", steps, roots, ("mse", loss), strict=True):
         make_run(tmp_path / name, {"data.root": root, "stage.loss": one}, checkpoint=step)
     said = r2flow("compare", tmp_path / "a", tmp_path / "b").said

@@ -35,11 +35,15 @@ def checkpoint() -> Checkpoint:
 @pytest.fixture(scope="module")
 def truths() -> list[np.ndarray]:
     random = np.random.default_rng(0)
-    images = np.stack([random.uniform(2, 70, (3, 8, 32)), random.random((3, 8, 32))], 1).astype(np.float32)
+    images = np.stack([random.uniform(2, 70, (3, 8, 32)), random.random((3, 8, 32))], 1).astype(
+        np.float32
+    )
     return list(images * (random.random((3, 1, 8, 32)) > 0.2))
 
 
-def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(checkpoint, truths, monkeypatch):
+def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
+    checkpoint, truths, monkeypatch
+):
     sensor, encoding, by = checkpoint.sensor, checkpoint.encoding, 0.0
     scan = iter(torch.from_numpy(np.stack([*truths, *truths])))
 
@@ -60,17 +64,29 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
     assert (row["mae_m"], row["mae_common_m"]) == pytest.approx((0.5, 0.5), abs=1e-3)
     hidden = [~kept_rays("rows:4", sensor, i) for i in range(3)]
     shares = np.mean([(x[0] > 0)[h].sum() / x[0].size for x, h in zip(truths, hidden, strict=True)])
-    assert row["mae_all_m"] == pytest.approx(0.5 * shares, rel=1e-3)  # all pixels, known ones without error
+    # all pixels, known ones without error
+    assert row["mae_all_m"] == pytest.approx(0.5 * shares, rel=1e-3)
 
 
 def test_interpolations_are_judged_as_any_answer(checkpoint, truths):
     config = {**checkpoint.config, "encoding": {**CONFIG["encoding"], "reflectance": False}}
-    ways = {"range": (Checkpoint(build_generator(config).eval(), config), checkpoint.generator.sampler)}
-    rows = {row["method"]: row for row in completion_rows(truths, checkpoint.sensor, ways, ["points:0.3"])}
-    of_range = next(completion_rows([truth[:1] for truth in truths], checkpoint.sensor, {}, ["points:0.3"]))
+    ways = {
+        "range": (Checkpoint(build_generator(config).eval(), config), checkpoint.generator.sampler)
+    }
+    rows = {
+        row["method"]: row
+        for row in completion_rows(truths, checkpoint.sensor, ways, ["points:0.3"])
+    }
+    of_range = next(
+        completion_rows([truth[:1] for truth in truths], checkpoint.sensor, {}, ["points:0.3"])
+    )
     assert rows["nearest"]["panel"] == of_range["panel"]  # means of the lines that every method has
-    known = [(x, kept_rays("points:0.3", checkpoint.sensor, number)) for number, x in enumerate(truths)]
-    expected = [errors(x, interpolated(x, mask), ~mask, checkpoint.sensor)["mae_m"] for x, mask in known]
+    known = [
+        (x, kept_rays("points:0.3", checkpoint.sensor, number)) for number, x in enumerate(truths)
+    ]
+    expected = [
+        errors(x, interpolated(x, mask), ~mask, checkpoint.sensor)["mae_m"] for x, mask in known
+    ]
     assert rows["linear, 1/r"]["mae_m"] == pytest.approx(np.mean(expected), rel=1e-4)
 
 
@@ -94,11 +110,16 @@ def test_the_verb_writes_a_page(r2flow, checkpoint, tmp_path: Path):
     ).said  # fmt: skip
     assert said.startswith("2 scans of simulated:3 (at most 2, --num), 2 completions per scan. ")
     rows = json.loads((out / "completion.json").read_text())["rows"]
-    assert [row["method"] for row in rows] == 2 * [*INTERPOLATIONS, "model.safetensors, jump, 1 step"]
+    assert [row["method"] for row in rows] == 2 * [
+        *INTERPOLATIONS,
+        "model.safetensors, jump, 1 step",
+    ]
     assert "coverage" in (out / "completion.md").read_text()
 
 
-def test_a_densifier_takes_a_flow_s_size_and_range_alone_has_no_reflectance(r2flow, checkpoint, tmp_path: Path):
+def test_a_densifier_takes_a_flow_s_size_and_range_alone_has_no_reflectance(
+    r2flow, checkpoint, tmp_path: Path
+):
     flow = Checkpoint(build_generator(FLOW).eval(), FLOW)
     models = tmp_path / "dense" / "model.safetensors", tmp_path / "flow" / "model.safetensors"
     checkpoint.save(models[0])
@@ -113,8 +134,11 @@ def test_a_densifier_takes_a_flow_s_size_and_range_alone_has_no_reflectance(r2fl
     assert "reflectance MAE" not in (tmp_path / "out" / "completion.md").read_text()
 
 
-@pytest.mark.parametrize("given", [(), ("--sensor", "vlp16", "--size", "8x96")])  # the folder's manifest, or options
-def test_a_densifier_is_measured_on_the_sensor_of_the_scans(r2flow, checkpoint, tmp_path: Path, given):
+# the folder's manifest, or options
+@pytest.mark.parametrize("given", [(), ("--sensor", "vlp16", "--size", "8x96")])
+def test_a_densifier_is_measured_on_the_sensor_of_the_scans(
+    r2flow, checkpoint, tmp_path: Path, given
+):
     checkpoint.save(tmp_path / "model.safetensors")
     sensor = SENSORS["vlp16"].resized(8, 96)
     truth = simulate(sensor, 3, 500 if given else 0).image  # the middle of 1000 scenes

@@ -27,7 +27,9 @@ class Falling(nn.Module):
 
 
 def by_hand(a: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
-    """Every state and velocity of Euler's path, (num, n + 1, elements) and (num, n, elements), in numpy."""
+    """Every state and velocity of Euler's path, (num, n + 1, elements) and (num, n, elements), in
+    numpy.
+    """
     x = Draws(5, range(num)).start((2, *SENSOR.shape)).double().numpy().reshape(num, -1)
     a, states, velocities = np.resize(a, x.shape[1]), [x], []
     for k in range(STEPS):
@@ -38,7 +40,8 @@ def by_hand(a: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("batch_size", [1, 2, 3])
 def test_the_figures_are_those_of_paths_kept_whole(batch_size):
-    rates = torch.linspace(1, 9, SENSOR.columns)  # a column's paths bend most where others no longer do
+    # a column's paths bend most where others no longer do
+    rates = torch.linspace(1, 9, SENSOR.columns)
     found = measure_paths(flow(Falling(rates)), "falling", 3, STEPS, 5, batch_size, most_curved=7)
     x, v = by_hand(rates.numpy(), 3)
     d = x[:, -1] - x[:, 0]
@@ -61,11 +64,14 @@ def test_the_page_compares_the_flows():
     flows = {name: measure_paths(flow(Falling(a)), name, 1, STEPS, 5) for name, a in slopes.items()}
     page = curvature_page(flows, 5)
     said = " ".join(page.text)
-    # s / |d|^2 does not change when a straight-line velocity is scaled; here the slower one is nearer to v = c t,
-    # whose variance over squared mean is (1/12) / (1/4) = 1/3.
+    # s / |d|^2 does not change when a straight-line velocity is scaled; here the slower one is
+    # nearer to v = c t, whose variance over squared mean is (1/12) / (1/4) = 1/3.
     assert 0.9 / 3 < summary("slow", flows["slow"])["integral_normalised"] < 1.2 / 3
     for row in (summary(*one) for one in flows.items()):
-        assert f"| {row['checkpoint']} | {row['integral']:.3g} | {row['integral_normalised']:.3g} |" in said
+        assert (
+            f"| {row['checkpoint']} | {row['integral']:.3g} | {row['integral_normalised']:.3g} |"
+            in said
+        )
     assert [len(page.figures[name].axes) for name in ("curvature", "trajectories")] == [2, 2]
 
 

@@ -31,7 +31,9 @@ class LostBetween(GaussianFlow):
 
 
 def test_a_frame_that_is_not_solved_is_reported(tmp_path, caplog):
-    page = interpolation(flow(LostBetween()), "ab", scans(2), 4, tmp_path / "o", build_sampler("rk4", steps=4))
+    page = interpolation(
+        flow(LostBetween()), "ab", scans(2), 4, tmp_path / "o", build_sampler("rk4", steps=4)
+    )
     assert [row["converged"] for row in page.rows] == [True, False, False, True]
     assert "not solved, so no scans of this flow: 1, 2;" in caplog.text
     assert "| no |" in page.text[1]
@@ -47,7 +49,9 @@ def test_an_end_without_its_noise_is_refused():
 
 
 def test_a_range_image_is_limited_to_the_range_of_the_sensor(tmp_path):
-    image = np.array([[1.0, 1.45, 40, 80, 81, np.inf, np.nan, -3], [2, 0.5, -1, 1, 1, 1, 1, 1]], np.float32)
+    image = np.array(
+        [[1.0, 1.45, 40, 80, 81, np.inf, np.nan, -3], [2, 0.5, -1, 1, 1, 1, 1, 1]], np.float32
+    )
     sensor = SENSORS["hdl64e"].resized(2, 4)
     np.save(tmp_path / "image.npy", image.reshape(2, 2, 4))
     checkpoint = flow()
@@ -58,7 +62,9 @@ def test_a_range_image_is_limited_to_the_range_of_the_sensor(tmp_path):
     np.testing.assert_allclose(seen[1].flatten(), [0, 0.5, 0, 1, 0, 0, 0, 0])
 
 
-@pytest.mark.parametrize(("of_sensor", "trained"), [(255.0, 1.0), (255.0, 255.0), (None, 255.0), (100.0, 255.0)])
+@pytest.mark.parametrize(
+    ("of_sensor", "trained"), [(255.0, 1.0), (255.0, 255.0), (None, 255.0), (100.0, 255.0)]
+)
 def test_reflectance_is_scaled_by_who_wrote_the_file(tmp_path, of_sensor, trained):
     image, checkpoint = scans(1)[0], flow()
     own, raw = tmp_path / "own" / "a.ply", tmp_path / "raw" / "a.ply"

@@ -40,7 +40,13 @@ def test_every_file_says_where_it_comes_from(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["/bin/r2flow", "report", "speed", "a b"])
     for path in write_page(page(), tmp_path):
         content = path.read_bytes().decode("latin-1")
-        for words in ("r2flow report speed 'a b'", torch.__version__, r2flow.__version__, "threads", "scenes"):
+        for words in (
+            "r2flow report speed 'a b'",
+            torch.__version__,
+            r2flow.__version__,
+            "threads",
+            "scenes",
+        ):
             assert words in content, (path.name, words)
         assert str(tmp_path) not in content  # nor any other path of the machine
 
@@ -52,16 +58,28 @@ def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
     assert content["paths"] == [{"values": [1.0, None]}]
     assert content["origin"]["seeds"] == {"scenes": 3}
     text = (tmp_path / "speed.md").read_text()
-    for words in ("# How fast\n\n![speed](speed.png)\n\nFirst.\n\n| s\\| |", "a\\|b\\nc | - |", f"```\n{command()}\n"):
+    for words in (
+        "# How fast\n\n![speed](speed.png)\n\nFirst.\n\n| s\\| |",
+        "a\\|b\\nc | - |",
+        f"```\n{command()}\n",
+    ):
         assert words in text
 
 
 def test_a_page_that_fails_leaves_the_old_one(tmp_path):
     write_page(page(), tmp_path)
-    before = {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix not in (".png", ".pdf")}
+    before = {
+        path: path.read_bytes()
+        for path in tmp_path.iterdir()
+        if path.suffix not in (".png", ".pdf")
+    }
     with pytest.raises(TypeError):
         write_page(page(rows=[{"solver": object()}]), tmp_path)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix not in (".png", ".pdf")} == before
+    assert {
+        path: path.read_bytes()
+        for path in tmp_path.iterdir()
+        if path.suffix not in (".png", ".pdf")
+    } == before
 
 
 @pytest.mark.parametrize(
@@ -76,15 +94,23 @@ def test_values_are_short(value, text):
 def test_in_the_terminal_numbers_stand_to_the_right_and_nothing_is_cut(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
     long = "[1, 2] " + 30 * "long "
-    print_table([("x", 1.5, long), ("longer", "12345", "-")], ("name", "RMS", "remark"), title="Errors")
+    print_table(
+        [("x", 1.5, long), ("longer", "12345", "-")], ("name", "RMS", "remark"), title="Errors"
+    )
     title, heads, *lines = capsys.readouterr().out.splitlines()
     assert title.strip() == "Errors"
     assert heads.split() == ["name", "RMS", "remark"]
-    assert [line.split() for line in lines] == [["x", "1.5", *long.split()], ["longer", "12345", "-"]]
+    assert [line.split() for line in lines] == [
+        ["x", "1.5", *long.split()],
+        ["longer", "12345", "-"],
+    ]
     assert lines[0].index("1.5") + 3 == lines[1].index("12345") + 5
     assert lines[0].index("[1, 2]") == lines[1].index("-")
 
 
 def test_a_long_value_cuts_no_key_and_pads_no_line(capsys):
     print_table([["a.key.of.some.length", "x" * 3000], ["another", 1]], ("", ""))
-    assert capsys.readouterr().out.splitlines() == [f"a.key.of.some.length  {'x' * 3000}", "another               1"]
+    assert capsys.readouterr().out.splitlines() == [
+        f"a.key.of.some.length  {'x' * 3000}",
+        "another               1",
+    ]

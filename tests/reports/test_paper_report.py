@@ -18,18 +18,25 @@ pytestmark = pytest.mark.usefixtures("quick_pictures")
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("runs")
-    stages = {"1-RF": {"name": "rectify"}, "2-RF": {"name": "reflow"}, "4-TD": {"name": "distill", "steps": 4}}
+    stages = {
+        "1-RF": {"name": "rectify"},
+        "2-RF": {"name": "reflow"},
+        "4-TD": {"name": "distill", "steps": 4},
+    }
     return {
-        role: write_run(root / f"role={role}_seed={i}", network(), stage, 0.2 + 0.05 * i)  # as folders of a sweep
+        # as folders of a sweep
+        role: write_run(root / f"role={role}_seed={i}", network(), stage, 0.2 + 0.05 * i)
         for i, (role, stage) in enumerate(stages.items())
     }
 
 
 def test_every_run_finds_its_role(runs):
-    assert {role: role_of(load_checkpoint(run), "label") for role, run in runs.items()} == {r: r for r in runs}
+    assert {role: role_of(load_checkpoint(run), "label") for role, run in runs.items()} == {
+        r: r for r in runs
+    }
     checkpoint = load_checkpoint(runs["2-RF"])
     for parent, role in (("rectify", "2-RF"), ("reflow", "label")):  # reflow of a 2-RF is a 3-RF
-        checkpoint.config["parent"] = {"stage": parent}
+        checkpoint.config["stage"]["parent"] = {"stage": parent}
         assert role_of(checkpoint, "label") == role
 
 
@@ -40,10 +47,23 @@ def test_an_architecture_of_the_paper_is_known_by_its_size():
 
 def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations_and_a_star_tells_another_protocol():
     rows = [
-        {"role": "1-RF", "flow": "ours", "evaluations": n, "jsd/jsd": d, "protocol": f"paper, 10000 scans of {of}:x"}
-        for n, d, of in ((1, 0.5, "64x1024 against 7 of kitti_360"), (4, 0.4, "64x1024 against 7 of a"), (64, 0.03, ""))
+        {
+            "role": "1-RF",
+            "flow": "ours",
+            "evaluations": n,
+            "jsd/jsd": d,
+            "protocol": f"paper, 10000 scans of {of}:x",
+        }
+        for n, d, of in (
+            (1, 0.5, "64x1024 against 7 of kitti_360"),
+            (4, 0.4, "64x1024 against 7 of a"),
+            (64, 0.03, ""),
+        )
     ]
-    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in table_i(rows).splitlines()[2:]]
+    lines = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in table_i(rows).splitlines()[2:]
+    ]
     below = {tuple(a[:3]): b for a, b in itertools.pairwise(lines) if b[1] == "ours"}
     jsd = 3 + list(COLUMNS).index("jsd")
     assert {key: (line[2], line[jsd]) for key, line in below.items()} == {
@@ -56,32 +76,73 @@ def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations_and_a_
 def test_two_models_of_one_role_are_both_drawn(runs):
     both = [PaperRun("1-RF", role, load_checkpoint(run)) for role, run in runs.items()]
     figure = scans_figure(both, None)
-    assert sum(text.get_text().startswith("1-RF, ") for axes in figure.axes for text in axes.texts) == 3
+    assert (
+        sum(text.get_text().startswith("1-RF, ") for axes in figure.axes for text in axes.texts)
+        == 3
+    )
 
 
 def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):
-    figures = {"speed": {"evaluations": 64.0, "seconds": 1}, "jsd": {"jsd": 0.25}, "frd": {"frd": 200.0}}
+    figures = {
+        "speed": {"evaluations": 64.0, "seconds": 1},
+        "jsd": {"jsd": 0.25},
+        "frd": {"frd": 200.0},
+    }
     metrics = [{"metric": name, "figures": values} for name, values in figures.items()]
     hashes = weights_hash(load_checkpoint(runs["1-RF"])), "another model"
-    sets = [{"kind": "sampled", "set": "a", "weights": weights, "scans": 10000} for weights in hashes]
+    sets = [
+        {"kind": "sampled", "set": "a", "weights": weights, "scans": 10000} for weights in hashes
+    ]
     metrics[0]["protocol"] = {"name": "paper", "image": [64, 1024]}
     real = {"set": "kitti_360:x", "scans": 7, "split": "test"}
-    comparisons = [{"kind": "judged", "real": real, "generated": one, "metrics": metrics} for one in sets]
+    comparisons = [
+        {"kind": "judged", "real": real, "generated": one, "metrics": metrics} for one in sets
+    ]
     last, stage = "checkpoints/step-00000007.ckpt", {"name": "transfer"}
-    unnamed = [write_run(tmp_path / name, network(), stage, 0.3 + i) / last for i, name in enumerate("ab")]
-    own = write_run(tmp_path / "own", network(backbone=None, generator={"name": "vanilla_gan", "doublings": 2}), stage)
+    unnamed = [
+        write_run(tmp_path / name, network(), stage, 0.3 + i) / last for i, name in enumerate("ab")
+    ]
+    own = write_run(
+        tmp_path / "own",
+        network(backbone=None, generator={"name": "vanilla_gan", "doublings": 2}),
+        stage,
+    )
     results = tmp_path / "e.json"
     results.write_text(json.dumps({"comparisons": comparisons}))
-    options = f"1-RF={own}", "--results", results, "--steps", 2, "--device", "cpu", "--real", "simulated:0"
-    command = "report", "paper", f"9-RF={runs['2-RF']}", runs["1-RF"], *unnamed, *options, "-o", tmp_path / "out"
+    options = (
+        f"1-RF={own}",
+        "--results",
+        results,
+        "--steps",
+        2,
+        "--device",
+        "cpu",
+        "--real",
+        "simulated:0",
+    )
+    command = (
+        "report",
+        "paper",
+        f"9-RF={runs['2-RF']}",
+        runs["1-RF"],
+        *unnamed,
+        *options,
+        "-o",
+        tmp_path / "out",
+    )
     said = r2flow(*command).said
     assert all(f"({name})" in said for name in ("9-RF", f"a/{last}", f"b/{last}"))
-    assert "10000 scans of 64x1024 against 7 of test in kitti_360:x." in (tmp_path / "out" / "paper.md").read_text()
+    assert (
+        "10000 scans of 64x1024 against 7 of test in kitti_360:x."
+        in (tmp_path / "out" / "paper.md").read_text()
+    )
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
     architecture, _ = content["architectures"]
     assert architecture["frd"] == "200*"  # of a part of kitti_360
-    assert architecture["parameters"] == sum(p.numel() for p in network().generator.backbone.parameters())
+    assert architecture["parameters"] == sum(
+        p.numel() for p in network().generator.backbone.parameters()
+    )
     written = {path.stem for path in (tmp_path / "out").glob("*.png")}
     assert written == {"figure_6", "figure_7", "figure_8a", "figure_8b"}
     wide = write_run(tmp_path / "wide", network(sensor={**CONFIG["sensor"], "columns": 128}), stage)

@@ -13,10 +13,19 @@ def image(r: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "r", [np.zeros_like(E), np.where((E < -0.3) & (A > 3.0), 5.0, 0.0), np.full_like(E, 79.9), np.full_like(E, 1.45)]
+    "r",
+    [
+        np.zeros_like(E),
+        np.where((E < -0.3) & (A > 3.0), 5.0, 0.0),
+        np.full_like(E, 79.9),
+        np.full_like(E, 1.45),
+    ],
 )
 def test_extreme_scans_are_drawn(tmp_path, r):
-    for figure in (scan_figure(image(r), SENSOR.rays(), "scan"), contact_sheet([image(r)[:1]] * 2, SENSOR.rays())):
+    for figure in (
+        scan_figure(image(r), SENSOR.rays(), "scan"),
+        contact_sheet([image(r)[:1]] * 2, SENSOR.rays()),
+    ):
         assert save_figure(figure, tmp_path / "scan.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -54,7 +63,12 @@ def test_a_wall_on_the_left_is_drawn_on_the_left():
     pixels = figure_pixels(figure := scan_figure(image(wall), SENSOR.rays()))
     (axes,) = (axes for axes in figure.axes if axes.get_title("left").startswith("bird's-eye"))
     box, (height, width) = axes.get_position(), pixels.shape[:2]
-    left, right, top, bottom = box.x0 * width, box.x1 * width, (1 - box.y1) * height, (1 - box.y0) * height
+    left, right, top, bottom = (
+        box.x0 * width,
+        box.x1 * width,
+        (1 - box.y1) * height,
+        (1 - box.y0) * height,
+    )
     drawn = (pixels[int(top) + 4 : int(bottom) - 4, int(left) + 4 : int(right) - 4] < 200).any(-1)
     middle = drawn.shape[1] // 2
     assert drawn[:, : middle - 20].sum() > 50

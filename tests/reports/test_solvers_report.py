@@ -54,12 +54,16 @@ def test_the_least_measurable_error_is_above_the_true_error_of_the_reference(nam
 
 
 def test_without_a_reference_no_error_can_be_measured():
-    found = checkpoint_subject(trained(lambda t, x: 9 * x**2), "blow-up", num=2, steps=32, tolerance=1e-4)
+    found = checkpoint_subject(
+        trained(lambda t, x: 9 * x**2), "blow-up", num=2, steps=32, tolerance=1e-4
+    )
     assert found.floor == math.inf
     assert best_within(measure([found], configurations(["euler"], [4], [])), 4) is None
 
 
-def row(method: str, evaluations: float, error: float, metres: float = 1.0, floor: float = 0.0, **more) -> dict:
+def row(
+    method: str, evaluations: float, error: float, metres: float = 1.0, floor: float = 0.0, **more
+) -> dict:
     return {
         "problem": "p", "method": method, "label": method, "evaluations": evaluations, "seconds": 1.0, "error": error,
         "range_rms_m": metres, "scans": 2, "converged": 2, "floor": floor, "length": 10.0, **more,
@@ -83,40 +87,65 @@ def test_the_cheapest_solver_within_an_error_of_the_range():
 
 def test_the_exact_problems_are_reported_with_what_was_not_solved():
     subjects = problem_subjects(["straight", "stiff_1e4"], scans=3, elements=4)
-    rows = measure(subjects, configurations(["euler", "midpoint", "torchdiffeq:dopri5"], [4, 8], [1e-3]))
-    assert rows[0]["options"].startswith("--sampler euler:finish=0 --steps 4")  # whatever a flow's own sampler is
-    assert rows[-1]["options"] == "--sampler torchdiffeq:method=dopri5 --tolerance 0.001"  # as `r2flow sample` takes it
+    rows = measure(
+        subjects, configurations(["euler", "midpoint", "torchdiffeq:dopri5"], [4, 8], [1e-3])
+    )
+    # whatever a flow's own sampler is
+    assert rows[0]["options"].startswith("--sampler euler:finish=0 --steps 4")
+    # as `r2flow sample` takes it
+    assert rows[-1]["options"] == "--sampler torchdiffeq:method=dopri5 --tolerance 0.001"
     straight = {r["label"]: r for r in rows if r["problem"] == "straight"}
     assert straight["euler, 4 steps"]["error"] < 1e-12
     page = solvers_page(rows, None, [4, 8], {})
     assert "| stiff_1e4 | none |" in page.text[2]  # explicit steps of 1/4 end farther than x_0
     assert set(page.figures) == {"solvers_problems"}
     axes = page.figures["solvers_problems"].axes[0]
-    assert {text.get_size() for text in axes.get_xticklabels(which="both")} == {8}  # larger ones overlap
+    # larger ones overlap
+    assert {text.get_size() for text in axes.get_xticklabels(which="both")} == {8}
 
 
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog):
-    caplog.set_level(logging.NOTSET, "r2flow.flow")  # which the verb raises; set back after the test
+    # which the verb raises; set back after the test
+    caplog.set_level(logging.NOTSET, "r2flow.flow")
 
     def quick(checkpoint, *given, **options):
-        checkpoint.generator.backbone = GaussianFlow()  # random weights have narrow pulses, which few steps miss
+        # random weights have narrow pulses, which few steps miss
+        checkpoint.generator.backbone = GaussianFlow()
         return checkpoint_subject(checkpoint, *given, steps=16, tolerance=1e-3, **options)
 
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     monkeypatch.setattr("r2flow.plugins._loaded", {"of/mine.py": "of/mine.py"})
     out = tmp_path / "reports"
-    options = ["--num", 2, "--samplers", "euler,heun2,dopri5", "--budgets", "2,4", "--problems", "gaussian,rotating"]
+    options = [
+        "--num",
+        2,
+        "--samplers",
+        "euler,heun2,dopri5",
+        "--budgets",
+        "2,4",
+        "--problems",
+        "gaussian,rotating",
+    ]
     said = r2flow("report", "solvers", saved[0], "-o", out, *options).said
-    figures = {f"{name}.{end}" for name in ("solvers", "solvers_problems") for end in ("png", "pdf")}
-    assert {path.name for path in out.iterdir()} == figures | {f"solvers.{end}" for end in ("json", "md")}
+    figures = {
+        f"{name}.{end}" for name in ("solvers", "solvers_problems") for end in ("png", "pdf")
+    }
+    assert {path.name for path in out.iterdir()} == figures | {
+        f"solvers.{end}" for end in ("json", "md")
+    }
     assert f"**{saved[0]}**, 2 scans, against its reference solution" in said
     assert f"`r2flow sample {saved[0]} --plugin=of/mine.py --sampler " in said
     rows = json.loads((out / "solvers.json").read_text())["rows"]
-    assert len(rows) == 3 * 8  # two problems and the checkpoint; two steps of two methods and four tolerances
-    for name in ("euler", "heun2", "dopri5"):  # most steps, or the lowest tolerance, are the closest to the reference
+    # two problems and the checkpoint; two steps of two methods and four tolerances
+    assert len(rows) == 3 * 8
+    # most steps, or the lowest tolerance, are the closest to the reference
+    for name in ("euler", "heun2", "dopri5"):
         drawn = [row for row in rows if (row["problem"], row["method"]) == (str(saved[0]), name)]
         errors = [row["range_rms_m"] for row in drawn]
         assert errors[0] == max(errors) > min(errors) == errors[-1]
         assert drawn[-1]["drop_differs"] <= drawn[0]["drop_differs"] < 0.1
-        exact = [row["error"] for row in rows if (row["problem"], row["method"]) == ("rotating", name)]
-        assert exact == sorted(set(exact), reverse=True)  # of a smooth field, every step of the scale counts
+        exact = [
+            row["error"] for row in rows if (row["problem"], row["method"]) == ("rotating", name)
+        ]
+        # of a smooth field, every step of the scale counts
+        assert exact == sorted(set(exact), reverse=True)

@@ -54,13 +54,17 @@ class Parsed(HTMLParser):
 
     @property
     def data(self) -> dict:
-        (text,) = (text for attributes, text in self.all("script") if attributes.get("id") == "data")
+        (text,) = (
+            text for attributes, text in self.all("script") if attributes.get("id") == "data"
+        )
         return json.loads(text)
 
 
 def images(count: int, channels: int = 2, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    r = rng.uniform(1.45, 80, (count, 1, *SENSOR.shape)) * (rng.random((count, 1, *SENSOR.shape)) < 0.8)
+    r = rng.uniform(1.45, 80, (count, 1, *SENSOR.shape)) * (
+        rng.random((count, 1, *SENSOR.shape)) < 0.8
+    )
     return np.concatenate([r, rng.random(r.shape) * (r > 0)], 1)[:, :channels].astype(np.float32)
 
 
@@ -69,7 +73,9 @@ def page_of(*images: np.ndarray, rays: torch.Tensor = RAYS) -> str:
 
 
 def unpacked(data: dict, number: int, frame: int = 0) -> list[np.ndarray]:
-    """Range in metres, reflectance and class number of one image, by the format's description alone."""
+    """Range in metres, reflectance and class number of one image, by the format's description
+    alone.
+    """
     one = data["scans"][number]
     rays = data["rays"][one["rays"]]
     shape = rays["rows"], rays["columns"]
@@ -84,7 +90,8 @@ def test_what_is_unpacked_is_the_scan(farthest):
     given[1, 0, 3, 5] = farthest
     given[0, 0, 0, :2], given[1, 0, 0, 0] = (np.nan, -1), np.inf
     data = Parsed(page_of(*given)).data
-    for number, image in enumerate(np.nan_to_num(given.clip(0), posinf=0)):  # other values are not returns
+    # other values are not returns
+    for number, image in enumerate(np.nan_to_num(given.clip(0), posinf=0)):
         r, reflectance = unpacked(data, number)
         assert np.abs(r - image[0]).max() <= max(0.002, farthest / 65535 / 2) + 1e-5
         assert ((r == 0) == (image[0] == 0)).all()
@@ -97,7 +104,10 @@ def test_what_is_unpacked_is_the_scan(farthest):
 def test_labels_have_their_names_and_colours():
     ids = np.full(SENSOR.shape, 40)
     ids[:2], ids[7] = 10, 0
-    panels = [Panel("scan", image[None], RAYS, of) for image, of in zip(images(2, 1), (ids[None], None), strict=True)]
+    panels = [
+        Panel("scan", image[None], RAYS, of)
+        for image, of in zip(images(2, 1), (ids[None], None), strict=True)
+    ]
     data = Parsed(page(panels)).data
     assert [one["labels"] for one in data["scans"]] == [True, False]
     assert data["shown"] == {"reflectance": False, "label": True}
@@ -109,17 +119,28 @@ def test_labels_have_their_names_and_colours():
 
 def test_a_usual_scan_takes_about_130_kb():
     made = simulate(SENSORS["hdl64e"], 0, 0)
-    empty, one = (len(page_of(image, rays=SENSORS["hdl64e"].rays())) for image in (0 * made.image, made.image))
+    empty, one = (
+        len(page_of(image, rays=SENSORS["hdl64e"].rays())) for image in (0 * made.image, made.image)
+    )
     assert one - empty < 140_000
     assert empty < 70_000
 
 
 def test_no_text_is_read_as_html():
-    parsed = Parsed(page([Panel(ATTACK, images(1), RAYS, np.full((1, *SENSOR.shape), 600), [ATTACK])], ATTACK))
-    assert [attributes.get("type") for attributes, _ in parsed.all("script")] == ["application/json", "module"]
+    parsed = Parsed(
+        page([Panel(ATTACK, images(1), RAYS, np.full((1, *SENSOR.shape), 600), [ATTACK])], ATTACK)
+    )
+    assert [attributes.get("type") for attributes, _ in parsed.all("script")] == [
+        "application/json",
+        "module",
+    ]
     assert not parsed.all("img")
     assert parsed.data["scans"][0]["caption"] == parsed.data["frames"][0] == ATTACK
-    assert [said for _, said in parsed.all("title")] == [said.strip() for _, said in parsed.all("h1")] == [ATTACK]
+    assert (
+        [said for _, said in parsed.all("title")]
+        == [said.strip() for _, said in parsed.all("h1")]
+        == [ATTACK]
+    )
 
 
 def test_the_page_allows_its_own_script_alone_and_loads_nothing():
@@ -127,17 +148,25 @@ def test_the_page_allows_its_own_script_alone_and_loads_nothing():
     parsed = Parsed(text)
     (policy,) = (a["content"] for a, _ in parsed.all("meta") if "http-equiv" in a)
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
-    script = next(said for attributes, said in parsed.all("script") if attributes["type"] == "module")
+    script = next(
+        said for attributes, said in parsed.all("script") if attributes["type"] == "module"
+    )
     (style,) = (said for _, said in parsed.all("style"))
     for rule, said in (("script-src", script), ("style-src", style)):
-        assert rules[rule] == f"'sha256-{base64.b64encode(hashlib.sha256(said.encode()).digest()).decode()}'"
+        assert (
+            rules[rule]
+            == f"'sha256-{base64.b64encode(hashlib.sha256(said.encode()).digest()).decode()}'"
+        )
     assert rules["default-src"] == "'none'"
     assert "http://" not in text.replace("http-equiv", "")
     assert "https://" not in text
 
 
 def test_what_does_not_fit_is_refused():
-    for panels in ([], [Panel("scan", np.broadcast_to(np.float32(0), (MOST // 256 + 1, 1, 8, 32)), RAYS)]):
+    for panels in (
+        [],
+        [Panel("scan", np.broadcast_to(np.float32(0), (MOST // 256 + 1, 1, 8, 32)), RAYS)],
+    ):
         with pytest.raises(InputError, match="found (0|65537) images"):
             page(panels)
 
@@ -163,12 +192,20 @@ class TestTheVerb:
         np.testing.assert_allclose(r[40:60], (-1.73 / np.sin(e))[40:60], atol=0.003)
 
     @pytest.mark.parametrize("given", [["."], ["a", "b"], ["a/data/0.ply", "b/data/0.ply"]])
-    def test_what_is_shown_together_has_one_scale_of_reflectance_and_differs_in_caption(self, r2flow, tmp_path, given):
+    def test_what_is_shown_together_has_one_scale_of_reflectance_and_differs_in_caption(
+        self, r2flow, tmp_path, given
+    ):
         for name, highest in (("a", 80), ("b", 204)):
-            write_points(tmp_path / "in" / name / "data" / "0.ply", np.array([[10.0, 0, 0]]), np.array([highest]))
+            write_points(
+                tmp_path / "in" / name / "data" / "0.ply",
+                np.array([[10.0, 0, 0]]),
+                np.array([highest]),
+            )
         scans = [tmp_path / "in" / name for name in given]
         assert r2flow("show", *scans, "--format", "npy", "-o", tmp_path)[0] == 0
-        assert [np.load(tmp_path / f"{n}.npy")[1].max() for n in ("0", "0_2")] == pytest.approx([80 / 255, 0.8])
+        assert [np.load(tmp_path / f"{n}.npy")[1].max() for n in ("0", "0_2")] == pytest.approx(
+            [80 / 255, 0.8]
+        )
         assert r2flow("view", *scans, "-o", tmp_path / "a.html")[0] == 0
         data = Parsed((tmp_path / "a.html").read_text()).data
         assert [one["caption"] for one in data["scans"]] == ["a/data/0.ply", "b/data/0.ply"]
@@ -183,7 +220,10 @@ class TestTheVerb:
         assert data["frames"] == ["a.npy", "b.npy"]
 
     def test_draws_a_model_at_several_steps_from_the_same_noise(self, r2flow, saved, tmp_path):
-        assert r2flow("view", saved[0], "--num", 2, "--steps", "1,3", "--out", tmp_path / "a.html")[0] == 0
+        assert (
+            r2flow("view", saved[0], "--num", 2, "--steps", "1,3", "--out", tmp_path / "a.html")[0]
+            == 0
+        )
         data = Parsed((tmp_path / "a.html").read_text()).data
         names = [f"{saved[0]}, seed 0, {steps}" for steps in ("1 step", "3 steps")]
         assert [one["caption"] for one in data["scans"]] == names
@@ -207,7 +247,9 @@ class TestTheVerb:
         monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url))
         monkeypatch.setattr("sys.platform", "linux")
         monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-        monkeypatch.setenv("DISPLAY", ":0") if screen else monkeypatch.delenv("DISPLAY", raising=False)
+        monkeypatch.setenv("DISPLAY", ":0") if screen else monkeypatch.delenv(
+            "DISPLAY", raising=False
+        )
         said = r2flow("view", tmp_path / "a.npy").said
         assert opened == ([f"file://{said.strip()}"] if screen else [])
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

@@ -16,7 +16,8 @@ pytestmark = pytest.mark.browser
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 RAYS = SENSOR.rays()
-PIXELS = {(4, 30): 22.0, (6, 35): 14.0, (9, 28): 9.0, (3, 40): 31.0, (12, 33): 5.0}  # (row, column): range
+# (row, column): range
+PIXELS = {(4, 30): 22.0, (6, 35): 14.0, (9, 28): 9.0, (3, 40): 31.0, (12, 33): 5.0}
 DESKTOP, PHONE = {"width": 1200, "height": 800}, {"width": 390, "height": 844}
 
 
@@ -27,14 +28,23 @@ def lone(scale: float = 1.0) -> np.ndarray:
     return image
 
 
-def panel(*images: np.ndarray, caption: str = "scan", labels: np.ndarray | None = None, frames=()) -> Panel:
+def panel(
+    *images: np.ndarray, caption: str = "scan", labels: np.ndarray | None = None, frames=()
+) -> Panel:
     return Panel(caption, np.stack(images), RAYS, labels, frames)
 
 
 @pytest.fixture(scope="module")
 def chromium():
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install r2flow[browser]")
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="needs playwright: pip install r2flow[browser]"
+    )
+    found = next(
+        filter(
+            None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))
+        ),
+        None,
+    )
     if found is None:
         pytest.skip("no chromium is installed")
     arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -55,7 +65,10 @@ def opened(chromium, tmp_path):
         contexts.append(chromium.new_context(viewport=size, color_scheme="dark"))
         shown = contexts[-1].new_page()
         shown.on("pageerror", lambda error: errors.append(str(error)))
-        shown.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        shown.on(
+            "console",
+            lambda message: errors.append(message.text) if message.type == "error" else None,
+        )
         shown.on("request", lambda request: requests.append(request.url))
         shown.on("dialog", lambda dialog: errors.append(f"dialog {dialog.message}"))
         shown.goto(path.as_uri(), timeout=120_000)
@@ -73,7 +86,9 @@ def opened(chromium, tmp_path):
 def settle(shown) -> None:
     """Until what was asked for is drawn: two frames after the last movement has rested."""
     shown.wait_for_timeout(400)
-    shown.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    shown.evaluate(
+        "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )
 
 
 def screen(shown) -> np.ndarray:
@@ -92,9 +107,13 @@ def camera_of(shown) -> dict:
 
 
 def projected(point: np.ndarray, camera: dict, box: dict) -> np.ndarray:
-    """Where a pinhole camera sees a point on the screen: 50 degrees upwards, more where the view is narrow."""
+    """Where a pinhole camera sees a point on the screen: 50 degrees upwards, more where the view is
+    narrow.
+    """
     yaw, pitch = camera["yaw"], camera["pitch"]
-    ahead = -np.array([math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), math.sin(pitch)])
+    ahead = -np.array(
+        [math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), math.sin(pitch)]
+    )
     eye = np.array(camera["target"]) - camera["distance"] * ahead
     right = np.cross(ahead, [0, 0, 1])
     right /= np.linalg.norm(right)
@@ -115,12 +134,16 @@ def points_of(image: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
 
 
 def colour_of_range(r: float) -> np.ndarray:
-    """As the pictures of the project have it: turbo from 0.93 (2 m) down to 0.1 (80 m), by the logarithm."""
+    """As the pictures of the project have it: turbo from 0.93 (2 m) down to 0.1 (80 m), by the
+    logarithm.
+    """
     share = int(np.clip(math.log(r / 2) / math.log(40) * 256, 0, 255)) / 255
     return 255 * np.array(colormaps["turbo"](0.9 - 0.83 * share)[:3])
 
 
-@pytest.mark.parametrize("keys", [[], ["ArrowLeft"] * 4 + ["ArrowUp"] * 2, ["t"]], ids=["first", "turned", "above"])
+@pytest.mark.parametrize(
+    "keys", [[], ["ArrowLeft"] * 4 + ["ArrowUp"] * 2, ["t"]], ids=["first", "turned", "above"]
+)
 def test_points_are_drawn_where_the_camera_sees_them_in_the_colour_of_their_range(opened, keys):
     shown = opened(panel(lone()))
     colour_by(shown, "range")
@@ -131,12 +154,16 @@ def test_points_are_drawn_where_the_camera_sees_them_in_the_colour_of_their_rang
     drawn = 0
     for place, point in points_of(lone()).items():
         x, y = projected(point, camera, box)
-        if not (box["x"] + 40 < x < box["x"] + box["width"] - 40 and box["y"] + 40 < y < box["y"] + box["height"] - 40):
+        if not (
+            box["x"] + 40 < x < box["x"] + box["width"] - 40
+            and box["y"] + 40 < y < box["y"] + box["height"] - 40
+        ):
             continue
         drawn += 1
         at = pixels[round(y - 0.5), round(x - 0.5)]
         assert np.abs(at - colour_of_range(PIXELS[place])).max() <= 4, (place, at)
-        around = pixels[round(y) - 30 : round(y) + 30 : 59, round(x)]  # 30 pixels above and below: the background
+        # 30 pixels above and below: the background
+        around = pixels[round(y) - 30 : round(y) + 30 : 59, round(x)]
         assert (around.max(axis=1) < 45).all()
     assert drawn >= 3
 
@@ -172,12 +199,19 @@ def test_mouse_and_keys_move_the_camera(opened, size):
     shown.mouse.up(button="right")
     moved = camera_of(shown)
     # What was in the middle has followed the mouse.
-    middle = projected(turned["target"], moved, box) - [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+    middle = projected(turned["target"], moved, box) - [
+        box["x"] + box["width"] / 2,
+        box["y"] + box["height"] / 2,
+    ]
     assert middle == pytest.approx([50, 0], abs=0.5)
-    assert shown.locator("#tiles").evaluate("tiles => getComputedStyle(tiles).outlineStyle") == "none"
+    assert (
+        shown.locator("#tiles").evaluate("tiles => getComputedStyle(tiles).outlineStyle") == "none"
+    )
     assert math.dist(moved["target"], turned["target"]) > 0.5
     shown.mouse.wheel(0, -100)
-    shown.wait_for_function("distance => window.view.camera.distance < distance", arg=moved["distance"])
+    shown.wait_for_function(
+        "distance => window.view.camera.distance < distance", arg=moved["distance"]
+    )
     shown.keyboard.press("r")
     assert camera_of(shown) == first
     shown.locator("#reset").click()
@@ -195,14 +229,21 @@ def test_the_cursor_finds_the_point_and_back(opened):
     strip = shown.locator(".image").first.bounding_box()
     for (row, column), r in PIXELS.items():
         shown.mouse.move(
-            strip["x"] + (column + 0.5) / 64 * strip["width"], strip["y"] + (row + 0.5) / 16 * strip["height"]
+            strip["x"] + (column + 0.5) / 64 * strip["width"],
+            strip["y"] + (row + 0.5) / 16 * strip["height"],
         )
-        assert shown.locator("#readout").inner_text().startswith(f"row {row}, column {column} · {r:.2f} m")
+        assert (
+            shown.locator("#readout")
+            .inner_text()
+            .startswith(f"row {row}, column {column} · {r:.2f} m")
+        )
         for tile, image in ((first, lone()), (second, lone(0.8))):
             box, mark = tile.bounding_box(), tile.locator(".mark").bounding_box()
             at = projected(points_of(image)[row, column], camera_of(shown), box)
             assert [mark["x"] + 9, mark["y"] + 9] == pytest.approx(at, abs=1.0)
-        shown.mouse.move(*projected(points_of(lone())[row, column], camera_of(shown), first.bounding_box()))
+        shown.mouse.move(
+            *projected(points_of(lone())[row, column], camera_of(shown), first.bounding_box())
+        )
         assert shown.locator("#readout").inner_text().startswith(f"row {row}, column {column} ·")
     shown.mouse.move(strip["x"] + 3, strip["y"] + strip["height"] / 2)
     assert "no return" in shown.locator("#readout").inner_text()
@@ -215,7 +256,9 @@ def test_the_slider_goes_through_the_frames(opened):
     shown.keyboard.press(".")
     shown.wait_for_function("() => document.getElementById('frame-name').textContent === 't = 1'")
     for strip, r in zip(strips, (7.0, 14.0), strict=True):
-        shown.mouse.move(strip["x"] + 35.5 / 64 * strip["width"], strip["y"] + 6.5 / 16 * strip["height"])
+        shown.mouse.move(
+            strip["x"] + 35.5 / 64 * strip["width"], strip["y"] + 6.5 / 16 * strip["height"]
+        )
         assert f"column 35 · {r:.2f} m" in shown.locator("#readout").inner_text()
 
 
@@ -224,7 +267,8 @@ def test_only_what_is_there_can_be_coloured(opened):
     assert shown.locator("#modes button").all_inner_texts() == ["range", "height"]
     assert shown.locator("#player").is_hidden()
     colour_by(shown, "range")
-    assert shown.locator("#legend span").all_inner_texts() == ["range 2 m", "12.6 m", "80 m"]  # sqrt(2 x 80) between
+    # sqrt(2 x 80) between
+    assert shown.locator("#legend span").all_inner_texts() == ["range 2 m", "12.6 m", "80 m"]
     shown = opened(panel(lone(), labels=np.full((1, *SENSOR.shape), 40)))
     colour_by(shown, "label")
     assert shown.locator("#legend span").all_inner_texts() == ["road", "no class"]

@@ -24,7 +24,10 @@ from tests.fields import Field
 
 def test_the_schedule_is_the_reference_s(shared):
     reference = torch.load(shared / "oracle" / "training.pt", weights_only=False)["lr"]
-    factors = [learning_rate_factor(step, reference["warmup"], reference["total"]) for step in reference["steps"]]
+    factors = [
+        learning_rate_factor(step, reference["warmup"], reference["total"])
+        for step in reference["steps"]
+    ]
     assert factors == pytest.approx(reference["factor"], abs=1e-6)
     assert learning_rate_factor(0, 0, 1) == 1  # no warm-up
 
@@ -78,9 +81,13 @@ def test_an_untrained_stage_has_the_loss_of_predicting_nothing():
     assert loss.item() == pytest.approx(M**2 + S**2 + 1, abs=5 / math.sqrt(x_0.numel()))
 
 
-@pytest.mark.parametrize("wrong", [torch.Tensor.sum, lambda loss: loss[:1], lambda loss: loss[:, None]])
+@pytest.mark.parametrize(
+    "wrong", [torch.Tensor.sum, lambda loss: loss[:1], lambda loss: loss[:, None]]
+)
 def test_a_loss_gives_a_value_a_scan(monkeypatch, wrong):
-    monkeypatch.setitem(LOSSES._entries, "wrong", lambda v_t, u_t: wrong((v_t - u_t).square().flatten(1).mean(1)))
+    monkeypatch.setitem(
+        LOSSES._entries, "wrong", lambda v_t, u_t: wrong((v_t - u_t).square().flatten(1).mean(1))
+    )
     with pytest.raises(InputError, match=r"one value a scan, \(256,\), found"):
         Rectify(generator=affine(), loss="wrong").training_step(pairs(0), 0)
 
@@ -91,13 +98,17 @@ X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
 @pytest.mark.parametrize(
     ("stage", "options", "steps"), [(Reflow, {}, 1), *((Distill, {"steps": k}, k) for k in (1, 4))]
 )
-def test_a_reflowed_gaussian_takes_one_step_and_a_distilled_one_its_own_number(stage, options: dict, steps: int):
+def test_a_reflowed_gaussian_takes_one_step_and_a_distilled_one_its_own_number(
+    stage, options: dict, steps: int
+):
     flow = fitted(stage(generator=affine(), **options), pairs, 1200).generator
     end = solve(flow.velocity, X_0, steps=steps).x.detach()
     torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
 
 
-@pytest.mark.parametrize(("k", "grid"), [(1, "uniform"), (2, "uniform"), (4, "uniform"), (4, "power:2")])
+@pytest.mark.parametrize(
+    ("k", "grid"), [(1, "uniform"), (2, "uniform"), (4, "uniform"), (4, "power:2")]
+)
 def test_distillation_trains_at_the_times_of_its_steps_alone(k: int, grid: str):
     seen = set()
 
@@ -109,15 +120,17 @@ def test_distillation_trains_at_the_times_of_its_steps_alone(k: int, grid: str):
     stage = Distill(generator=affine(Spy()), steps=k, grid=grid)
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     stage.training_step(pairs(0), 0)
-    assert seen == ({i / k for i in range(k)} if grid == "uniform" else {0, 7 / 16, 12 / 16, 15 / 16})
+    assert seen == (
+        {i / k for i in range(k)} if grid == "uniform" else {0, 7 / 16, 12 / 16, 15 / 16}
+    )
     assert stage.generator.sampler == build_sampler("euler", steps=k, grid=grid)
     assert stage.generator.fixed
 
 
 def test_the_paper_s_loss_and_times_are_the_defaults():
     stage = Reflow(generator=affine())
-    # Most of the U-shaped density lies at the ends: e^(4t) + e^(4(1 - t)) puts 2 e^2 sinh(1) / (e^4 - 1) = 0.324 inside
-    # (1/4, 3/4), where a uniform one has 0.5.
+    # Most of the U-shaped density lies at the ends: e^(4t) + e^(4(1 - t)) puts 2 e^2 sinh(1) / (e^4
+    # - 1) = 0.324 inside (1/4, 3/4), where a uniform one has 0.5.
     t = stage.time(torch.linspace(0, 1, 20001)[:-1])
     assert ((t > 0.25) & (t < 0.75)).float().mean().item() == pytest.approx(0.324, abs=2e-3)
     r = torch.full((256, 1, 2, 2), 0.3)
@@ -129,8 +142,14 @@ def test_the_paper_s_loss_and_times_are_the_defaults():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        *(({"name": name, "learning_rat": 1.0}, r"Did you mean 'learning_rate'\?") for name in STAGES),
-        ({"name": "distill", "steps": 0}, "stage 'distill': steps: input should be greater than or equal to 1"),
+        *(
+            ({"name": name, "learning_rat": 1.0}, r"Did you mean 'learning_rate'\?")
+            for name in STAGES
+        ),
+        (
+            {"name": "distill", "steps": 0},
+            "stage 'distill': steps: input should be greater than or equal to 1",
+        ),
         ({"name": "distill", "steps": 2, "time": {"name": "uniform"}}, "leave time out"),
     ],
 )
@@ -139,9 +158,16 @@ def test_what_cannot_be_is_refused(options, message):
         STAGES.build({**options, "generator": affine()})
 
 
-@pytest.mark.parametrize(("stage", "data"), [("reflow", "simulated"), ("distill", "folder"), ("rectify", "pairs")])
+@pytest.mark.parametrize(
+    ("stage", "data"), [("reflow", "simulated"), ("distill", "folder"), ("rectify", "pairs")]
+)
 def test_stage_and_data_belong_together(stage: str, data: str, saved):
-    given = [f"stage={stage}", f"data={data}", f"stage.parent={saved[0]}", "data.root=x" * (data == "folder")]
+    given = [
+        f"stage={stage}",
+        f"data={data}",
+        f"stage.parent={saved[0]}",
+        "data.root=x" * (data == "folder"),
+    ]
     config = compose([one for one in given if one])
     with pytest.raises(InputError, match=f"stage={stage} learns from"):
         build(config)
@@ -149,14 +175,20 @@ def test_stage_and_data_belong_together(stage: str, data: str, saved):
 
 def test_stage_and_data_belong_together_in_lightning_too(tmp_path):
     trainer, data = quiet_trainer(tmp_path, max_steps=1), ScanDataModule(sensor=SENSOR)
-    with pytest.raises(InputError, match="stage=reflow learns from pairs: give data=pairs, not simulated"):
+    with pytest.raises(
+        InputError, match="stage=reflow learns from pairs: give data=pairs, not simulated"
+    ):
         trainer.fit(Reflow(generator=build_generator(CONFIG)), data)
 
 
 def test_a_straightened_generator_is_drawn_without_fresh_noise():
     """Its pairs of noise and scan belong together; SDE and DDPM would part them."""
     own = build_sampler("heun2", steps=5)
-    for before, after in ((build_sampler("sde"), USUAL), (build_sampler("renoise"), USUAL), (own, own)):
+    for before, after in (
+        (build_sampler("sde"), USUAL),
+        (build_sampler("renoise"), USUAL),
+        (own, own),
+    ):
         flow = affine()
         flow.sampler = before
         assert Reflow(generator=flow).generator.sampler == after

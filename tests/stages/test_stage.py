@@ -42,7 +42,9 @@ class Automatic(Stage):
 
     def on_train_batch_end(self, outputs, batch, batch_idx) -> None:
         schedules = self.lr_schedulers()
-        self.rates.append((schedules[0] if isinstance(schedules, list) else schedules).get_last_lr()[0])
+        self.rates.append(
+            (schedules[0] if isinstance(schedules, list) else schedules).get_last_lr()[0]
+        )
 
 
 class Manual(Automatic):
@@ -60,7 +62,9 @@ class Manual(Automatic):
 
 
 def fitted(stage: Stage, folder) -> Stage:
-    trainer = quiet_trainer(folder, max_steps=6, gradient_clip_val=CLIP if stage.automatic_optimization else None)
+    trainer = quiet_trainer(
+        folder, max_steps=6, gradient_clip_val=CLIP if stage.automatic_optimization else None
+    )
     trainer.fit(stage, BATCHES)
     assert trainer.global_step == 6
     return stage
@@ -71,9 +75,14 @@ def test_steps_of_its_own_are_clipped_scheduled_and_counted_as_lightning_s(tmp_p
     for a, b in zip(automatic.generator.parameters(), manual.generator.parameters(), strict=True):
         assert torch.equal(a, b)
     assert manual.rates == automatic.rates
-    assert automatic.rates[:2] == pytest.approx([0.05, 0.1])  # a warm-up of two images is one of two steps
+    # a warm-up of two images is one of two steps
+    assert automatic.rates[:2] == pytest.approx([0.05, 0.1])
     assert not torch.equal(manual.other.weight, Manual().other.weight)
-    stage = type("Own", (Automatic,), {"training_step": lambda self, batch, _: self.other(batch).square().sum()})()
+    stage = type(
+        "Own",
+        (Automatic,),
+        {"training_step": lambda self, batch, _: self.other(batch).square().sum()},
+    )()
     assert not torch.equal(fitted(stage, tmp_path).other.weight, Automatic().other.weight)
 
 
@@ -88,14 +97,18 @@ class Given(SingleLoss):
 
 def test_the_logged_loss_is_the_mean_over_the_parts_of_a_step(tmp_path):
     trainer = quiet_trainer(tmp_path, max_steps=2, accumulate_grad_batches=2)
-    trainer.fit(Given(generator=Linear()), DataLoader([batch_of(loss) for loss in (1.0, 2.0, 4.0, 8.0)]))
+    trainer.fit(
+        Given(generator=Linear()), DataLoader([batch_of(loss) for loss in (1.0, 2.0, 4.0, 8.0)])
+    )
     assert trainer.callback_metrics["train/loss"] == (4 + 8) / 2
 
 
 @pytest.mark.parametrize("loss", [None, 1.0, torch.ones(()), torch.ones(2, requires_grad=True)])
 def test_a_loss_without_a_gradient_or_of_many_numbers_is_refused(loss):
     stage = type("Wrong", (Given,), {"regression_loss": lambda *_: loss})(generator=Linear())
-    with pytest.raises(InputError, match="regression_loss of a Wrong must be one number with a gradient"):
+    with pytest.raises(
+        InputError, match="regression_loss of a Wrong must be one number with a gradient"
+    ):
         stage.training_step(batch_of(0.0), 0)
 
 
@@ -126,7 +139,9 @@ def test_gradients_are_clipped_after_they_were_scaled_back(tmp_path, slope):
     stage = Slope(slope)
     before = stage.generator.layer.bias.detach().clone()
     quiet_trainer(tmp_path, max_steps=1, plugins=[scaled]).fit(stage, BATCHES)
-    assert float(before - stage.generator.layer.bias.detach()) == pytest.approx(min(slope, CLIP), rel=1e-3)
+    assert float(before - stage.generator.layer.bias.detach()) == pytest.approx(
+        min(slope, CLIP), rel=1e-3
+    )
 
 
 RATE, MOMENTUM = 0.05, 0.9
@@ -135,7 +150,9 @@ ADAMW = {"lr": 1e-2, "betas": (0.9, 0.99), "weight_decay": 0.1}
 
 def network() -> nn.Sequential:
     torch.manual_seed(0)
-    return nn.Sequential(nn.Conv2d(2, 16, 3), nn.Conv2d(16, 32, 3), nn.Flatten(), nn.Linear(32, 48), nn.Linear(48, 2))
+    return nn.Sequential(
+        nn.Conv2d(2, 16, 3), nn.Conv2d(16, 32, 3), nn.Flatten(), nn.Linear(32, 48), nn.Linear(48, 2)
+    )
 
 
 def gradients(model: nn.Module, seed: int) -> None:
@@ -150,7 +167,8 @@ def test_singular_values_come_near_one_and_directions_stay(shape):
     u, _, v = torch.linalg.svd(matrix.double(), full_matrices=False)
     in_its_directions = u.T @ orthogonalised(matrix).double() @ v.T
     values = in_its_directions.diagonal()
-    # five steps of the polynomial leave [0.68, 1.14] for values above 1e-2 of the largest; bfloat16 adds its rounding
+    # five steps of the polynomial leave [0.68, 1.14] for values above 1e-2 of the largest; bfloat16
+    # adds its rounding
     assert values.min() > 0.6
     assert values.max() < 1.2
     assert (in_its_directions - values.diag()).abs().max() < 0.05
@@ -158,7 +176,10 @@ def test_singular_values_come_near_one_and_directions_stay(shape):
 
 
 def test_matrices_between_hidden_layers_are_learned_so():
-    assert {name for name, p in network().named_parameters() if is_hidden_matrix(p)} == {"1.weight", "3.weight"}
+    assert {name for name, p in network().named_parameters() if is_hidden_matrix(p)} == {
+        "1.weight",
+        "3.weight",
+    }
 
 
 def test_all_other_weights_are_adamw_s():
@@ -172,7 +193,8 @@ def test_all_other_weights_are_adamw_s():
         assert torch.equal(p, q) != is_hidden_matrix(p)
 
 
-@pytest.mark.parametrize(("layer", "factor"), [(1, 1), (3, 1.5**0.5)])  # 32 rows of 144 columns, 48 of 32
+# 32 rows of 144 columns, 48 of 32
+@pytest.mark.parametrize(("layer", "factor"), [(1, 1), (3, 1.5**0.5)])
 def test_a_step_of_a_matrix_is_the_equation(layer, factor):
     model = network()
     ours = Muon(model.parameters(), RATE, MOMENTUM, **ADAMW)
@@ -184,7 +206,8 @@ def test_a_step_of_a_matrix_is_the_equation(layer, factor):
         g = matrix.grad.flatten(1)
         average = MOMENTUM * average + (1 - MOMENTUM) * g
         step = orthogonalised((1 - MOMENTUM) * g + MOMENTUM * average)
-        expected = expected * (1 - rate * 0.1) - rate * factor * step  # sqrt(max(1, rows / columns))
+        # sqrt(max(1, rows / columns))
+        expected = expected * (1 - rate * 0.1) - rate * factor * step
         ours.step()
     assert torch.allclose(matrix.flatten(1), expected, atol=1e-5)
 
@@ -198,11 +221,15 @@ def test_it_goes_on_from_its_state_bit_for_bit():
     resumed.load_state_dict(copy.deepcopy(ours.state_dict()))
     for net, optimizer in ((model, ours), (later, resumed)):
         gradients(net, 1), optimizer.step()
-    assert all(torch.equal(p, q) for p, q in zip(model.parameters(), later.parameters(), strict=True))
+    assert all(
+        torch.equal(p, q) for p, q in zip(model.parameters(), later.parameters(), strict=True)
+    )
 
 
 def test_a_closure_clears_the_gradients_of_all_weights():
-    """Lightning hands the whole of a step over as a closure; gradients of earlier steps must not stay."""
+    """Lightning hands the whole of a step over as a closure; gradients of earlier steps must not
+    stay.
+    """
     model, other = network(), network()
     ours, theirs = (Muon(net.parameters(), RATE, **ADAMW) for net in (model, other))
     for x in torch.randn(3, 2, 2, 5, 5, generator=torch.Generator().manual_seed(0)):
@@ -217,4 +244,6 @@ def test_a_closure_clears_the_gradients_of_all_weights():
         other.zero_grad()
         other(x).square().sum().backward()
         theirs.step()
-    assert all(torch.equal(p, q) for p, q in zip(model.parameters(), other.parameters(), strict=True))
+    assert all(
+        torch.equal(p, q) for p, q in zip(model.parameters(), other.parameters(), strict=True)
+    )

@@ -48,24 +48,40 @@ def flow() -> TransferFlow:
 @pytest.fixture(scope="module")
 def scans() -> torch.Tensor:
     draw = torch.Generator().manual_seed(3)
-    images = torch.stack([2 + 70 * torch.rand(3, 8, 32, generator=draw), torch.rand(3, 8, 32, generator=draw)], 1)
+    images = torch.stack(
+        [2 + 70 * torch.rand(3, 8, 32, generator=draw), torch.rand(3, 8, 32, generator=draw)], 1
+    )
     return images * (torch.rand(3, 1, 8, 32, generator=draw) > 0.2)
 
 
 def measured(images: torch.Tensor, text: str = "rows:4") -> torch.Tensor:
-    mask = torch.from_numpy(parse_mask(text)(np.ones(images.shape[-2:], bool), noise.generator(0, "condition", 0)))
+    mask = torch.from_numpy(
+        parse_mask(text)(np.ones(images.shape[-2:], bool), noise.generator(0, "condition", 0))
+    )
     return ray_states(images, mask)
 
 
-def answered(flow: TransferFlow, images: torch.Tensor, state: torch.Tensor, sampler: str = "jump:steps=1", **how):
+def answered(
+    flow: TransferFlow,
+    images: torch.Tensor,
+    state: torch.Tensor,
+    sampler: str = "jump:steps=1",
+    **how,
+):
     condition = condition_of(flow.space, images, state)
     draws = Draws(0, range(len(images)))
-    return flow(draws.start(flow.noise_shape), condition, sampler=build_sampler(sampler), draws=draws, **how)
+    return flow(
+        draws.start(flow.noise_shape), condition, sampler=build_sampler(sampler), draws=draws, **how
+    )
 
 
-@pytest.mark.parametrize("sampler", ["jump:steps=1", "jump:steps=4", "euler:steps=3", "sde:steps=3:churn=0"])
+@pytest.mark.parametrize(
+    "sampler", ["jump:steps=1", "jump:steps=4", "euler:steps=3", "sde:steps=3:churn=0"]
+)
 @pytest.mark.parametrize("mask", ["rows:4", "points:0.3"])
-def test_known_rays_come_back_to_the_bit_and_the_others_within_the_sensor(flow, scans, sampler, mask):
+def test_known_rays_come_back_to_the_bit_and_the_others_within_the_sensor(
+    flow, scans, sampler, mask
+):
     state = measured(scans, mask)
     known = condition_of(flow.space, scans, state)
     for each in (flow, copy.deepcopy(flow).bfloat16()):
@@ -78,7 +94,9 @@ def test_known_rays_come_back_to_the_bit_and_the_others_within_the_sensor(flow, 
 
 
 def test_before_it_has_learned_a_plane_comes_back_whole():
-    """1 / r is linear in the tangent of elevation on the ground, and so in the rows of a narrow view."""
+    """1 / r is linear in the tangent of elevation on the ground, and so in the rows of a narrow
+    view.
+    """
     flow = built(nought=True, sensor={"name": "hdl64e", "rows": 64, "columns": 32})
     elevation = flow.space.rays[0]
     r = torch.where(elevation < math.radians(-5), 1.73 / (-elevation).sin().clamp(min=1e-3), 0)
@@ -87,7 +105,8 @@ def test_before_it_has_learned_a_plane_comes_back_whole():
     answer = flow.space.decode(answered(flow, images, state).x)[0]
     inner = (r > 0) & (r.roll(1, 0) > 0) & (r.roll(-1, 0) > 0) & (state[0] == Ray.UNKNOWN)
     assert inner.sum() > 500
-    assert ((answer[0] - r).abs() / r)[inner].max() < 1e-3  # a chord's sagitta: step^2 / 2 = 3e-5, and float32
+    # a chord's sagitta: step^2 / 2 = 3e-5, and float32
+    assert ((answer[0] - r).abs() / r)[inner].max() < 1e-3
     assert answer[1][inner].allclose(torch.tensor(0.4), atol=1e-5)
 
 
@@ -101,8 +120,12 @@ def test_the_intensities_of_another_sensor_may_have_any_scale(flow, scans):
     other, runs = flow.at(flow.space.through(build_sensor("vlp16", 8, 32))), []
     bright, dim = (scans * torch.tensor([1.0, share])[:, None, None] for share in (0.4, 0.1))
     state = measured(scans)
-    one, quarter = (other.space.decode(answered(other, images, state).x) for images in (bright, dim))
-    torch.testing.assert_close(quarter, one * torch.tensor([1.0, 0.25])[:, None, None], rtol=1e-4, atol=1e-5)
+    one, quarter = (
+        other.space.decode(answered(other, images, state).x) for images in (bright, dim)
+    )
+    torch.testing.assert_close(
+        quarter, one * torch.tensor([1.0, 0.25])[:, None, None], rtol=1e-4, atol=1e-5
+    )
     assert one[:, 1].max() > 0.1
     counted = other.backbone.register_forward_hook(lambda *_: runs.append(1))
     assert answered(other, bright, state).evaluations.tolist() == [len(runs)] * len(scans)
@@ -112,21 +135,33 @@ def test_the_intensities_of_another_sensor_may_have_any_scale(flow, scans):
 def test_the_returns_of_another_sensor_are_those_of_higher_rows(flow, scans):
     other, state = copy.copy(flow), condition_of(flow.space, scans, measured(scans))
     other.foreign, steps = True, torch.full((3, 2), 0.01)
-    about, elevations = Surroundings.of(flow.space, state, True, steps), flow.elevations.expand(3, -1)
-    rows, raised = (flow.rows(e, steps, torch.zeros(3) > 0) for e in (elevations, elevations + math.radians(3)))
+    about, elevations = (
+        Surroundings.of(flow.space, state, True, steps),
+        flow.elevations.expand(3, -1),
+    )
+    rows, raised = (
+        flow.rows(e, steps, torch.zeros(3) > 0) for e in (elevations, elevations + math.radians(3))
+    )
     t, x = torch.zeros(()), about.start
     assert torch.equal(x[state["known"] > 0], state["image"][state["known"] > 0])
-    found, same, above = (f.answers(t, x, about, r) for f, r in ((other, rows), (flow, rows), (flow, raised)))
+    found, same, above = (
+        f.answers(t, x, about, r) for f, r in ((other, rows), (flow, rows), (flow, raised))
+    )
     torch.testing.assert_close((found.ranges, found.returns), (same.ranges, above.returns))
     assert not torch.equal(same.returns, above.returns)
 
 
 def test_a_flow_for_another_sensor_starts_as_the_parents_answer_to_any_sensor(flow, scans):
-    other, images = built(sensor={"name": "vlp16", "rows": 16, "columns": 64}), scans[:, :1].repeat(1, 1, 2, 2)
+    other, images = (
+        built(sensor={"name": "vlp16", "rows": 16, "columns": 64}),
+        scans[:, :1].repeat(1, 1, 2, 2),
+    )
     torch.nn.init.zeros_(other.backbone.answer.weight)
     other.start_from(flow)
     state = measured(images)
-    mine, parents = (f.space.decode(answered(f, images, state).x)[:, 0] for f in (other, flow.at(other.space)))
+    mine, parents = (
+        f.space.decode(answered(f, images, state).x)[:, 0] for f in (other, flow.at(other.space))
+    )
     both = (mine > 0) & (parents > 0)
     assert both.float().mean() > 0.5
     assert torch.equal(mine[both], parents[both])
@@ -151,14 +186,18 @@ def answers() -> Answers:
 def test_reflectance_is_the_mean_over_the_candidates(flow):
     p = torch.tensor([0.25, 0.75, 0, 0, 0, 0, 0])[None, :, None, None]
     strengths = torch.linspace(0.1, 0.7, 7)[None, :, None, None]
-    sure = Answers(p.clamp(min=1e-30).log(), 2 + 0 * p, 0 * p + 0.1, torch.ones(1, 1, 1, 1), strengths)
+    sure = Answers(
+        p.clamp(min=1e-30).log(), 2 + 0 * p, 0 * p + 0.1, torch.ones(1, 1, 1, 1), strengths
+    )
     made = flow.space.decode(flow._chosen(sure))[0, :, 0, 0]
     torch.testing.assert_close(made, torch.tensor([math.exp(2), 0.25 * 0.1 + 0.75 * 0.2]))
 
 
 def integral(answers: Answers, end: float, weight=lambda x: 1.0) -> float:
     def weighed(x: float) -> float:
-        return weight(x) * float(answers.log_density(torch.tensor(x, dtype=torch.float64).reshape(1, 1, 1, 1)).exp())
+        return weight(x) * float(
+            answers.log_density(torch.tensor(x, dtype=torch.float64).reshape(1, 1, 1, 1)).exp()
+        )
 
     kinks = sorted(x for x in answers.ranges.flatten().tolist() if x < end)
     return quad(weighed, -12, end, points=kinks or None, limit=200)[0]
@@ -166,13 +205,17 @@ def integral(answers: Answers, end: float, weight=lambda x: 1.0) -> float:
 
 def test_the_density_is_one_and_its_expected_error_that_of_an_integral(answers):
     assert integral(answers, 12) == pytest.approx(1, abs=1e-4)
-    off = [integral(answers, 12, lambda x, m=m: abs(x - m)) for m in answers.ranges.flatten().tolist()]
+    off = [
+        integral(answers, 12, lambda x, m=m: abs(x - m)) for m in answers.ranges.flatten().tolist()
+    ]
     assert int(answers.least_error()) == int(np.argmin(off))
 
 
 @pytest.mark.parametrize("u", [0.02, 0.3, 0.5, 0.95])
 def test_a_quantile_is_where_the_density_has_its_share(answers, u):
-    assert integral(answers, float(answers.quantile(torch.full((1, 1, 1, 1), u)))) == pytest.approx(u, abs=1e-4)
+    assert integral(answers, float(answers.quantile(torch.full((1, 1, 1, 1), u)))) == pytest.approx(
+        u, abs=1e-4
+    )
 
 
 def test_transported_answers_return_as_often_as_expected_and_keep_what_is_known(flow, scans):
@@ -180,7 +223,9 @@ def test_transported_answers_return_as_often_as_expected_and_keep_what_is_known(
     condition = condition_of(flow.space, scans[:1], state[:1])
     many = {name: value.expand(400, -1, -1, -1) for name, value in condition.items()}
     draws = Draws(0, range(400))
-    made = flow(draws.start(flow.noise_shape), many, sampler=build_sampler("transport"), draws=draws)
+    made = flow(
+        draws.start(flow.noise_shape), many, sampler=build_sampler("transport"), draws=draws
+    )
     known = many["known"] > 0
     assert torch.equal(made.x[known], many["image"][known])
     assert (made.evaluations == 1).all()
@@ -188,7 +233,9 @@ def test_transported_answers_return_as_often_as_expected_and_keep_what_is_known(
     seen: list[Answers] = []
     given, flow.answers = flow.answers, lambda *args: seen.append(given(*args)) or seen[-1]
     flow(torch.zeros(1, *flow.noise_shape), condition, sampler=build_sampler("transport"))
-    sharp = flow(draws.start(flow.noise_shape)[:1], condition, sampler=build_sampler("transport:residual=0"))
+    sharp = flow(
+        draws.start(flow.noise_shape)[:1], condition, sampler=build_sampler("transport:residual=0")
+    )
     del flow.answers
     hidden = (state[0] == Ray.UNKNOWN) & (share > 0)
     off = (share - seen[0].returns.sigmoid()[0, 0])[hidden]
@@ -196,14 +243,19 @@ def test_transported_answers_return_as_often_as_expected_and_keep_what_is_known(
     assert off.mean().abs() < 0.01
     r = flow.space.decode(sharp.x)[:, :1]
     near = (seen[1].ranges - r.clamp(min=1e-3).log()).abs().amin(1, keepdim=True)
-    assert near[(r > 0) & (state[:1, None] == Ray.UNKNOWN)].max() < 1e-4  # each ray is one of its candidates
+    # each ray is one of its candidates
+    assert near[(r > 0) & (state[:1, None] == Ray.UNKNOWN)].max() < 1e-4
 
 
 def test_smoothed_noise_is_standard_normal_and_agrees_within_the_correlation_length():
     elevations = torch.linspace(0.05, -0.05, 5)
     hidden = torch.rand(1, 1, 5, 64, generator=torch.Generator().manual_seed(0)) < 0.7
     units = torch.eye(5 * 64).reshape(-1, 1, 5, 64)  # a linear map: these are its columns
-    matrix = smoothed(units, hidden.expand(len(units), -1, -1, -1), elevations).reshape(len(units), -1).T.double()
+    matrix = (
+        smoothed(units, hidden.expand(len(units), -1, -1, -1), elevations)
+        .reshape(len(units), -1)
+        .T.double()
+    )
     covariance = matrix @ matrix.T
     rays = torch.cartesian_prod(torch.arange(5), torch.arange(64))[hidden.flatten()]
     covariance = covariance[hidden.flatten()][:, hidden.flatten()]
@@ -231,8 +283,10 @@ def test_the_velocity_leads_to_the_mean_of_the_answers(flow, scans, monkeypatch)
     (answers,) = seen
     p, q = answers.logits.exp().double().numpy(), answers.returns.sigmoid().double().numpy()[:, 0]
     r = np.exp(answers.ranges.double().numpy()).clip(1.45, 80)
-    mean = q * (p * (2 * np.log2(r + 1) / np.log2(81) - 1)).sum(1) - (1 - q)  # the paper's eq. 5; -1 is no return
-    hidden = (state == Ray.UNKNOWN).numpy() & (x[:, 0] != -1).numpy()  # rows beyond the measured ones stay empty
+    # the paper's eq. 5; -1 is no return
+    mean = q * (p * (2 * np.log2(r + 1) / np.log2(81) - 1)).sum(1) - (1 - q)
+    # rows beyond the measured ones stay empty
+    hidden = (state == Ray.UNKNOWN).numpy() & (x[:, 0] != -1).numpy()
     assert hidden.sum() > 300
     assert np.allclose(x[:, 0].numpy()[hidden], mean[hidden], atol=1e-5)
 
@@ -261,8 +315,11 @@ def test_a_ray_between_two_returns_of_its_row_starts_between_them(flow):
     images = torch.zeros(1, 2, 8, 32)
     images[0, :, 4, [0, 4]] = torch.tensor([[10.0, 30.0], [0.4, 0.8]])
     state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN))
-    about = Surroundings.of(flow.space, condition_of(flow.space, images, state), True, torch.full((1, 2), 0.01))
-    assert flow.space.decode(about.start)[0, :, 4, 1].tolist() == pytest.approx([12, 0.5], rel=1e-5)  # linear in 1 / r
+    about = Surroundings.of(
+        flow.space, condition_of(flow.space, images, state), True, torch.full((1, 2), 0.01)
+    )
+    # linear in 1 / r
+    assert flow.space.decode(about.start)[0, :, 4, 1].tolist() == pytest.approx([12, 0.5], rel=1e-5)
 
 
 def test_a_coarser_image_has_the_nearest_return_of_each_block(flow):
@@ -278,14 +335,18 @@ def test_a_coarser_image_has_the_nearest_return_of_each_block(flow):
 def test_a_part_of_a_scan_and_what_is_known_of_it_depend_on_the_image_alone(flow, scans):
     x_1, tasks = flow.space.encoding.encode(scans[0]), Tasks(rows=4, columns=16)
     parts = [
-        [tasks(flow.space, x_1, flow.space.sensor, noise.generator(0, "condition", k)) for k in range(40)]
+        [
+            tasks(flow.space, x_1, flow.space.sensor, noise.generator(0, "condition", k))
+            for k in range(40)
+        ]
         for _ in range(2)
     ]
     for one, other in zip(*parts, strict=True):
         assert all(torch.equal(one[name], other[name]) for name in one.keys() | other.keys())
         assert one["x_1"].shape == (2, 4, 16)
         assert torch.equal(one["image"], one["x_1"] * one["known"])
-    rows = [one["known"][0].mean(1).tolist() for one in parts[0]]  # of a sensor of few beams one, any of them
+    # of a sensor of few beams one, any of them
+    rows = [one["known"][0].mean(1).tolist() for one in parts[0]]
     assert {row.index(1) for row in rows if sum(row) == max(row) == 1} == {0, 1, 2, 3}
     rng = noise.generator(0, "condition", 0)
     silent = Tasks(rows=4, columns=16, silent=0.99)(flow.space, x_1, flow.space.sensor, rng)
@@ -313,7 +374,10 @@ def test_what_it_learns_from_lowers_the_loss(scans, monkeypatch):
     batch |= {"x_0": torch.randn(x_1.shape), "k": torch.arange(3)}
     u, by = torch.tensor([0.2, 0.6, 0.9]), torch.optim.Adam(learner.parameters(), 1e-2)
     learner.eval()  # in validation the scans count alike in any batch
-    alone = [learner.regression_loss({n: v[[i]] for n, v in batch.items()}, u[[i]]).item() for i in range(3)]
+    alone = [
+        learner.regression_loss({n: v[[i]] for n, v in batch.items()}, u[[i]]).item()
+        for i in range(3)
+    ]
     assert learner.regression_loss(batch, u).item() == pytest.approx(sum(alone) / 3, rel=1e-5)
     learner.train()
     losses = []
@@ -326,11 +390,20 @@ def test_what_it_learns_from_lowers_the_loss(scans, monkeypatch):
     assert losses[-1] < losses[0] - 0.5
     assert all(p.grad is not None and p.grad.isfinite().all() for p in learner.parameters())
     counts: list[torch.Tensor] = []
-    monkeypatch.setattr("r2flow.generators.transfer.mean_over_processes", lambda count: counts.append(count) or count)
+    monkeypatch.setattr(
+        "r2flow.generators.transfer.mean_over_processes",
+        lambda count: counts.append(count) or count,
+    )
     whole = learner.regression_loss(batch, u).item()
-    halves = iter([count / 2 for count in counts] * 2)  # the mean over two devices, one with a scan, one with two
-    monkeypatch.setattr("r2flow.generators.transfer.mean_over_processes", lambda count: next(halves))
-    parts = [learner.regression_loss({n: v[at] for n, v in batch.items()}, u[at]) for at in (slice(1), slice(1, 3))]
+    # the mean over two devices, one with a scan, one with two
+    halves = iter([count / 2 for count in counts] * 2)
+    monkeypatch.setattr(
+        "r2flow.generators.transfer.mean_over_processes", lambda count: next(halves)
+    )
+    parts = [
+        learner.regression_loss({n: v[at] for n, v in batch.items()}, u[at])
+        for at in (slice(1), slice(1, 3))
+    ]
     assert sum(parts).item() / 2 == pytest.approx(whole, rel=1e-5)
 
 
@@ -339,7 +412,9 @@ def test_a_batch_has_crops_of_several_sensors():
     space = learner.generator.space
     parts = [{"name": "simulated", "scenes": 4},
              {"name": "simulated", "scenes": 4, "sensor": {"name": "vlp16", "columns": 64}}]  # fmt: skip
-    data = ScanDataModule("mixed", space.sensor, space.encoding, parts=parts, validation={"share": 0.5})
+    data = ScanDataModule(
+        "mixed", space.sensor, space.encoding, parts=parts, validation={"share": 0.5}
+    )
     data.adopt(learner.item_format)
     data.setup()
     [batch] = data.val_dataloader()
@@ -351,7 +426,8 @@ def test_a_batch_has_crops_of_several_sensors():
         assert batch["elevations"][i].tolist() == rows[top : top + 8]
         steps = (rows[top] - rows[top + 7]) / 7, 2 * math.pi / sensor.columns
         assert batch["steps"][i].tolist() == pytest.approx(steps)
-        whole = torch.from_numpy(simulate(sensor, 0, (2, 3, 6, 7)[i]).image)  # each part has its own scenes
+        # each part has its own scenes
+        whole = torch.from_numpy(simulate(sensor, 0, (2, 3, 6, 7)[i]).image)
         if sensor != space.sensor:  # intensities of another sensor are scaled to a mean
             whole[1] = (whole[1] * 0.265 / whole[1][whole[0] > 0].mean()).clamp(max=1)
         crop = space.through(sensor).decode(batch["x_1"][i : i + 1])[0]
@@ -362,7 +438,11 @@ def test_a_batch_has_crops_of_several_sensors():
 
 @pytest.mark.parametrize(
     ("stage", "width", "word"),
-    [(Rectify, 64, "one sensor"), (LearnFlowMap, 64, "one sensor"), (Transfer, 16, "crops of 8x32")],
+    [
+        (Rectify, 64, "one sensor"),
+        (LearnFlowMap, 64, "one sensor"),
+        (Transfer, 16, "crops of 8x32"),
+    ],
 )
 def test_a_part_of_another_sensor_that_cannot_be_learned_from_is_refused(stage, width, word):
     part = {"name": "simulated", "scenes": 4}
@@ -382,9 +462,11 @@ def test_a_stage_that_tells_nothing_refuses_it(other):
 def test_it_draws_nothing_from_noise_alone_and_needs_a_backbone_for_any_size(flow):
     with pytest.raises(InputError, match="completes scans"):
         flow(torch.zeros(1, 2, 8, 32))
-    for sampler in ("sde", "renoise", "refine"):  # their noise has deviation 1, that of x_0 is sigma
+    # their noise has deviation 1, that of x_0 is sigma
+    for sampler in ("sde", "renoise", "refine"):
         with pytest.raises(InputError, match=r"N\(0, 1\).*give jump"):
             build_sampler(sampler).check(flow)
-    type("Redrawn", (Transport,), {"draws": True, "name": "redrawn"})().check(flow)  # a plug-in for this flow
+    # a plug-in for this flow
+    type("Redrawn", (Transport,), {"draws": True, "name": "redrawn"})().check(flow)
     with pytest.raises(InputError, match="backbone=local"):
         built(backbone=tiny_options("hdit"))

@@ -1,4 +1,6 @@
-"""Every system: scan i is a function of its number alone, and published files are taken by the verbs as they are."""
+"""Every system: scan i is a function of its number alone, and published files are taken by the
+verbs as they are.
+"""
 
 import json
 import signal
@@ -27,7 +29,11 @@ SYSTEMS: dict[str, tuple[dict[str, Any], str, int]] = {
     "diffusion": ({}, "ddpm:steps=5", 5),
     "score": ({"width": 4, "levels": 3}, "langevin:steps=5", 3 * 5 + 1),
     # 1000 // 7 = 142 goes 8 times into 1000
-    "latent_diffusion": ({"autoencoder": SMALL_AUTOENCODER, "unet": SMALL_UNET}, "latent_ddim:steps=7", 8),
+    "latent_diffusion": (
+        {"autoencoder": SMALL_AUTOENCODER, "unet": SMALL_UNET},
+        "latent_ddim:steps=7",
+        8,
+    ),
 }
 
 
@@ -35,7 +41,12 @@ SYSTEMS: dict[str, tuple[dict[str, Any], str, int]] = {
 def test_a_scan_is_a_function_of_its_number_alone(name: str):
     torch.manual_seed(0)
     options, text, evaluations = SYSTEMS[name]
-    backbone = {"name": "efficient_unet", "base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": 1}
+    backbone = {
+        "name": "efficient_unet",
+        "base_channels": 8,
+        "channel_multiplier": [1, 2],
+        "num_residual_blocks": 1,
+    }
     config = {
         "sensor": SENSOR, "encoding": {"format": "logscale", "reflectance": False}, "backbone": backbone,
         "generator": {"name": name, **options},
@@ -43,18 +54,23 @@ def test_a_scan_is_a_function_of_its_number_alone(name: str):
     generator, sampler = build_generator(config).eval(), build_sampler(text)
     three, one = Draws(0, [4, 5, 6]), Draws(0, [5])
     with torch.device("meta"):  # a default device of the user's
-        many, alone = (generator(d.start(generator.noise_shape), draws=d, sampler=sampler) for d in (three, one))
+        many, alone = (
+            generator(d.start(generator.noise_shape), draws=d, sampler=sampler)
+            for d in (three, one)
+        )
     torch.testing.assert_close(many.x[1:2], alone.x, rtol=0, atol=1e-4)
     assert not torch.allclose(many.x[0], many.x[1])
     assert many.x.shape == (3, 1, 8, 32)
     assert many.x.abs().max() <= 1 or name == "latent_diffusion"  # whose decoder has no bound
     assert many.evaluations.tolist() == [evaluations] * 3
     assert sampler.evaluations(generator) == evaluations
-    double = generator.double()(one.start(generator.noise_shape), draws=one, sampler=sampler)  # as in 64-true runs
+    # as in 64-true runs
+    double = generator.double()(one.start(generator.noise_shape), draws=one, sampler=sampler)
     torch.testing.assert_close(double.x.float(), alone.x, rtol=0, atol=1e-4)
 
 
-# Options, and the evaluations that a scan takes: steps x noise levels and one to take the last noise off.
+# Options, and the evaluations that a scan takes: steps x noise levels and one to take the last
+# noise off.
 FILES = {
     "vanilla_published.pth": ([], 1),
     "dusty1_published.pth": ([], 1),
@@ -66,16 +82,31 @@ FILES = {
 LARGE = ("lidargen_published.pth", "lidm_published.ckpt")  # of 64 x 1024
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in LARGE else ()) for n in FILES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in LARGE else ()) for n in FILES]
+)
 def test_a_published_file_is_sampled_and_evaluated(r2flow, shared, tmp_path: Path, name: str):
     path = shared / "oracle_baselines" / name
     if not path.exists():
         pytest.skip("the reference checkpoint is not here")
     options, evaluations = FILES[name]
     out = tmp_path / "scans"
-    assert r2flow("sample", path, *options, "--num", 2, "--pictures", 0, "--device", "cpu", "--out", out).said
+    assert r2flow(
+        "sample", path, *options, "--num", 2, "--pictures", 0, "--device", "cpu", "--out", out
+    ).said
     assert (out / "000001.npy").is_file()
-    alone = ["--num", 2, "--metrics", "jsd", "--no-reference", "--no-baselines", "--workers", 0, "--device", "cpu"]
+    alone = [
+        "--num",
+        2,
+        "--metrics",
+        "jsd",
+        "--no-reference",
+        "--no-baselines",
+        "--workers",
+        0,
+        "--device",
+        "cpu",
+    ]
     assert r2flow("evaluate", out, path, *options, *alone, "--json", tmp_path / "e.json").said
     (found,) = json.loads((tmp_path / "e.json").read_text())["comparisons"]
     assert found["generated"]["num"] == 2
@@ -105,9 +136,16 @@ FAMILIES = {
         "stage.augment.kimg=0.1", "stage.augment.every=2", "stage.r1_every=2",
     ],
 }  # fmt: skip
-FIRST = ["experiment=lidm_autoencoder", "size=small", *TINY, "trainer.max_steps=3", "generator.autoencoder.codes=16"]
+FIRST = [
+    "experiment=lidm_autoencoder",
+    "size=small",
+    *TINY,
+    "trainer.max_steps=3",
+    "generator.autoencoder.codes=16",
+]
 
-assert_equal = partial(torch.testing.assert_close, rtol=0, atol=0)  # bit-equal, whatever is nested in what
+# bit-equal, whatever is nested in what
+assert_equal = partial(torch.testing.assert_close, rtol=0, atol=0)
 
 
 @pytest.mark.slow
@@ -122,17 +160,25 @@ def test_a_killed_system_ends_as_the_one_left_alone(tmp_path: Path, family: str)
     assert code == -signal.SIGKILL, said
     assert checkpoints_of(tmp_path / "killed")[0].name == "step-00000004.ckpt"
     assert "resuming from" in in_process(tmp_path, killed).stdout
-    one, other = (read_checkpoint(checkpoints_of(tmp_path / name)[0]) for name in ("alone", "killed"))
+    one, other = (
+        read_checkpoint(checkpoints_of(tmp_path / name)[0]) for name in ("alone", "killed")
+    )
     assert one["global_step"] == other["global_step"]
-    for part in {"state_dict", "current_model_state", "optimizer_states"} & one.keys():  # not all runs have an average
+    # not all runs have an average
+    for part in {"state_dict", "current_model_state", "optimizer_states"} & one.keys():
         assert_equal(one[part], other[part])
     if family == "latent":  # its autoencoder stays as it is
         first = load_checkpoint(tmp_path / "first").generator.first_stage_model
-        assert_equal(first.state_dict(), load_checkpoint(tmp_path / "alone").generator.first_stage_model.state_dict())
+        assert_equal(
+            first.state_dict(),
+            load_checkpoint(tmp_path / "alone").generator.first_stage_model.state_dict(),
+        )
 
 
 def garble(part: str, **changes: Any) -> Callable[[Any], None]:
-    """Change or, with None, remove entries of a published config, in a part such as `model.generator`."""
+    """Change or, with None, remove entries of a published config, in a part such as
+    `model.generator`.
+    """
 
     def change(cfg: Any) -> None:
         for key in filter(None, part.split(".")):
@@ -150,8 +196,16 @@ GARBLED = [
     ("dusty2", garble("dataset", max_depth=1.0), "needs 0 < min_range < max_range"),
     ("dusty2", garble(OUTPUT, act="os.system"), "KeyError: 'os.system'"),
     ("r2dm", garble("data", min_depth=90.0), "needs 0 < min_range < max_range"),
-    ("r2dm", garble("diffusion", timestep_type="discrete"), "only diffusions of range in continuous time"),
-    ("r2dm", garble("model", architecture="refinenet"), "no published architecture named 'refinenet'"),
+    (
+        "r2dm",
+        garble("diffusion", timestep_type="discrete"),
+        "only diffusions of range in continuous time",
+    ),
+    (
+        "r2dm",
+        garble("model", architecture="refinenet"),
+        "no published architecture named 'refinenet'",
+    ),
     ("r2dm", garble("diffusion", noise_schedule="sigmoid"), "no log-SNR schedule named 'sigmoid'"),
     ("lidargen", None, "KeyError: 'network.sigmas'"),
 ]
@@ -161,7 +215,9 @@ GARBLED = [
 def test_a_published_file_that_is_not_understood_is_one_line(shared, tmp_path, name, change, said):
     content: Any = [{"module.begin_conv.weight": torch.zeros(4, 4, 3, 3)}, {}, 1, 2, {}]
     if change is not None:
-        content = torch.load(shared / "oracle_baselines" / f"{name}_published.pth", weights_only=False)
+        content = torch.load(
+            shared / "oracle_baselines" / f"{name}_published.pth", weights_only=False
+        )
         change(content["cfg"])
     torch.save(content, tmp_path / "it.pth")
     with refused(said):

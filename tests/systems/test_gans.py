@@ -1,4 +1,6 @@
-"""The vanilla GAN, DUSty v1 and DUSty v2: networks, losses, rules, augmentation, data, published files and training."""
+"""The vanilla GAN, DUSty v1 and DUSty v2: networks, losses, rules, augmentation, data, published
+files and training.
+"""
 
 import math
 from collections.abc import Mapping
@@ -8,9 +10,9 @@ from typing import Any
 
 import pytest
 import torch
+from r2flow.callbacks.ema import HalfLifeEMA, half_life_decay
 from torch import nn
 
-from r2flow.callbacks.ema import HalfLifeEMA, half_life_decay
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
@@ -19,13 +21,34 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint, read_checkpoint
 from r2flow.reports.training import read_curves
 from r2flow.systems.gan import dcgan, style_discriminator, style_gan
-from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, BatchDraws, affine, coloured, transformed
+from r2flow.systems.gan.augment import (
+    TRANSFORMATIONS,
+    AdaptiveAugment,
+    BatchDraws,
+    affine,
+    coloured,
+    transformed,
+)
 from r2flow.systems.gan.dcgan import DustyV1, VanillaGan
 from r2flow.systems.gan.layers import logistic, straight_through_mask
-from r2flow.systems.gan.stage import Warmup, blurred, discriminator_loss, generator_loss, lazy_adam, r1
+from r2flow.systems.gan.stage import (
+    Warmup,
+    blurred,
+    discriminator_loss,
+    generator_loss,
+    lazy_adam,
+    r1,
+)
 from r2flow.systems.gan.style_gan import DustyV2
 from r2flow.training import build, compose, fit
-from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
+from tests.reference import (
+    assert_near,
+    assert_norms,
+    assert_published,
+    load_case,
+    published_names,
+    shapes_of,
+)
 from tests.training.conftest import start
 
 NETWORKS = [
@@ -46,7 +69,9 @@ def generator_of(cfg: Mapping[str, Any]) -> nn.Module:
         "latent": mapping["in_ch"], "base_channels": synthesis["ch_base"], "max_channels": synthesis["ch_max"]
     }  # fmt: skip
     if cfg["arch"] == "dusty_v2":
-        return DustyV2(given, **widths, depth=mapping["depth"], doublings=len(synthesis["layers"])).network
+        return DustyV2(
+            given, **widths, depth=mapping["depth"], doublings=len(synthesis["layers"])
+        ).network
     return (DustyV1 if "raydrop_logit" in out else VanillaGan)(given, **widths).network
 
 
@@ -57,11 +82,17 @@ def test_a_generator_is_the_published_one(shared: Path, name: str):
     assert list(network.state_dict()) == list(case["state_dict"])
     network.load_state_dict(case["state_dict"])
     given = case["inputs"]
-    more = {key: given.get(name) for key, name in (("uniform", "uniform"), ("shift", "shift_fraction"))}
-    made = assert_published(network, case, tolerance, lambda at: network(at["z"], at.get("angle"), **more))
+    more = {
+        key: given.get(name) for key, name in (("uniform", "uniform"), ("shift", "shift_fraction"))
+    }
+    made = assert_published(
+        network, case, tolerance, lambda at: network(at["z"], at.get("angle"), **more)
+    )
     if "uniform" in given:
         assert torch.equal(made["raydrop_mask"], case["outputs"]["raydrop_mask"])
-        torch.testing.assert_close(logistic(given["uniform"]), given["logistic_noise"], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(
+            logistic(given["uniform"]), given["logistic_noise"], rtol=1e-5, atol=1e-6
+        )
     after = network.state_dict()
     for key, expected in case.get("buffers_after", {}).items():
         torch.testing.assert_close(after[key], expected, rtol=1e-5, atol=1e-7)
@@ -70,7 +101,10 @@ def test_a_generator_is_the_published_one(shared: Path, name: str):
 @pytest.mark.parametrize("name", ["vanilla_d_32x64", "dusty2_d_64x64"])
 def test_a_discriminator_is_the_published_one_with_its_penalty(shared: Path, name: str):
     case, tolerance = load_case(shared, f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
-    layer, module = case["cfg"]["layer_kwargs"], style_discriminator if case["cfg"]["arch"] == "dusty_v2" else dcgan
+    layer, module = (
+        case["cfg"]["layer_kwargs"],
+        style_discriminator if case["cfg"]["arch"] == "dusty_v2" else dcgan,
+    )
     widths = {"base_channels": layer["ch_base"], "max_channels": layer["ch_max"]}
     network = module.Discriminator(tuple(layer["resolution"]), layer["in_ch"], **widths)
     assert list(network.state_dict()) == list(case["state_dict"])
@@ -102,7 +136,11 @@ SIZES = {"": (64, 512, 1), "_64x1024_2ch": (64, 1024, 2)}
 def test_full_size_networks_have_the_published_names_and_shapes(shared: Path, name: str, size: str):
     build, (*shape, channels) = FULL[name], SIZES[size]
     with torch.device("meta"):
-        network = build(tuple(shape), channels) if name.endswith("_D") else build(space(*shape, channels)).network
+        network = (
+            build(tuple(shape), channels)
+            if name.endswith("_D")
+            else build(space(*shape, channels)).network
+        )
     assert shapes_of(network) == published_names(shared, f"{name}{size}")
 
 
@@ -117,7 +155,10 @@ GANS = [(DustyV1, dcgan.Discriminator), (DustyV2, style_discriminator.Discrimina
 
 @pytest.mark.parametrize(("gan", "critic"), GANS)
 def test_codes_masks_and_scores_stay_float32_in_half_precision(gan: Any, critic: Any):
-    generator, discriminator = gan(space(32, 64), latent=8, base_channels=4), critic((32, 64), base_channels=4)
+    generator, discriminator = (
+        gan(space(32, 64), latent=8, base_channels=4),
+        critic((32, 64), base_channels=4),
+    )
     with torch.autocast("cpu", torch.bfloat16):
         made = generator.made(torch.randn(2, 8), torch.rand(2, 1, 32, 64))
         scores = discriminator(made["image"])
@@ -132,7 +173,10 @@ def test_a_turn_by_whole_columns_is_a_roll():
 
 def test_losses_and_their_gradients(shared: Path):
     case = load_case(shared, "gan_losses.pt")
-    for name, loss in (("nsgan_G", lambda real, fake: generator_loss(fake)), ("nsgan_D", discriminator_loss)):
+    for name, loss in (
+        ("nsgan_G", lambda real, fake: generator_loss(fake)),
+        ("nsgan_D", discriminator_loss),
+    ):
         expected = case["cases"][name]
         real, fake = (case[key].clone().requires_grad_() for key in ("y_real", "y_fake"))
         found = loss(real, fake)
@@ -160,9 +204,12 @@ def test_rules_of_training(shared: Path):
     case = load_case(shared, "gan_training_rules.pt")
     ema = case["ema_decay"]
     found = [
-        half_life_decay(step, ema["batch_size"], 1000 * ema["ema_kimg"], ema["rampup"]) for step in ema["iteration"]
+        half_life_decay(step, ema["batch_size"], 1000 * ema["ema_kimg"], ema["rampup"])
+        for step in ema["iteration"]
     ]
-    torch.testing.assert_close(torch.tensor(found, dtype=torch.float64), ema["decay"], rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        torch.tensor(found, dtype=torch.float64), ema["decay"], rtol=1e-6, atol=0
+    )
     callback = HalfLifeEMA()
     callback.batch_size, callback._step = 32, 6250
     assert callback._decay() == pytest.approx(0.5 ** (32 / 10_000))
@@ -184,7 +231,9 @@ def test_rules_of_training(shared: Path):
 
 def test_p_of_ada_follows_the_published_trace(shared: Path):
     case = load_case(shared, "gan_training_rules.pt")["ada_p"]
-    augment = AdaptiveAugment(case["p_target"], case["kimg"], highest=case["p_max"], every=case["every"])
+    augment = AdaptiveAugment(
+        case["p_target"], case["kimg"], highest=case["p_max"], every=case["every"]
+    )
     signs, found = [], []
     for step, scores in enumerate(case["preds"]):
         augment.count(scores)
@@ -228,7 +277,9 @@ def test_augmentation_draws_the_published_distributions():
         ("luma_flip", 0.5, 0.5),
     ):  # fmt: skip
         values = draws[name][0]
-        assert values.mean().item() == pytest.approx(mean, abs=5 * deviation / len(values.flatten()) ** 0.5), name
+        assert values.mean().item() == pytest.approx(
+            mean, abs=5 * deviation / len(values.flatten()) ** 0.5
+        ), name
         assert values.std().item() == pytest.approx(deviation, rel=0.03), name
     for name, octaves in (("iso_scale", 0.2), ("contrast", 0.5)):
         assert draws[name][0].log2().std().item() == pytest.approx(octaves, rel=0.03), name
@@ -244,7 +295,8 @@ def test_augmentation_without_a_transformation_leaves_it_out_and_refuses_an_unkn
 
 
 def test_whole_shifts_on_a_ring_are_rolls_where_the_filter_lets_all_pass():
-    x = torch.sin(torch.arange(64) * 2 * math.pi * 3 / 64).expand(1, 1, 8, 64)  # far below the filter's limit
+    # far below the filter's limit
+    x = torch.sin(torch.arange(64) * 2 * math.pi * 3 / 64).expand(1, 1, 8, 64)
     assert_near(transformed(x, torch.ones(2, 1), torch.tensor([[0.0], [5.0]])), x.roll(5, 3), 1e-3)
 
 
@@ -253,30 +305,45 @@ def test_data_are_the_published_ones(shared: Path):
     sensor = SENSORS["hdl64e_rings"].resized(16, 64)
     assert (sensor.min_range, sensor.max_range) == (case["min_depth"], case["max_depth"])
     encoding = Encoding(sensor, "inverse_depth", reflectance=False)
-    torch.testing.assert_close(encoding.encode(case["metres"] * case["mask"]), case["model_space"], rtol=1e-5, atol=0)
-    torch.testing.assert_close(encoding.format.forward(case["metres"]), case["inv_depth_norm"], rtol=1e-5, atol=0)
+    torch.testing.assert_close(
+        encoding.encode(case["metres"] * case["mask"]), case["model_space"], rtol=1e-5, atol=0
+    )
+    torch.testing.assert_close(
+        encoding.format.forward(case["metres"]), case["inv_depth_norm"], rtol=1e-5, atol=0
+    )
     metres = encoding.decode(case["sample"])
     torch.testing.assert_close(metres, case["sample_metres"].abs(), rtol=1e-5, atol=0)
-    torch.testing.assert_close(unproject(metres, case["angle"][0]), case["sample_points"], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        unproject(metres, case["angle"][0]), case["sample_points"], rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
 @pytest.mark.parametrize("averaged", [True, False])
 def test_a_published_file_is_a_generator(shared: Path, name: str, averaged: bool):
     io = load_case(shared, f"{name}_published_io.pt")
-    checkpoint = load_checkpoint(shared / "oracle_baselines" / f"{name}_published.pth", averaged=averaged)
+    checkpoint = load_checkpoint(
+        shared / "oracle_baselines" / f"{name}_published.pth", averaged=averaged
+    )
     assert checkpoint.config["published"] == io["cfg"]
     assert checkpoint.step == 1_000_000 // 32
-    assert sum(p.numel() for p in checkpoint.generator.network.parameters()) == io["num_parameters"]["G"]
+    assert (
+        sum(p.numel() for p in checkpoint.generator.network.parameters())
+        == io["num_parameters"]["G"]
+    )
     made = checkpoint.generator.made(io["z"], io["uniform"], truncation=io["truncation_psi"])
-    apart = (made["image"] - io["outputs"]["image"]).abs().max() / io["outputs"]["image"].abs().max()
+    apart = (made["image"] - io["outputs"]["image"]).abs().max() / io["outputs"][
+        "image"
+    ].abs().max()
     assert (apart < 1e-4) == averaged
     if averaged:
         for key, expected in io["outputs"].items():
             assert_near(made[key], expected, 1e-4)
 
 
-def test_sensor_and_angles_of_a_published_file_are_its_own_also_when_saved(shared: Path, tmp_path: Path):
+def test_sensor_and_angles_of_a_published_file_are_its_own_also_when_saved(
+    shared: Path, tmp_path: Path
+):
     checkpoint = load_checkpoint(shared / "oracle_baselines" / "dusty2_published.pth")
     rays = checkpoint.sensor.rays()
     torch.testing.assert_close(checkpoint.generator.angle[0], rays, rtol=0, atol=1e-4)
@@ -302,8 +369,12 @@ def test_truncation_by_0_is_refused_and_by_less_draws_codes_together():
     generator = build_generator(tiny("dusty2")).eval()
     z = torch.randn(16, 8)
     generator.network.w_avg.copy_(torch.randn(1, 8))
-    whole, half = (generator.made(z, torch.rand(16, 1, 16, 32), truncation=psi)["w"] for psi in (1.0, 0.5))
-    torch.testing.assert_close(half, generator.network.w_avg + 0.5 * (whole - generator.network.w_avg))
+    whole, half = (
+        generator.made(z, torch.rand(16, 1, 16, 32), truncation=psi)["w"] for psi in (1.0, 0.5)
+    )
+    torch.testing.assert_close(
+        half, generator.network.w_avg + 0.5 * (whole - generator.network.w_avg)
+    )
     for truncation in (0.0, 2.0, "x", float("nan")):
         with pytest.raises(InputError, match="truncation"):
             generator.choose(truncation=truncation)
@@ -326,7 +397,9 @@ def test_each_row_of_the_log_has_the_augmentation_of_its_step_and_the_last_penal
     assert curves["train/augmented"][1].tolist() == pytest.approx(expected)
     assert len(set(expected)) == 3  # in five steps it moves after every second
     assert [len(set(each)) for each in curves["train/last_r1"]] == [4, 2]
-    assert fit(build(compose([*options, f"stage.parent={tmp_path}", f"run_dir={tmp_path / 'tuned'}"]))).finished
+    assert fit(
+        build(compose([*options, f"stage.parent={tmp_path}", f"run_dir={tmp_path / 'tuned'}"]))
+    ).finished
 
 
 @pytest.mark.slow
@@ -342,7 +415,11 @@ def test_two_processes_equal_one(tmp_path: Path):
         assert process.returncode == 0, said
         runs[name] = read_checkpoint(tmp_path / name / "checkpoints" / "step-00000003.ckpt")
     one, two = runs["one"], runs["two"]
-    assert torch.equal(one["current_model_state"]["augment.p"], two["current_model_state"]["augment.p"])
+    assert torch.equal(
+        one["current_model_state"]["augment.p"], two["current_model_state"]["augment.p"]
+    )
     for name, value in one["current_model_state"].items():
         # Adam with beta_1 = 0 takes steps of the rate's size whatever the gradient's: 2e-3 a step.
-        torch.testing.assert_close(two["current_model_state"][name], value, rtol=0, atol=2e-4, msg=name)
+        torch.testing.assert_close(
+            two["current_model_state"][name], value, rtol=0, atol=2e-4, msg=name
+        )

@@ -1,4 +1,6 @@
-"""LiDM against its published code: autoencoder, quantiser, U-Net, diffusion, losses, data and checkpoints."""
+"""LiDM against its published code: autoencoder, quantiser, U-Net, diffusion, losses, data and
+checkpoints.
+"""
 
 import json
 import shutil
@@ -41,16 +43,32 @@ from r2flow.systems.latent.stage import (
 )
 from r2flow.systems.latent.unet import LatentUNet
 from r2flow.training import check, compose
-from tests.reference import assert_near, assert_norms, assert_published, load_case, published_names, shapes_of
+from tests.reference import (
+    assert_near,
+    assert_norms,
+    assert_published,
+    load_case,
+    published_names,
+    shapes_of,
+)
 
-SMALL_AUTOENCODER = {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16}
+SMALL_AUTOENCODER = {
+    "width": 32,
+    "multipliers": [1, 1],
+    "strides": [[2, 2]],
+    "blocks": 1,
+    "codes": 16,
+}
 SMALL_UNET = {"width": 32, "multipliers": [1, 2], "blocks": 1, "attention": [2]}
 TINY: dict[str, Any] = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32, "min_range": 1.0, "max_range": 56.0},
     "encoding": {"format": "shifted_log", "reflectance": False, "limits": "open"},
     "backbone": {"name": "latent_unet"},
 }
-DIFFUSION = {**TINY, "generator": {"name": "latent_diffusion", "autoencoder": SMALL_AUTOENCODER, "unet": SMALL_UNET}}
+DIFFUSION = {
+    **TINY,
+    "generator": {"name": "latent_diffusion", "autoencoder": SMALL_AUTOENCODER, "unet": SMALL_UNET},
+}
 AUTOENCODER = {**TINY, "generator": {"name": "vq_autoencoder", "autoencoder": SMALL_AUTOENCODER}}
 
 
@@ -88,7 +106,9 @@ def test_autoencoder_and_gradients_are_the_published(shared: Path):
 
     def call(given: dict[str, Tensor]) -> dict[str, Tensor]:
         before, (made, loss) = model.encode(given["x"]), model(given["x"])
-        assert torch.equal(model.quantize.nearest(before.movedim(1, -1)).flatten()[sure], indices[sure])
+        assert torch.equal(
+            model.quantize.nearest(before.movedim(1, -1)).flatten()[sure], indices[sure]
+        )
         return {
             "prequant": before, "quant": model.quantize(before)[0], "codebook_loss": loss, "reconstruction": made,
             "interface_decoded": model.decode(before), "interface_decoded_unquantised": model.decode(before, False),
@@ -168,7 +188,11 @@ def test_objective_and_gradients_are_the_published(diffusion: dict[str, Any]):
 @torch.no_grad()
 def test_ddim_is_the_published(diffusion: dict[str, Any], name: str):
     """The walk that `LatentDDIM` takes, and the data that each of its steps expects."""
-    case, log_snr, decode = diffusion["cases"][name], diffusion["log_snr"], diffusion["autoencoder"].decode
+    case, log_snr, decode = (
+        diffusion["cases"][name],
+        diffusion["log_snr"],
+        diffusion["autoencoder"].decode,
+    )
     times = some_of(len(log_snr), case["steps"])
 
     def clean(z: Tensor, t: Tensor) -> Tensor:
@@ -198,14 +222,21 @@ def test_adversarial_losses_and_gradients_are_the_published(shared: Path, step: 
     cfg = case["cfg"]
     model = PatchDiscriminator(cfg["disc_in_channels"], cfg["disc_ndf"], cfg["disc_num_layers"])
     model.load_state_dict(case["discriminator"])
-    last, factor = case["last_layer"].clone().requires_grad_(), adversarial_factor(step, cfg["disc_start"], True)
+    last, factor = (
+        case["last_layer"].clone().requires_grad_(),
+        adversarial_factor(step, cfg["disc_start"], True),
+    )
     made = F.conv2d(case["features"], last)
     expected = case["cases"][f"step{step}_ae"]
     reconstruction, adversarial = reconstruction_loss(case["inputs"], made), -model(made).mean()
     weight = adaptive_weight(reconstruction, adversarial, last, cfg["disc_weight"])
     assert_near(weight, expected["log"]["train/d_weight"], 1e-4)
     assert_near(adversarial, expected["log"]["train/g_loss"], 1e-4)
-    loss = reconstruction + factor * weight * adversarial + cfg["codebook_weight"] * case["codebook_loss"]
+    loss = (
+        reconstruction
+        + factor * weight * adversarial
+        + cfg["codebook_weight"] * case["codebook_loss"]
+    )
     assert_near(loss, expected["loss"], 1e-4)
     loss.backward()
     assert_near(last.grad, expected["grad_last_layer"], 1e-3)
@@ -232,8 +263,10 @@ def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
     x = encoding.encode(case["metres"][None])
     assert_near(x, case["model_space"], 1e-6)
     assert torch.equal(returns(x[None], encoding)[0], case["mask"])
-    edge = torch.tensor([0.0, 0.00392156, 0.005, 1.0])[None, None, None]  # published: r < 1 / 255 m is dropped
-    for name, mask in (("metric", [-1, -1, 1, 1]), ("inverse", [-1, 1, 1, 1])):  # `inverse` clips to 1 m
+    # published: r < 1 / 255 m is dropped
+    edge = torch.tensor([0.0, 0.00392156, 0.005, 1.0])[None, None, None]
+    # `inverse` clips to 1 m
+    for name, mask in (("metric", [-1, -1, 1, 1]), ("inverse", [-1, 1, 1, 1])):
         other = Encoding(sensor, name, reflectance=False)
         assert returns(other.encode(edge), other).flatten().tolist() == mask
     encoding = Encoding(sensor, "shifted_log", reflectance=False, limits="open")
@@ -247,15 +280,25 @@ def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
 @pytest.fixture
 def published(shared: Path, tmp_path: Path) -> tuple[Path, dict[str, Any]]:
     io = load_case(shared, "lidm_published_io.pt")
-    path = Path(shutil.copy(shared / "oracle_baselines" / "lidm_published.ckpt", tmp_path / "model.ckpt"))
-    images = {"size": [16, 32], "fov": [3, -25], "depth_range": [1.0, 56.0], "depth_scale": 5.84, "log_scale": True}
+    path = Path(
+        shutil.copy(shared / "oracle_baselines" / "lidm_published.ckpt", tmp_path / "model.ckpt")
+    )
+    images = {
+        "size": [16, 32],
+        "fov": [3, -25],
+        "depth_range": [1.0, 56.0],
+        "depth_scale": 5.84,
+        "log_scale": True,
+    }
     config = {"model": {"params": io["cfg"]}, "data": {"params": {"dataset": images}}}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
     return path, io
 
 
 @pytest.mark.parametrize("averaged", [True, False])
-def test_a_published_diffusion_gives_its_noise_and_images(published: tuple[Path, dict[str, Any]], averaged: bool):
+def test_a_published_diffusion_gives_its_noise_and_images(
+    published: tuple[Path, dict[str, Any]], averaged: bool
+):
     path, io = published
     loaded = load_checkpoint(path, averaged=averaged)
     generator = loaded.generator
@@ -263,25 +306,39 @@ def test_a_published_diffusion_gives_its_noise_and_images(published: tuple[Path,
     assert loaded.step == 1234
     assert generator.sampler == build_sampler("latent_ddim", steps=50, eta=1.0)
     with torch.no_grad():
-        assert_near(generator.unet(io["z"], io["t"]), io["output_ema" if averaged else "output_weights"], 5e-5)
+        assert_near(
+            generator.unet(io["z"], io["t"]),
+            io["output_ema" if averaged else "output_weights"],
+            5e-5,
+        )
         assert_near(generator.first_stage_model.encode(io["x"]), io["latent"], 5e-5)
         assert_near(generator.first_stage_model.decode(io["z"]), io["decoded"], 5e-5)
 
 
-def test_a_published_diffusion_without_its_config_has_its_own_schedule(shared: Path, tmp_path: Path, caplog: Any):
+def test_a_published_diffusion_without_its_config_has_its_own_schedule(
+    shared: Path, tmp_path: Path, caplog: Any
+):
     content = load_case(shared, "lidm_published.ckpt")
     betas = torch.linspace(0.0012345678**0.5, 0.0195**0.5, 1000, dtype=torch.float64) ** 2
-    torch.save({**content, "state_dict": {**content["state_dict"], "betas": betas.float()}}, tmp_path / "model.ckpt")
+    torch.save(
+        {**content, "state_dict": {**content["state_dict"], "betas": betas.float()}},
+        tmp_path / "model.ckpt",
+    )
     loaded = load_checkpoint(tmp_path / "model.ckpt")
     assert_near(loaded.generator.log_snr, torch.logit((1 - betas).cumprod(0)), 2e-7)
-    assert "64 x 1024, ranges of 1 to 56 m on a logarithmic scale, attention heads of 32" in caplog.text
+    assert (
+        "64 x 1024, ranges of 1 to 56 m on a logarithmic scale, attention heads of 32"
+        in caplog.text
+    )
     assert loaded.generator.space.shape == (1, 64, 1024)
     assert loaded.config["generator"]["unet"]["head_channels"] == 32
     assert loaded.config["generator"]["schedule"]["last"] == 0.0195
 
 
 @pytest.mark.parametrize("name", ["use_new_attention_order", "scale_by_std"])
-def test_an_option_that_changes_the_images_and_is_not_read_is_refused(published: tuple[Path, Any], name: str):
+def test_an_option_that_changes_the_images_and_is_not_read_is_refused(
+    published: tuple[Path, Any], name: str
+):
     config = yaml.safe_load((notes := published[0].with_name("config.yaml")).read_text())
     params = config["model"]["params"]
     (params if name == "scale_by_std" else params["unet_config"]["params"])[name] = True
@@ -290,17 +347,24 @@ def test_an_option_that_changes_the_images_and_is_not_read_is_refused(published:
         load_checkpoint(published[0])
 
 
-def test_points_fall_into_the_published_pixels(published: tuple[Path, dict[str, Any]], shared: Path):
+def test_points_fall_into_the_published_pixels(
+    published: tuple[Path, dict[str, Any]], shared: Path
+):
     case = load_case(shared, "lidm_data.pt")
     sensor = build_sensor("hdl64e", 16, 64, *case["depth_range"])
     chosen = yaml.safe_load((CONF / "data" / "kitti_360_lidm.yaml").read_text())
     readings = chosen["reading"], chosen["validation"]["data"]["reading"]
-    for how in (reading_for([], load_checkpoint(published[0])).convention, *(r["convention"] for r in readings)):
+    for how in (
+        reading_for([], load_checkpoint(published[0])).convention,
+        *(r["convention"] for r in readings),
+    ):
         image = torch.from_numpy(project(case["points"].numpy(), None, sensor, convention=how))[0]
         assert_near(torch.where(image > 0, image, -1.0), case["proj_range"], 1e-6)
 
 
-def test_callback_states_keyed_by_their_class_are_read(shared: Path, tmp_path: Path, monkeypatch: Any):
+def test_callback_states_keyed_by_their_class_are_read(
+    shared: Path, tmp_path: Path, monkeypatch: Any
+):
     """As Lightning 1.4.2 wrote them; the class is not imported."""
     place = "pytorch_lightning.callbacks.model_checkpoint"
     key = type("ModelCheckpoint", (), {"__module__": place})
@@ -309,7 +373,9 @@ def test_callback_states_keyed_by_their_class_are_read(shared: Path, tmp_path: P
             patch.setitem(sys.modules, name, ModuleType(name))
         sys.modules[place].ModelCheckpoint = key
         content = load_case(shared, "lidm_ae_published.ckpt")
-        torch.save({**content, "callbacks": {key: {"best_model_path": "a"}}}, tmp_path / "model.ckpt")
+        torch.save(
+            {**content, "callbacks": {key: {"best_model_path": "a"}}}, tmp_path / "model.ckpt"
+        )
     assert load_checkpoint(tmp_path / "model.ckpt").config["generator"]["name"] == "vq_autoencoder"
 
 
@@ -318,12 +384,20 @@ def test_callback_states_keyed_by_their_class_are_read(shared: Path, tmp_path: P
     [
         ({}, {}),
         (
-            {"multipliers": (2, 1, 2), "strides": ((1, 2), (1, 2)), "blocks": 3, "attention": (1,), "mask": True},
+            {
+                "multipliers": (2, 1, 2),
+                "strides": ((1, 2), (1, 2)),
+                "blocks": 3,
+                "attention": (1,),
+                "mask": True,
+            },
             {"multipliers": (1, 2, 3), "blocks": 1, "attention": (2,), "width": 64},
         ),
     ],
 )
-def test_options_are_read_off_the_names_and_shapes_of_weights(first: dict[str, Any], second: dict[str, Any]):
+def test_options_are_read_off_the_names_and_shapes_of_weights(
+    first: dict[str, Any], second: dict[str, Any]
+):
     with torch.device("meta"):
         autoencoder, unet = Autoencoder(1, **first), LatentUNet((8, 16, 128), **second)
     usual = options_of(Autoencoder, given=1), options_of(LatentUNet, given=1)
@@ -332,19 +406,26 @@ def test_options_are_read_off_the_names_and_shapes_of_weights(first: dict[str, A
         (_unet, unet, second, usual[1]),
     ):
         for name, value in read(model.state_dict()).items():
-            assert value == json.loads(json.dumps({**known, **given}[name])), name  # lists for tuples
+            # lists for tuples
+            assert value == json.loads(json.dumps({**known, **given}[name])), name
 
 
 def test_a_published_config_that_contradicts_is_one_line(published: tuple[Path, dict[str, Any]]):
     path, _ = published
     text = path.with_name("config.yaml").read_text()
-    for what, instead, said in (("5.84", "6.5", "'depth_scale': 6.5"), ("- -25", "- -30", r"'fov': \[3, -30\]")):
+    for what, instead, said in (
+        ("5.84", "6.5", "'depth_scale': 6.5"),
+        ("- -25", "- -30", r"'fov': \[3, -30\]"),
+    ):
         path.with_name("config.yaml").write_text(text.replace(what, instead))
         with pytest.raises(InputError, match=said):
             load_checkpoint(path)
     content = torch.load(path, weights_only=True)
     path.with_name("config.yaml").unlink()
-    for name, said in ("betas", "betas are not evenly spaced"), ("cond_stage_model.w", "only LiDM's unconditional"):
+    for name, said in (
+        ("betas", "betas are not evenly spaced"),
+        ("cond_stage_model.w", "only LiDM's unconditional"),
+    ):
         content["state_dict"][name] = torch.linspace(0.0015, 0.0195, 1000)
         torch.save(content, path)
         with pytest.raises(InputError, match=said):
@@ -355,8 +436,13 @@ def test_a_published_config_that_contradicts_is_one_line(published: tuple[Path, 
 def test_a_published_autoencoder_gives_its_codes(shared: Path, tmp_path: Path, averaged: bool):
     io, content = (load_case(shared, f"lidm_ae_published{end}") for end in ("_io.pt", ".ckpt"))
     if averaged:
-        averages = {f"model_ema.{name.replace('.', '')}": value for name, value in content["state_dict"].items()}
-        content["state_dict"] = {name: 2 * value for name, value in content["state_dict"].items()} | averages
+        averages = {
+            f"model_ema.{name.replace('.', '')}": value
+            for name, value in content["state_dict"].items()
+        }
+        content["state_dict"] = {
+            name: 2 * value for name, value in content["state_dict"].items()
+        } | averages
     torch.save(content, tmp_path / "model.ckpt")
     model = load_checkpoint(tmp_path / "model.ckpt").generator.first_stage_model
     with torch.no_grad():
@@ -364,14 +450,20 @@ def test_a_published_autoencoder_gives_its_codes(shared: Path, tmp_path: Path, a
     assert_near(before, io["prequant"], 5e-5)
     assert_near(made, io["reconstruction"], 5e-5)
     assert_near(loss, io["codebook_loss"], 5e-5)
-    assert (model.quantize.nearest(before.movedim(1, -1)).flatten() == io["indices"]).float().mean() > 0.99
+    assert (
+        model.quantize.nearest(before.movedim(1, -1)).flatten() == io["indices"]
+    ).float().mean() > 0.99
 
 
 def test_an_autoencoder_where_scans_are_wanted_is_one_line(r2flow, shared: Path, tmp_path: Path):
     path = shared / "oracle_baselines" / "lidm_ae_published.ckpt"
     code, _, error = r2flow("sample", path, "-o", tmp_path / "out")
     warning, line = error.splitlines()
-    assert (code, warning.startswith("WARNING"), "a VQAutoencoder draws no scans" in line) == (2, True, True)
+    assert (code, warning.startswith("WARNING"), "a VQAutoencoder draws no scans" in line) == (
+        2,
+        True,
+        True,
+    )
     assert not (tmp_path / "out").exists()
     assert "\nsampler " not in r2flow("info", path).said
 
@@ -382,15 +474,24 @@ def test_a_latent_diffusion_starts_from_its_autoencoder_alone():
     before = generator.unet.state_dict()
     generator.start_from(parent)
     own = generator.first_stage_model.state_dict()
-    assert all(torch.equal(own[name], value) for name, value in parent.first_stage_model.state_dict().items())
-    assert all(torch.equal(before[name], value) for name, value in generator.unet.state_dict().items())
+    assert all(
+        torch.equal(own[name], value)
+        for name, value in parent.first_stage_model.state_dict().items()
+    )
+    assert all(
+        torch.equal(before[name], value) for name, value in generator.unet.state_dict().items()
+    )
     other = {**AUTOENCODER["generator"], "autoencoder": {**SMALL_AUTOENCODER, "codes": 32}}
     with pytest.raises(InputError, match="do not fit"):
         generator.start_from(build_generator({**AUTOENCODER, "generator": other}))
 
 
-@pytest.mark.parametrize(("changes", "said"), [({"name": "ddpm"}, "denoise"), ({"steps": 1000}, "in 1 to 999")])
-def test_a_sampler_that_a_latent_diffusion_does_not_have_is_refused(changes: dict[str, Any], said: str):
+@pytest.mark.parametrize(
+    ("changes", "said"), [({"name": "ddpm"}, "denoise"), ({"steps": 1000}, "in 1 to 999")]
+)
+def test_a_sampler_that_a_latent_diffusion_does_not_have_is_refused(
+    changes: dict[str, Any], said: str
+):
     with pytest.raises(InputError, match=said):
         build_generator(DIFFUSION).choose(**changes)
 
@@ -407,12 +508,24 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
     ("change", "said"),
     [
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1, 2], [2, 2]]}}, "needs 1 strides"),
-        ({"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}}, r"\) halves images 4"),
-        ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "'none' or 'learnable', found 'polar'"),
+        (
+            {"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}},
+            r"\) halves images 4",
+        ),
+        (
+            {"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER},
+            "'none' or 'learnable', found 'polar'",
+        ),
         ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers must be 1 integers"),
-        ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
+        (
+            {"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}},
+            r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]",
+        ),
         ({"schedule": {"name": "cosine", "steps": 1}}, "steps: must be at least 2, found 1"),
-        ({"schedule": {"name": "square_root_linear", "last": 2.0}}, r"last: must be in \(0, 1\), found 2"),
+        (
+            {"schedule": {"name": "square_root_linear", "last": 2.0}},
+            r"last: must be in \(0, 1\), found 2",
+        ),
     ],
 )
 def test_sizes_that_cannot_work_are_one_line(change: dict[str, Any], said: str):
@@ -451,7 +564,17 @@ def test_the_published_recipe_with_positions_starts_from_its_autoencoder(tmp_pat
     with pytest.raises(InputError, match="starts from a trained model: give parent=RUN"):
         check(compose(["experiment=lidm", "stage.parent=null", *common]))
     first = ["experiment=lidm_autoencoder", *common]
-    config = check(compose(["experiment=lidm_ape", *common]), parent=Parent(compose(first), tmp_path))
-    assert [config["data"][key] for key in ("name", "split", "drives")] == ["kitti_360", "train", None]  # the paper's
+    config = check(
+        compose(["experiment=lidm_ape", *common]), parent=Parent(compose(first), tmp_path)
+    )
+    # the paper's
+    assert [config["data"][key] for key in ("name", "split", "drives")] == [
+        "kitti_360",
+        "train",
+        None,
+    ]
     with torch.device("meta"):
-        assert sum(p.numel() for p in build_generator(config).parameters()) == 15_070_361 + 257_751_560 + 524_288
+        assert (
+            sum(p.numel() for p in build_generator(config).parameters())
+            == 15_070_361 + 257_751_560 + 524_288
+        )

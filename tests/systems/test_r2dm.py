@@ -1,4 +1,6 @@
-"""R2DM against the published implementation: network, schedules, objective, samplers, RePaint, data, checkpoint."""
+"""R2DM against the published implementation: network, schedules, objective, samplers, RePaint,
+data, checkpoint.
+"""
 
 import math
 from itertools import pairwise
@@ -35,7 +37,12 @@ from tests.reference import assert_near, assert_norms, assert_published, backbon
 CONFIG: dict[str, Any] = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
     "encoding": {"format": "logscale", "reflectance": True},
-    "backbone": {"name": "efficient_unet", "base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": 1},
+    "backbone": {
+        "name": "efficient_unet",
+        "base_channels": 8,
+        "channel_multiplier": [1, 2],
+        "num_residual_blocks": 1,
+    },
     "generator": {"name": "diffusion"},
 }
 
@@ -63,11 +70,19 @@ def test_schedules_of_steps_are_the_published(shared):
     for name, expected in load_case(shared, "r2dm_schedules.pt")["discrete_40_steps"].items():
         log_snr = DISCRETE[name](40)
         now, before = log_snr.sigmoid(), torch.cat([torch.ones(1), log_snr[:-1].sigmoid()])
-        found = {"alpha_bar": now, "alpha_bar_prev": before, "beta": 1 - now / before, "snr": log_snr.exp()}
+        found = {
+            "alpha_bar": now,
+            "alpha_bar_prev": before,
+            "beta": 1 - now / before,
+            "snr": log_snr.exp(),
+        }
         for key, value in found.items():
             assert_near(value, expected[key], 1e-6)
-    alpha_bar = DISCRETE["sigmoid"](1000)[-3:].sigmoid()  # of the published code, which rounds the end to float32
-    assert (1 - alpha_bar[1:] / alpha_bar[:-1]).tolist() == pytest.approx([0.5013504179271411, 0.999], rel=1e-9)
+    # of the published code, which rounds the end to float32
+    alpha_bar = DISCRETE["sigmoid"](1000)[-3:].sigmoid()
+    assert (1 - alpha_bar[1:] / alpha_bar[:-1]).tolist() == pytest.approx(
+        [0.5013504179271411, 0.999], rel=1e-9
+    )
 
 
 def test_loss_weights_are_the_published(shared):
@@ -76,7 +91,9 @@ def test_loss_weights_are_the_published(shared):
     for name, theirs in (("eps", "eps"), ("v", "v"), ("x", "x_0")):
         for kind, gamma in (("minsnr", 5.0), ("plain", None)):
             expected = case["loss_weight_cosine"][f"{theirs}_{kind}"]
-            torch.testing.assert_close(PREDICTIONS[name].weight(log_snr, gamma), expected, rtol=1e-6, atol=0)
+            torch.testing.assert_close(
+                PREDICTIONS[name].weight(log_snr, gamma), expected, rtol=1e-6, atol=0
+            )
 
 
 def test_the_stage_s_loss_is_the_formula_s_or_on_demand_the_published(shared):
@@ -112,7 +129,12 @@ def test_samplers_follow_the_published_trajectories(shared):
         eta, tolerance = (1.0, 1e-3) if one["mode"] == "ddpm" else (one["ddim_eta"], 2e-3)
         start, *draws = one["noise"]
         log_snrs = generator.schedule(torch.linspace(1, 0, one["num_steps"] + 1))
-        states = torch.stack([start, *walk(generator.denoise, start, log_snrs, eta, lambda j: draws[j - 1])])  # noqa: B023
+        states = torch.stack(
+            [
+                start,
+                *walk(generator.denoise, start, log_snrs, eta, lambda j, draws=draws: draws[j - 1]),
+            ]
+        )
         assert_near(states, one["trajectory"], tolerance)
         given = SimpleNamespace(step=lambda shape, j: draws[j - 1])  # noqa: B023
         name = "ddpm" if one["mode"] == "ddpm" else f"ddim:eta={eta}"
@@ -133,7 +155,9 @@ def test_a_scan_is_completed_by_the_published_repaint(shared):
         draws=SimpleNamespace(step=lambda shape, j: draws[j - 1]),
         progress=lambda: evaluated.append(1),
     )  # fmt: skip
-    assert_near(made.x, torch.where(case["mask"] > 0, case["known"], one["output"].clamp(-1, 1)), 1e-3)
+    assert_near(
+        made.x, torch.where(case["mask"] > 0, case["known"], one["output"].clamp(-1, 1)), 1e-3
+    )
     assert made.evaluations.tolist() == [len(evaluated)] * 2 == [7, 7]
 
 
@@ -156,7 +180,9 @@ def test_repaint_draws_as_often_as_its_steps_parts_and_repeats_say():
     known = torch.ones(1, 1, 2, 2)
     mask = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
     log_snrs = Cosine()(torch.linspace(1, 0, 13, dtype=torch.float64))
-    states = list(repaint(lambda z, _: torch.zeros_like(z), known, known, mask, log_snrs, noise, 2, 4))
+    states = list(
+        repaint(lambda z, _: torch.zeros_like(z), known, known, mask, log_snrs, noise, 2, 4)
+    )
     assert len(states) == 2 + 2 + 1  # the last step is not repeated
     # Known pixels and ancestral step on the way down, one on the way up.
     assert drawn == list(range(1, 1 + 5 * 4 * 2 + 2 * 4))
@@ -170,7 +196,9 @@ FORMATS = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric
 def test_metres_and_model_space_are_the_published(shared, name):
     data = load_case(shared, "r2dm_data.pt")
     case = data[f"{name}_1.45_80.0"]
-    encoding = Encoding(SENSORS["hdl64e"].resized(16, 64), FORMATS[name], reflectance=False, limits="open")
+    encoding = Encoding(
+        SENSORS["hdl64e"].resized(16, 64), FORMATS[name], reflectance=False, limits="open"
+    )
     assert_near(encoding.encode(case["metres"]), case["model_space"], 1e-5)
     assert_near(encoding.decode(2 * case["normalised_in"] - 1), case["reverted"], 1e-5)
     assert_near(encoding.decode(encoding.encode(case["metres"])), case["round_trip"], 1e-5)
@@ -181,7 +209,9 @@ def test_metres_and_model_space_are_the_published(shared, name):
 def test_rays_are_the_published(shared):
     data, sensor = load_case(shared, "r2dm_data.pt"), SENSORS["hdl64e"]
     assert_near(sensor.resized(16, 64).rays("reference"), data["ray_angles"][0], 1e-5)
-    assert_near(sensor.rays("reference").double().sum((1, 2)), data["ray_angles_64x1024_sums"], 1e-5)
+    assert_near(
+        sensor.rays("reference").double().sum((1, 2)), data["ray_angles_64x1024_sums"], 1e-5
+    )
 
 
 @pytest.mark.parametrize("averaged", [True, False])
@@ -193,7 +223,12 @@ def test_a_published_checkpoint_predicts_what_its_authors_did(shared, averaged):
     output = diffusion.predict(expected["x"], expected["t"])
     assert_near(output, expected["output_ema" if averaged else "output_weights"], 2e-5)
     assert sum(p.numel() for p in diffusion.parameters()) == expected["parameters"]
-    assert (found.format, found.step, found.sensor.min_range, found.sensor.max_range) == ("published", 3, 1.45, 80.0)
+    assert (found.format, found.step, found.sensor.min_range, found.sensor.max_range) == (
+        "published",
+        3,
+        1.45,
+        80.0,
+    )
     assert found.encoding.limits == "open"
     assert diffusion.sampler == build_sampler("ddpm", steps=256)
 
@@ -222,7 +257,9 @@ def test_the_weight_turns_a_prediction_s_error_into_that_of_the_data(name):
     prediction = PREDICTIONS[name]
     x, z = torch.zeros(9, 1, dtype=torch.float64), torch.randn(9, 1, dtype=torch.float64)
     alpha, sigma = (part[:, None] for part in alpha_sigma(log_snr))
-    right, wrong = (prediction.target(one, (z - alpha * one) / sigma, log_snr) for one in (x, x + 0.1))
+    right, wrong = (
+        prediction.target(one, (z - alpha * one) / sigma, log_snr) for one in (x, x + 0.1)
+    )
     weighted = prediction.weight(log_snr, 5.0) * (wrong - right).square()[:, 0]
     torch.testing.assert_close(weighted, 0.01 * log_snr.exp().clamp(max=5.0))
 
@@ -235,7 +272,9 @@ def test_a_step_keeps_the_distribution_of_gaussian_data(eta):
     draws = torch.randn(2, len(x), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     found = step(noised(x, here, draws[0]), x, here, there, eta, draws[1])
     alpha, sigma = alpha_sigma(there)
-    assert found.mean().item() == pytest.approx(0.3 * alpha.item(), abs=4 * sigma.item() / len(x) ** 0.5)
+    assert found.mean().item() == pytest.approx(
+        0.3 * alpha.item(), abs=4 * sigma.item() / len(x) ** 0.5
+    )
     assert found.std().item() == pytest.approx(sigma.item(), rel=1e-2)
 
 
@@ -246,7 +285,10 @@ def test_forward_steps_add_up_to_the_noise_of_their_end():
     signal, variance = alpha * one, sigma.square() * one
     for here, there in pairwise(lambdas):
         kept = forward_step(one, here, there, zero)
-        signal, variance = kept * signal, kept.square() * variance + forward_step(zero, here, there, one).square()
+        signal, variance = (
+            kept * signal,
+            kept.square() * variance + forward_step(zero, here, there, one).square(),
+        )
     torch.testing.assert_close(signal, last_alpha * one)
     torch.testing.assert_close(variance, last_sigma.square() * one)
 
@@ -257,7 +299,9 @@ class Exact(Diffusion):
     mean, std = 0.2, 0.1
 
     def predict(self, z: Tensor, log_snr: Tensor) -> Tensor:
-        alpha, sigma = (part.reshape(-1, 1, 1, 1) for part in alpha_sigma(log_snr.double().reshape(-1)))
+        alpha, sigma = (
+            part.reshape(-1, 1, 1, 1) for part in alpha_sigma(log_snr.double().reshape(-1))
+        )
         return (sigma * (z - alpha * self.mean) / (alpha**2 * self.std**2 + sigma**2)).to(z)
 
 
@@ -270,10 +314,14 @@ def exact() -> Exact:
 
 @torch.no_grad()
 def test_a_diffusion_is_the_flow_of_its_own_data(exact):
-    """The straight flow of N(m, s^2) carries x_0 to m + s x_0; the schedule ends where sigma is 6e-4."""
+    """The straight flow of N(m, s^2) carries x_0 to m + s x_0; the schedule ends where sigma is
+    6e-4.
+    """
     noise = Draws(0, [0]).start(exact.noise_shape)
     for sampler in (build_sampler("dopri5", tolerance=1e-7), build_sampler("ddim", steps=1000)):
-        torch.testing.assert_close(exact(noise, sampler=sampler).x, exact.mean + exact.std * noise, rtol=0, atol=2e-3)
+        torch.testing.assert_close(
+            exact(noise, sampler=sampler).x, exact.mean + exact.std * noise, rtol=0, atol=2e-3
+        )
 
 
 @torch.no_grad()
@@ -285,7 +333,9 @@ def test_a_scan_is_completed_with_a_diffusion_as_with_any_flow(exact):
     condition = {"image": image * known, "known": known}
     found = exact(noise, condition, sampler=build_sampler("replace", steps=500), draws=draws).x
     torch.testing.assert_close(found * known, image * known, rtol=0, atol=0)
-    torch.testing.assert_close(found[..., 1::2], (exact.mean + exact.std * noise)[..., 1::2], rtol=0, atol=0.01)
+    torch.testing.assert_close(
+        found[..., 1::2], (exact.mean + exact.std * noise)[..., 1::2], rtol=0, atol=0.01
+    )
 
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
@@ -298,16 +348,25 @@ def test_what_a_diffusion_cannot_do_is_said(exact):
 
 @pytest.mark.parametrize("farthest", [5.0, 15.0, 20.0])
 def test_a_cosine_schedule_has_its_digits_up_to_its_ends(farthest):
-    """2 ln cot of the angle in float64, at times of float32; both ends, -farthest and farthest, leave the angle q."""
+    """2 ln cot of the angle in float64, at times of float32; both ends, -farthest and farthest,
+    leave the angle q.
+    """
     t, q = torch.linspace(0, 1, 33), math.atan(math.exp(-farthest / 2))
-    sine, cosine = ((q + share * (math.pi / 2 - 2 * q)).sin() for share in (t.double(), 1 - t.double()))
+    sine, cosine = (
+        (q + share * (math.pi / 2 - 2 * q)).sin() for share in (t.double(), 1 - t.double())
+    )
     expected = 2 * (cosine.log() - sine.log())
-    torch.testing.assert_close(Cosine(-farthest, farthest)(t).double(), expected, rtol=0, atol=0.005)
+    torch.testing.assert_close(
+        Cosine(-farthest, farthest)(t).double(), expected, rtol=0, atol=0.005
+    )
 
 
 @pytest.mark.parametrize(
-    "ends", [{"lowest": -2000.0}, {"highest": 21.0}, {"lowest": 3.0, "highest": 2.0}, {"lowest": math.nan}]
+    "ends",
+    [{"lowest": -2000.0}, {"highest": 21.0}, {"lowest": 3.0, "highest": 2.0}, {"lowest": math.nan}],
 )
 def test_a_cosine_schedule_whose_ends_are_no_numbers_is_one_line(ends):
-    with pytest.raises(InputError, match="falls from highest to lowest, both within 20 of 0; found"):
+    with pytest.raises(
+        InputError, match="falls from highest to lowest, both within 20 of 0; found"
+    ):
         Cosine(**ends)

@@ -57,7 +57,9 @@ TINY = [
 def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, sensor = tmp_path_factory.mktemp("scans"), SENSORS["hdl64e"].resized(32, 256)
     for index in range(12):
-        write_points(folder / f"{index:06d}.bin", *image_to_points(simulate(sensor, 0, index).image, sensor))
+        write_points(
+            folder / f"{index:06d}.bin", *image_to_points(simulate(sensor, 0, index).image, sensor)
+        )
     return folder
 
 
@@ -83,7 +85,9 @@ def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
     with contextlib.chdir(cwd):
         done = quickly(lambda: run_verb(["train", *arguments], COMMAND))
     if check and done.returncode:
-        raise AssertionError(f"{' '.join(arguments)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
+        raise AssertionError(
+            f"{' '.join(arguments)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+        )
     return done
 
 
@@ -97,7 +101,9 @@ def job_in_process(command: Sequence[str]) -> int:
         return 2
 
 
-def run_train(cwd: Path, scans: Path, *overrides: str, check: bool = True, flags: tuple[str, ...] = ()) -> Done:
+def run_train(
+    cwd: Path, scans: Path, *overrides: str, check: bool = True, flags: tuple[str, ...] = ()
+) -> Done:
     """The tiny run, a sweep's jobs too in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("r2flow.runs.launch.run_process", job_in_process)
@@ -111,14 +117,20 @@ def start(
     return subprocess.Popen(
         [*command, *map(str, arguments)], start_new_session=True, cwd=cwd, text=True, stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, env={**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "another", **environment},
-        # A shell's background job is started with Ctrl-C ignored, nohup's with SIGHUP, and hands that on.
+        # A shell's background job is started with Ctrl-C ignored, nohup's with SIGHUP, and hands
+        # that on.
         preexec_fn=lambda: [signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)],
     )  # fmt: skip
 
 
 def hold_at(step: int, file: Path, seconds: float = 60.0) -> list[str]:
-    """Options by which a run writes a file at a step and waits to be told to stop, if not `let_go(file)` before."""
-    return [f"--plugin={HOLDING}", f"+callbacks.hold={{file: {file}, step: {step}, seconds: {seconds}}}"]
+    """Options by which a run writes a file at a step and waits to be told to stop, if not
+    `let_go(file)` before.
+    """
+    return [
+        f"--plugin={HOLDING}",
+        f"+callbacks.hold={{file: {file}, step: {step}, seconds: {seconds}}}",
+    ]
 
 
 def let_go(file: Path) -> None:
@@ -131,7 +143,9 @@ def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = 200.0)
 
 
 def stop_held(held: Path, by: int, command: list[str]) -> tuple[int, str]:
-    """Start a run that waits (`hold_at`) and send its process group a signal there: (exit code, output)."""
+    """Start a run that waits (`hold_at`) and send its process group a signal there: (exit code,
+    output).
+    """
     process = start(held.parent, command)
     wait_for(held, process)
     os.killpg(process.pid, by)

@@ -4,12 +4,13 @@ import time
 from pathlib import Path
 
 import lightning as L
-
 from r2flow.callbacks import CALLBACKS, Stopping
 
 
 class Hold(L.Callback):
-    """Writes `file` at the end of a step, 0: before the first, and waits for a signal unless `file.go` exists."""
+    """Writes `file` at the end of a step, 0: before the first, and waits for a signal unless
+    `file.go` exists.
+    """
 
     def __init__(self, file: str, step: int = 0, seconds: float = 60.0) -> None:
         self.file, self.step, self.seconds = Path(file), step, seconds

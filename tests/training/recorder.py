@@ -1,4 +1,5 @@
-"""train.py with somebody looking on: each rank writes down its losses, its average, and what it writes.
+"""train.py with somebody looking on: each rank writes down its losses, its average, and what it
+writes.
 
 A script of its own because the ranks of a DDP run are processes that start the same script again.
 """
@@ -17,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from r2flow.callbacks import CALLBACKS
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.ema import averaged_weights
+
 from r2flow.cli import main
 from r2flow.data.loader import FlowDataset
 

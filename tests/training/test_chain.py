@@ -13,12 +13,21 @@ from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
 from r2flow.reports.compare import report_chain
 from r2flow.runs.chain import links_of
-from r2flow.runs.folder import has_ended
 from r2flow.runs.composing import compose
+from r2flow.runs.folder import has_ended
 from r2flow.signals import LATER
 from r2flow.training import Result, Run, build
 from tests.conftest import CONFIG, write_checkpoint
-from tests.training.conftest import TINY, hold_at, in_process, let_go, run_train, start, tiny, wait_for
+from tests.training.conftest import (
+    TINY,
+    hold_at,
+    in_process,
+    let_go,
+    run_train,
+    start,
+    tiny,
+    wait_for,
+)
 
 HELD = Path("held")  # in the folder that a chain is started from
 CHAIN = ["experiment=demo", "preview=null", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8",
@@ -27,12 +36,16 @@ LINKS = ("rf1", "rf2", "td2")
 STOPPED = Result({}, None, Path(), 0, finished=False)  # of `fit`
 
 
-def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_preview_is_drawn_once_and_before_the_chain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     model = write_checkpoint(tmp_path / "street.ckpt", CONFIG)
     monkeypatch.setattr("r2flow.models.find_model", {"street": model}.__getitem__)
     picture = tmp_path / "runs" / "demo" / "preview" / "samples.png"
     drawn: list[int] = []
-    monkeypatch.setattr("r2flow.runs.chain.fit", lambda _: drawn.append(picture.stat().st_mtime_ns) or STOPPED)
+    monkeypatch.setattr(
+        "r2flow.runs.chain.fit", lambda _: drawn.append(picture.stat().st_mtime_ns) or STOPPED
+    )
     for _ in range(2):
         done = in_process(tmp_path, ["experiment=demo", "trainer.accelerator=cpu"], check=False)
         assert "preview: scans of the model street in runs/demo/preview/samples.png" in done.stdout
@@ -41,7 +54,9 @@ def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatc
 
 def of_a_child(*overrides: str) -> list[str]:
     """The tiny run's overrides without what a child takes from its parent."""
-    return [one for one in TINY if not one.startswith(("data=", "sensor", "backbone", "data.root"))] + list(overrides)
+    return [
+        one for one in TINY if not one.startswith(("data=", "sensor", "backbone", "data.root"))
+    ] + list(overrides)
 
 
 @pytest.fixture(scope="session")
@@ -68,35 +83,63 @@ def assert_alike(first: Path, second: Path) -> None:
     a, b = state(first), state(second)
     assert a.keys() == b.keys()
     for name, value in a.items():
-        assert torch.equal(value, b[name]) if isinstance(value, torch.Tensor) else value == b[name], name
+        assert (
+            torch.equal(value, b[name]) if isinstance(value, torch.Tensor) else value == b[name]
+        ), name
 
 
 def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
     run, said = chained
-    for name in ("report/steps.png", "report/compare.md", "report/compare.json", "report/000000.ply"):
+    for name in (
+        "report/steps.png",
+        "report/compare.md",
+        "report/compare.json",
+        "report/000000.ply",
+    ):
         assert (run / name).is_file(), name
-    for words in ("[1/3] rf1", "[2/3] rf2", "[3/3] td2", "8 pairs", "evaluations a pair", "pairs/s", "r2flow sample"):
+    for words in (
+        "[1/3] rf1",
+        "[2/3] rf2",
+        "[3/3] td2",
+        "8 pairs",
+        "evaluations a pair",
+        "pairs/s",
+        "r2flow sample",
+    ):
         assert words in said
     assert said.rstrip().endswith("Open runs/demo/report/steps.png first.")
     first, second, third = (load_checkpoint(run / link) for link in LINKS)
-    assert [flow.config["stage"]["name"] for flow in (first, second, third)] == ["rectify", "reflow", "distill"]
+    assert [flow.config["stage"]["name"] for flow in (first, second, third)] == [
+        "rectify",
+        "reflow",
+        "distill",
+    ]
     assert second.config["stage"]["parent"]["weights"] == weights_hash(first)
     assert third.config["stage"]["parent"]["weights"] == weights_hash(second)
     assert second.config["backbone"] == first.config["backbone"]
-    assert [(f.generator.sampler.steps, f.generator.fixed) for f in (first, third)] == [(2, False), (2, True)]
+    assert [(f.generator.sampler.steps, f.generator.fixed) for f in (first, third)] == [
+        (2, False),
+        (2, True),
+    ]
     # The noise that 2-TD learns from is none of that which 2-RF has learned from.
-    assert (second.config["data"]["pairs"]["first"], third.config["data"]["pairs"]["first"]) == (0, 8)
+    assert (second.config["data"]["pairs"]["first"], third.config["data"]["pairs"]["first"]) == (
+        0,
+        8,
+    )
 
 
 def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):
     run = Path(shutil.copytree(chained[0], tmp_path / "runs" / "it's"))
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")}
-    assert run_train(tmp_path, scans, *CHAIN, 'name="it\'s"').stdout.count("finished before") == 4  # the report too
+    # the report too
+    assert run_train(tmp_path, scans, *CHAIN, 'name="it\'s"').stdout.count("finished before") == 4
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")} == before
 
 
 @pytest.mark.slow
-def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(chained, scans, tmp_path):
+def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
+    chained, scans, tmp_path
+):
     shutil.copytree(chained[0], tmp_path / "runs" / "demo")
     run = tmp_path / "runs" / "demo"
     shutil.rmtree(run / "td2")
@@ -120,7 +163,10 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(cha
     [
         (["experiment=reflow"], "data=pairs are drawn by a trained run: give stage.parent=RUN"),
         (["experiment=reflow", "stage.parent=RF1", "sensor=vlp16"], "the sensor is the parent's"),
-        (["experiment=reflow", "stage.parent=RF1", "data.augment.flip=true"], "data.augment changes scans"),
+        (
+            ["experiment=reflow", "stage.parent=RF1", "data.augment.flip=true"],
+            "data.augment changes scans",
+        ),
         (["experiment=reflow", "stage.parent=RF1"], "holds other pairs"),
     ],
 )
@@ -130,12 +176,19 @@ def test_a_child_that_cannot_be_is_refused_in_one_line(chained, tmp_path, overri
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple[Path, str], tmp_path: Path):
+def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(
+    chained: tuple[Path, str], tmp_path: Path
+):
     parent = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "2011"))
     shutil.rmtree(parent / "pairs")
     last, before = checkpoints_of(parent)
     last.unlink()
-    options = ["experiment=reflow", "data.pairs.num=4", "data.pairs.batch_size=4", "trainer.max_steps=2"]
+    options = [
+        "experiment=reflow",
+        "data.pairs.num=4",
+        "data.pairs.batch_size=4",
+        "trainer.max_steps=2",
+    ]
     done = in_process(tmp_path, of_a_child(*options, "stage.parent=2011"), check=False)
     assert "has stopped at step 6 of 8: finish it, or name the checkpoint" in done.refusal
     in_process(tmp_path, of_a_child(*options, f"stage.parent={before}"))
@@ -145,13 +198,18 @@ def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple
 def test_pairs_of_a_flow_map_can_be_its_jumps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     sampler = ("data.pairs.sampler.name=jump", "data.pairs.sampler.steps=4")
-    run = build(compose(["experiment=reflow", "stage.parent=street", "data.root=pairs", "trainer=cpu", *sampler]))
+    run = build(
+        compose(
+            ["experiment=reflow", "stage.parent=street", "data.root=pairs", "trainer=cpu", *sampler]
+        )
+    )
     assert run.data.pair_store.sampler.name == "jump"
 
 
 @pytest.mark.slow
 def test_two_devices_make_the_pairs_that_one_makes(chained: tuple[Path, str], tmp_path: Path):
-    # Lightning starts the second device by the process's own command line, which must not be that of these tests.
+    # Lightning starts the second device by the process's own command line, which must not be that
+    # of these tests.
     options = of_a_child(
         "experiment=reflow", f"stage.parent={chained[0] / 'rf1'}", "trainer.strategy=ddp", "trainer.devices=2",
         f"data.root={tmp_path / 'pairs'}", "data.pairs.num=8", "data.pairs.batch_size=4",
@@ -161,11 +219,18 @@ def test_two_devices_make_the_pairs_that_one_makes(chained: tuple[Path, str], tm
     said, _ = process.communicate(timeout=200)
     assert process.returncode == 0, said
     for name in ("manifest.json", "pairs-000000.safetensors"):
-        assert (tmp_path / "pairs" / name).read_bytes() == (chained[0] / "rf1" / "pairs" / name).read_bytes()
+        assert (tmp_path / "pairs" / name).read_bytes() == (
+            chained[0] / "rf1" / "pairs" / name
+        ).read_bytes()
 
 
 ALL_LINKS = ("data.batch_size=2", "data.validation.share=0.1", "+trainer.x=1")
-OF_SCANS = ("data.augment.flip=true", "data.a_key_of_tomorrow=1", "data.validation.data.root=x", "sensor=vlp16")
+OF_SCANS = (
+    "data.augment.flip=true",
+    "data.a_key_of_tomorrow=1",
+    "data.validation.data.root=x",
+    "sensor=vlp16",
+)
 
 
 def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone():
@@ -186,48 +251,86 @@ def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone()
     )  # fmt: skip
 
 
-def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(kitti_360, tmp_path, monkeypatch):
+def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
+    kitti_360, tmp_path, monkeypatch
+):
     ran: list[Run] = []
     monkeypatch.setattr("r2flow.runs.chain.fit", lambda run: ran.append(run) or STOPPED)
-    command = ["experiment=r2flow", f"data.root={kitti_360}", "data.augment.flip=true", "trainer.accelerator=cpu"]
+    command = [
+        "experiment=r2flow",
+        f"data.root={kitti_360}",
+        "data.augment.flip=true",
+        "trainer.accelerator=cpu",
+    ]
     assert in_process(tmp_path, command, check=False).returncode == LATER
     (first,) = ran  # the later ones have been built, and are not refused for the flip
     assert first.data.augment.flip
-    assert first.config["trainer"] == {**compose(["experiment=r2flow_1rf"])["trainer"], "accelerator": "cpu", "default_root_dir": "runs/r2flow/rf1"}
+    assert first.config["trainer"] == {
+        **compose(["experiment=r2flow_1rf"])["trainer"],
+        "accelerator": "cpu",
+        "default_root_dir": "runs/r2flow/rf1",
+    }
     assert [path.name for path in tmp_path.iterdir()] == ["data_3d_raw"]  # no runs
 
 
-def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(scans: Path, tmp_path: Path, monkeypatch):
+def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(
+    scans: Path, tmp_path: Path, monkeypatch
+):
     ran: list[Run] = []
     monkeypatch.setattr("r2flow.runs.chain.fit", lambda run: ran.append(run) or STOPPED)
-    command = ["experiment=r2flow", "size=small", "data=folder", f"data.root={scans}", "trainer.accelerator=cpu"]
-    assert "chain.rf1: scans in files are no" in in_process(tmp_path, [*command, "data.scenes=5"], check=False).refusal
+    command = [
+        "experiment=r2flow",
+        "size=small",
+        "data=folder",
+        f"data.root={scans}",
+        "trainer.accelerator=cpu",
+    ]
+    assert (
+        "chain.rf1: scans in files are no"
+        in in_process(tmp_path, [*command, "data.scenes=5"], check=False).refusal
+    )
     in_process(tmp_path, command, check=False)
     assert len(ran) == 1  # of both
     (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=simulated"])
     assert link.overrides[:2] == ("data.scenes=9", "data=simulated")
-    more = {"more": {"parent": "rf1", "data": {"scenes": 9}}, "rf2": {"experiment": "reflow", "parent": "more"}}
-    assert links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=mixed"])[0].overrides[0] == "data=mixed"
+    more = {
+        "more": {"parent": "rf1", "data": {"scenes": 9}},
+        "rf2": {"experiment": "reflow", "parent": "more"},
+    }
+    assert (
+        links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=mixed"])[0].overrides[0]
+        == "data=mixed"
+    )
     links = links_of({"rf1": {"data": {"scenes": 8}}, **more}, "runs", ["data=folder"])
-    assert ["data=folder" in link.overrides for link in links] == [True, True, False]  # rf2 learns from pairs
+    # rf2 learns from pairs
+    assert ["data=folder" in link.overrides for link in links] == [True, True, False]
     assert not any(text.startswith("data.scenes") for link in links for text in link.overrides)
 
 
 def test_a_chain_s_report_draws_what_each_system_can(chained: tuple[Path, str], tmp_path: Path):
-    judge, first = {"name": "dcgan", "halvings": 2}, {"name": "autoencoder", "discriminator": {"layers": 1}}
+    judge, first = (
+        {"name": "dcgan", "halvings": 2},
+        {"name": "autoencoder", "discriminator": {"layers": 1}},
+    )
     others = {
         "ae": {"stage": first, "generator": {"name": "vq_autoencoder"}},
-        "gan": {"stage": {"name": "gan", "discriminator": judge}, "generator": {"name": "dusty2", "doublings": 2}},
+        "gan": {
+            "stage": {"name": "gan", "discriminator": judge},
+            "generator": {"name": "dusty2", "doublings": 2},
+        },
     }
     runs = {}
     for name, other in others.items():
         config = {**CONFIG, **other}
-        runs[name] = write_checkpoint(tmp_path / name / "checkpoints" / "step-00000007.ckpt", config).parent.parent
+        runs[name] = write_checkpoint(
+            tmp_path / name / "checkpoints" / "step-00000007.ckpt", config
+        ).parent.parent
         (runs[name] / "config.yaml").write_text(yaml.safe_dump(config))
     report_chain({"rf1": chained[0] / "rf1"} | runs, tmp_path / "report")
     rows = json.loads((tmp_path / "report" / "compare.json").read_text())["rows"]
     assert [row["name"] for row in rows] == ["rf1", "ae", "gan"]
-    assert len(list((tmp_path / "report").glob("0*.ply"))) == 4  # of the GAN, the last that makes scans
+    # of the GAN, the last that makes scans
+    assert len(list((tmp_path / "report").glob("0*.ply"))) == 4
 
 
 def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_options():
@@ -243,19 +346,26 @@ def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_optio
     [
         (["trainer.fast_dev_run=true"], "fast_dev_run leaves none"),
         (["stage.parent=x"], "stage.parent is each link's own"),
-        (["chain.rf2.parent=rf9"], "chain.rf2 starts from rf9; give parent=EARLIER or an experiment"),
+        (
+            ["chain.rf2.parent=rf9"],
+            "chain.rf2 starts from rf9; give parent=EARLIER or an experiment",
+        ),
         (["+chain.fr2.trainer.max_steps=9"], "chain.fr2 starts from nothing; give parent=EARLIER"),
         (["~chain.rf9"], "no key 'chain.rf9'. See --cfg job"),
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
     ],
 )
-def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path: Path, overrides: list[str], message: str):
+def test_a_chain_that_cannot_run_is_refused_before_its_first_link(
+    tmp_path: Path, overrides: list[str], message: str
+):
     assert message in in_process(tmp_path, ["experiment=demo", *overrides], check=False).refusal
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_link_that_lost_its_last_checkpoint_is_not_finished(chained: tuple[Path, str], tmp_path: Path):
+def test_a_link_that_lost_its_last_checkpoint_is_not_finished(
+    chained: tuple[Path, str], tmp_path: Path
+):
     run = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "rf1"))
     assert has_ended(run)
     checkpoints_of(run)[0].unlink()

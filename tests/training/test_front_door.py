@@ -1,4 +1,6 @@
-"""Values of the wrong kind or out of their range, key by key: one line, exit code 2, nothing written."""
+"""Values of the wrong kind or out of their range, key by key: one line, exit code 2, nothing
+written.
+"""
 
 import shutil
 import subprocess
@@ -7,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
+
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.files import write_file
 from r2flow.generators import build_generator
@@ -28,7 +30,8 @@ REFUSED = {
     "callbacks.ema={evry: 3}": "no key 'callbacks.ema.evry'. Did you mean 'callbacks.ema.every'?",
     "+callbacks.emaa={}": "Did you mean 'ema'?",
     "callbacks.ema.decay=2": "decay: input should be less than 1, found 2",
-    "sampler={name: dopri5} & callbacks.pictures.steps=3": "callbacks.pictures: sampler 'dopri5': no option 'steps'",
+    "sampler={name: dopri5} & "
+    "callbacks.pictures.steps=3": "callbacks.pictures: sampler 'dopri5': no option 'steps'",
     "callbacks.ema=3": "callbacks.ema: input should be a valid dictionary, found 3",
     "sampler=3": "sampler: input should be a valid dictionary, found 3",
     "sampler.name=": "no sampler named ''; known: adams3, ",
@@ -42,7 +45,8 @@ REFUSED = {
     "trainer.val_check_interval=0": "val_check_interval must be above 0",
     "stage.time={name: u_shaped, a: 800}": "a must be a finite number above 0 and at most 80",
     "sampler.name=mmps": "completes scans: give it to r2flow complete by --sampler",
-    "+callbacks.half_life_ema={half_life: 4, rampup: 1}": "one average of its weights, found callbacks.ema and",
+    "+callbacks.half_life_ema={half_life: 4, rampup: "
+    "1}": "one average of its weights, found callbacks.ema and",
     "trainer.deterministic=foo": "deterministic must be true or false or 'warn' or null",
     "trainer.accelerator=tpu": "trainer: ",
     "seed=99999999999999999999": "seed must be a whole number of at least 0 and below 2^63",
@@ -57,10 +61,13 @@ REFUSED = {
     "--foo": "unrecognized arguments: --foo; see --help",
     "seed=1,2": "seed=1,2 is several values: for a sweep add -m, for a list give seed=[1,2].",
     "data=folder & data.root=. & data.scenes=5": "no simulated scenes: leave data.scenes out",
-    "data=mixed & data.parts=[{name: simulated}] & data.split=train": "has its own: leave data.split",
+    "data=mixed & data.parts=[{name: simulated}] & "
+    "data.split=train": "has its own: leave data.split",
     "data.pairs.num=5": "data=simulated has no pairs (data=pairs has): leave data.pairs out",
-    "stage=reflow & data=pairs & stage.parent=street & data.drives=[1]": "pairs are drawn, not read: leave data.drives",
-    "stage=reflow & data=pairs & stage.parent=street & data.reading={convention: lidm}": "convention is that of the flow",
+    "stage=reflow & data=pairs & stage.parent=street & "
+    "data.drives=[1]": "pairs are drawn, not read: leave data.drives",
+    "stage=reflow & data=pairs & stage.parent=street & data.reading={convention: "
+    "lidm}": "convention is that of the flow",
     "preview=street": "preview is of a chain of runs",
     "trainer.limit_test_batches=3": "no key 'trainer.limit_test_batches'",
     "data.workers=1000000000": "workers must be a whole number from 0 to 1,000, found 1000000000",
@@ -75,12 +82,14 @@ REFUSED = {
     "sensor.columns=100": "100 | nearest",
     "data=folder & data.root=/nowhere/at/all": "/nowhere/at/all is not a folder | data.root=FOLDER",
     "data.batch_size=3 & trainer.accumulate_grad_batches=2": "batch_size=3 | multiple of 2",
-    "trainer.strategy=ddp & trainer.devices=2 & trainer.val_check_interval=00:00:00:09": "another step on each device",
+    "trainer.strategy=ddp & trainer.devices=2 & "
+    "trainer.val_check_interval=00:00:00:09": "another step on each device",
     "trainer.precision=16-mixed": "16-mixed | bf16-mixed",
     "encoding.format=log": "no range format named 'log' | Did you mean 'logscale'?",
     "sensor.rays=foo": "'centre' or 'reference' | 'foo'",
     "stage.time.name=discrete": "needs the option 'k'",
-    "+data.validation.data={name: folder, root: x, splt: test}": "no option 'splt' | Did you mean 'split'?",
+    "+data.validation.data={name: folder, root: x, splt: "
+    "test}": "no option 'splt' | Did you mean 'split'?",
     "data.augment.roll=true": "data.augment.roll | backbone.position=learnable | backbone.position=none",
     "data.validation.data={name: mixed}": "needs the name of a data set",
 }
@@ -88,7 +97,9 @@ REFUSED = {
 
 @pytest.mark.parametrize(("arguments", "words"), REFUSED.items(), ids=REFUSED)
 def test_a_wrong_value_is_refused(tmp_path: Path, arguments: str, words: str):
-    line = in_process(tmp_path, ["name=bad", "trainer.accelerator=cpu", *arguments.split(" & ")], check=False).refusal
+    line = in_process(
+        tmp_path, ["name=bad", "trainer.accelerator=cpu", *arguments.split(" & ")], check=False
+    ).refusal
     assert line.startswith("error: ")
     assert all(word in line for word in words.split(" | ")), line
     assert list(tmp_path.iterdir()) == []
@@ -96,10 +107,16 @@ def test_a_wrong_value_is_refused(tmp_path: Path, arguments: str, words: str):
 
 def test_python_refuses_a_wrong_key_and_a_chain():
     for words, wrong in (
-        ("no key 'stage.step'. Did you mean 'stage.steps'?", lambda: compose(["stage=distill", "stage.step=3"])),
+        (
+            "no key 'stage.step'. Did you mean 'stage.steps'?",
+            lambda: compose(["stage=distill", "stage.step=3"]),
+        ),
         ("overrides are a list, as ['data=prepared']", lambda: compose("data=prepared")),
         ("folders are a list, as ['conf']", lambda: compose(folders="conf")),
-        ("a chain of runs: train it by `r2flow train`", lambda: build(compose(["experiment=demo"]))),
+        (
+            "a chain of runs: train it by `r2flow train`",
+            lambda: build(compose(["experiment=demo"])),
+        ),
         ("reflectance: input should be a valid boolean", lambda: build_generator(compose())),
     ):
         with refused(words):
@@ -109,11 +126,24 @@ def test_python_refuses_a_wrong_key_and_a_chain():
 def test_a_folder_of_configs_may_have_any_name(tmp_path: Path):
     write_file(tmp_path / "é, [1]" / "experiment" / "mine.yaml", "# @package _global_\nseed: 9")
     assert compose(["experiment=mine"], [tmp_path / "é, [1]"])["seed"] == 9
-    damaged = (b"a: \xfc", "/experiment/mine.yaml is not UTF-8"), ("seed: 9\nseed: 8", 'mine.yaml", line 2')
+    damaged = (
+        (b"a: \xfc", "/experiment/mine.yaml is not UTF-8"),
+        ("seed: 9\nseed: 8", 'mine.yaml", line 2'),
+    )
     number = ("# @package _global_\n1: 2", "no option '1'")
-    for text, said in *damaged, number, ("seed: 9", "experiment: input should be a valid string, found"), ("a: ${", "'${'"):
+    for text, said in (
+        *damaged,
+        number,
+        ("seed: 9", "experiment: input should be a valid string, found"),
+        ("a: ${", "'${'"),
+    ):
         write_file(tmp_path / "é, [1]" / "experiment" / "mine.yaml", text)
-        assert said in in_process(tmp_path, ["--config-dir", "é, [1]", "experiment=mine"], check=False).refusal
+        assert (
+            said
+            in in_process(
+                tmp_path, ["--config-dir", "é, [1]", "experiment=mine"], check=False
+            ).refusal
+        )
     write_file(tmp_path / "é, [1]" / "data" / "mine.yaml", "root: scans")
     refusal = in_process(tmp_path, ["--config-dir", "é, [1]", "data=mine"], check=False).refusal
     assert "data must be a group of keys with a name, found {'root': 'scans'}" in refusal
@@ -122,33 +152,63 @@ def test_a_folder_of_configs_may_have_any_name(tmp_path: Path):
 def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
     asked = ["data.scenes=2", "backbone=hdit_tiny", f"run_dir={tmp_path}"]
     assert build(compose(asked), asked).config["encoding"]["levels"] == 100
-    asked += ["encoding.levels=50.0", "sampler.name=dopri5", "+callbacks.pictures={every: 0, steps: 3}"]  # none drawn
+    # none drawn
+    asked += [
+        "encoding.levels=50.0",
+        "sampler.name=dopri5",
+        "+callbacks.pictures={every: 0, steps: 3}",
+    ]
     run = build(compose(asked), asked)
     assert run.config["encoding"]["levels"] == run.stage.generator.space.encoding.levels == 50
 
 
-def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(scans: Path, tmp_path: Path):
-    asked = ["experiment=densify", "data=folder", f"data.root={scans}", f"run_dir={tmp_path / 'run'}"]
+def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(
+    scans: Path, tmp_path: Path
+):
+    asked = [
+        "experiment=densify",
+        "data=folder",
+        f"data.root={scans}",
+        f"run_dir={tmp_path / 'run'}",
+    ]
     assert build(compose([*asked, "data.scenes=99"]), asked).data.options.name == "folder"
     asked[1:3] = []
-    assert 99 not in {part.scenes for part in build(compose([*asked, "data.scenes=99"]), asked).data.parts}
+    assert 99 not in {
+        part.scenes for part in build(compose([*asked, "data.scenes=99"]), asked).data.parts
+    }
 
 
 def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
     write_sensor(replace(SENSORS["vlp16"], name="mine"), tmp_path / "my sensor.YAML", "")
-    sensor = compose(["sensor.columns=256", f"sensor='{tmp_path}/my sensor.YAML'", "sensor.min_range=3"])["sensor"]
-    assert [sensor[key] for key in ("name", "rows", "columns", "min_range")] == ["mine", None, 256, 3]
+    sensor = compose(
+        ["sensor.columns=256", f"sensor='{tmp_path}/my sensor.YAML'", "sensor.min_range=3"]
+    )["sensor"]
+    assert [sensor[key] for key in ("name", "rows", "columns", "min_range")] == [
+        "mine",
+        None,
+        256,
+        3,
+    ]
     assert sensor["elevations"] == list(SENSORS["vlp16"].elevations)
     part = {"name": "simulated", "sensor": str(tmp_path / "my sensor.YAML")}
     (own,) = ScanDataModule("mixed", parts=[part]).sensors
     assert own == replace(SENSORS["vlp16"], name="mine")
-    (tmp_path / "own.yaml").write_text("{name: hdl32e, rows: 16, rays: centre}")  # a built-in sensor by its name
-    assert build_sensor(**compose([f"sensor={tmp_path}/own.yaml"])["sensor"]) == SENSORS["hdl32e"].resized(16)
+    # a built-in sensor by its name
+    (tmp_path / "own.yaml").write_text("{name: hdl32e, rows: 16, rays: centre}")
+    assert build_sensor(**compose([f"sensor={tmp_path}/own.yaml"])["sensor"]) == SENSORS[
+        "hdl32e"
+    ].resized(16)
 
 
 def test_a_named_choice_has_options_of_its_own():
-    assert compose(["stage.time={name: logit_normal, mean: 2}"])["stage"]["time"] == {"name": "logit_normal", "mean": 2}
-    assert compose(["stage=reflow", "stage.time={name: uniform}"])["stage"]["time"] == {"name": "uniform"}  # without a
+    assert compose(["stage.time={name: logit_normal, mean: 2}"])["stage"]["time"] == {
+        "name": "logit_normal",
+        "mean": 2,
+    }
+    # without a
+    assert compose(["stage=reflow", "stage.time={name: uniform}"])["stage"]["time"] == {
+        "name": "uniform"
+    }
 
 
 def test_a_generator_without_options_is_given_by_its_name():
@@ -162,7 +222,10 @@ def test_a_generator_without_options_is_given_by_its_name():
         ("def f(:\n", "SyntaxError"),
         ("def f():\n    raise RuntimeError('a\\nb')\nf()", "RuntimeError: a b (line 2)"),
         ("import sys; sys.exit(0)", "SystemExit"),
-        ("from r2flow.stages import STAGES, Rectify\nSTAGES.add('rectify', Rectify)", "named 'rectify' exists already"),
+        (
+            "from r2flow.stages import STAGES, Rectify\nSTAGES.add('rectify', Rectify)",
+            "named 'rectify' exists already",
+        ),
     ],
 )
 def test_a_plugin_that_does_not_load(tmp_path: Path, text: str, words: str):
@@ -175,10 +238,15 @@ def test_a_plugin_that_does_not_load(tmp_path: Path, text: str, words: str):
 
 def test_a_folder_is_no_plugin(tmp_path: Path):
     (tmp_path / "no_package").mkdir()
-    assert "without an __init__.py" in in_process(tmp_path, ["--plugin", "no_package"], check=False).refusal
+    assert (
+        "without an __init__.py"
+        in in_process(tmp_path, ["--plugin", "no_package"], check=False).refusal
+    )
 
 
-@pytest.mark.parametrize("text", ["", "- 1", "x", "a: [", "a: \0", "data: 3", "trainer: [1]", "a: &a [*a]"])
+@pytest.mark.parametrize(
+    "text", ["", "- 1", "x", "a: [", "a: \0", "data: 3", "trainer: [1]", "a: &a [*a]"]
+)
 def test_a_damaged_config_is_refused_in_one_line(tmp_path: Path, text: str):
     (tmp_path / CONFIG).write_text(text)
     with refused("config.yaml is damaged (", "); the checkpoints are usable"):
@@ -197,12 +265,20 @@ def test_one_bad_scan_stops_the_run_or_is_left_out(train: Run, scans: Path, tmp_
     folder = Path(shutil.copytree(scans, tmp_path / "copy"))
     (folder / "000004.bin").write_bytes(b"\0" * 33)
     inside = f"run_dir={folder}/000000.bin/run"  # refused before a scan is read
-    for where, words in (("name=strict", "data.reading.on_bad_scan=skip"), (inside, "0.bin is not a folder that can")):
+    for where, words in (
+        ("name=strict", "data.reading.on_bad_scan=skip"),
+        (inside, "0.bin is not a folder that can"),
+    ):
         refusal = train(f"data.root={folder}", where, check=False).refusal
         assert words in refusal
         assert ("000004.bin" in refusal) == (where != inside)
     assert not (tmp_path / "runs" / "strict").exists()
-    done = train(f"data.root={folder}", "name=lenient", "data.reading.on_bad_scan=skip", "trainer.max_steps=2")
+    done = train(
+        f"data.root={folder}",
+        "name=lenient",
+        "data.reading.on_bad_scan=skip",
+        "trainer.max_steps=2",
+    )
     assert "left out" in done.stdout + done.stderr
     assert (tmp_path / "runs" / "lenient" / "checkpoints").exists()
 
@@ -211,5 +287,7 @@ def test_a_misspelt_config_is_answered_without_loading_torch(tmp_path: Path):
     mistakes = ["bakcbone.base_channels=8", "backbone=hditt", "chain=[", "+experiment=reflo"]
     script = f"for one in {mistakes}: print(run(['train', one], []), 'torch' in sys.modules)"
     command = [sys.executable, "-c", f"import sys; from r2flow.cli.verbs import run\n{script}"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
+    )
     assert (done.stdout, len(done.stderr.splitlines())) == (4 * "2 False\n", 4), done.stderr

@@ -1,4 +1,6 @@
-"""Each long verb, ended ten times at random moments by SIGTERM, SIGINT and SIGKILL in turn, ends as one left alone."""
+"""Each long verb, ended ten times at random moments by SIGTERM, SIGINT and SIGKILL in turn, ends as
+one left alone.
+"""
 
 import os
 import random
@@ -36,9 +38,11 @@ def finish(cwd: Path, command: Sequence[object]) -> float:
 
 
 def end_ten_times(cwd: Path, command: Sequence[object], seed: int, into: str = "") -> None:
-    """Run a command to its end into `one`, the last word behind `into`; end it ten times, then finish, into `ended`.
+    """Run a command to its end into `one`, the last word behind `into`; end it ten times, then
+    finish, into `ended`.
 
-    Signals go to the process alone and to its whole group by turns, as `kill` and a terminal send them.
+    Signals go to the process alone and to its whole group by turns, as `kill` and a terminal send
+    them.
     """
     seconds = finish(cwd, [*command, f"{into}one"])
     command, draw, ended = [*command, f"{into}ended"], random.Random(seed), 0
@@ -59,7 +63,11 @@ def end_ten_times(cwd: Path, command: Sequence[object], seed: int, into: str = "
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 @pytest.mark.parametrize(("seed", "verb"), [*enumerate(VERBS)])
@@ -70,12 +78,16 @@ def test_a_verb(saved, tmp_path: Path, seed: int, verb: str):
 
 
 def test_training(scans: Path, tmp_path: Path):
-    end_ten_times(tmp_path, [*COMMAND, *tiny(scans, "data.workers=2", "data.memory_gib=0")], 3, "name=")
+    end_ten_times(
+        tmp_path, [*COMMAND, *tiny(scans, "data.workers=2", "data.memory_gib=0")], 3, "name="
+    )
     assert_bit_equal(tmp_path / "runs" / "one", tmp_path / "runs" / "ended")
 
 
 def test_a_sweep(scans: Path, tmp_path: Path):
-    end_ten_times(tmp_path, [*COMMAND, "-m", *tiny(scans, "seed=1,2", "samples.num=0")], 4, "hydra.sweep.dir=")
+    end_ten_times(
+        tmp_path, [*COMMAND, "-m", *tiny(scans, "seed=1,2", "samples.num=0")], 4, "hydra.sweep.dir="
+    )
     jobs = [path.name for path in (tmp_path / "one").iterdir() if checkpoints_of(path)]
     assert len(jobs) == 2
     for job in jobs:

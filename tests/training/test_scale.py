@@ -1,4 +1,6 @@
-"""Many processes, half precision, SLURM and sweeps on a cluster: the same run, however it is spread."""
+"""Many processes, half precision, SLURM and sweeps on a cluster: the same run, however it is
+spread.
+"""
 
 import json
 import os
@@ -16,8 +18,8 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch.utilities import rank_zero_only
-
 from r2flow.callbacks.stopping import slurm_job
+
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import checkpoints_of, read_checkpoint
 from r2flow.signals import LATER
@@ -26,20 +28,35 @@ from tests.training.conftest import TINY, Run, hold_at, start, tiny, wait_for
 from tests.training.test_train import assert_bit_equal, weights
 
 STEPS = 20
-EXACT = [f"trainer.max_steps={STEPS}", "backbone.dropout=0"]  # dropout's masks are drawn per device batch
+# dropout's masks are drawn per device batch
+EXACT = [f"trainer.max_steps={STEPS}", "backbone.dropout=0"]
 TWO = ["trainer.devices=2", "trainer.strategy=ddp"]
 
 
 def recorded(
-    cwd: Path, scans: Path, record: Path, *overrides: str, code: int = 0, broken: tuple[int, ...] = ()
+    cwd: Path,
+    scans: Path,
+    record: Path,
+    *overrides: str,
+    code: int = 0,
+    broken: tuple[int, ...] = (),
 ) -> subprocess.CompletedProcess[str]:
     recorder = str(Path(__file__).with_name("recorder.py"))
-    command = [sys.executable, recorder, *TINY, f"data.root={scans}", *overrides, "+callbacks.recorder={}"]
+    command = [
+        sys.executable,
+        recorder,
+        *TINY,
+        f"data.root={scans}",
+        *overrides,
+        "+callbacks.recorder={}",
+    ]
     environment = {
         **os.environ, "OMP_NUM_THREADS": "1", "R2FLOW_RECORD": str(record), "R2FLOW_BROKEN": json.dumps(broken),
     }  # fmt: skip
     record.mkdir(exist_ok=True)
-    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == code, f"{done.stdout}\n{done.stderr}"
     return done
 
@@ -79,8 +96,13 @@ def test_two_processes_share_one_average_and_one_writes(one: Path, two: Path):
     average = [json.loads((two / "record" / f"average-{rank}.json").read_text()) for rank in (0, 1)]
     assert average[0] == average[1]
     assert {path.name.split("-")[1] for path in (two / "record").glob("wrote-*")} == {"0"}
-    assert [p.name for p in checkpoints_of(two / "runs" / "two")] == ["step-00000020.ckpt", "step-00000018.ckpt"]
-    torch.testing.assert_close(weights(one / "runs" / "one"), weights(two / "runs" / "two"), rtol=0, atol=1e-4)
+    assert [p.name for p in checkpoints_of(two / "runs" / "two")] == [
+        "step-00000020.ckpt",
+        "step-00000018.ckpt",
+    ]
+    torch.testing.assert_close(
+        weights(one / "runs" / "one"), weights(two / "runs" / "two"), rtol=0, atol=1e-4
+    )
 
 
 @pytest.mark.slow
@@ -92,12 +114,15 @@ def test_a_run_goes_on_in_more_processes(one: Path, scans: Path, tmp_path: Path)
     alone, resumed = losses(one / "record"), losses(tmp_path / "record")
     assert list(resumed) == [19, 20]
     assert all(abs(alone[step] - resumed[step]) < 1e-5 for step in resumed)
-    torch.testing.assert_close(weights(one / "runs" / "one"), weights(tmp_path / "runs" / "one"), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        weights(one / "runs" / "one"), weights(tmp_path / "runs" / "one"), rtol=0, atol=1e-5
+    )
 
 
 @pytest.mark.slow
 def test_a_defect_on_one_device_is_skipped_and_ends_on_all(scans: Path, tmp_path: Path):
-    # Batches of 4 over two ranks: odd images are rank 1's. Images 9, 13 and 17 break steps 3, 4 and 5.
+    # Batches of 4 over two ranks: odd images are rank 1's. Images 9, 13 and 17 break steps 3, 4 and
+    # 5.
     done = recorded(tmp_path, scans, tmp_path, "name=broken", *EXACT, *TWO, "callbacks.guard.skips=3",
                     code=2, broken=(9, 13, 17))  # fmt: skip
     errors = [line for line in done.stderr.splitlines() if line.startswith("error:")]
@@ -120,10 +145,17 @@ def test_accumulated_batches_have_the_losses_of_the_whole(one: Path, scans: Path
 
 
 def srun(
-    cwd: Path, scans: Path, *overrides: str, tasks: int = 1, leave_after: Path | None = None, apart: bool = False
+    cwd: Path,
+    scans: Path,
+    *overrides: str,
+    tasks: int = 1,
+    leave_after: Path | None = None,
+    apart: bool = False,
 ) -> list[tuple[int, str]]:
-    """(exit code, output) of every task of the tiny run as srun starts it, with a `scontrol` that notes what it gets;
-    the last task is sent SIGUSR1 when the file `leave_after` is there; `apart`: in folders a and b."""
+    """(exit code, output) of every task of the tiny run as srun starts it, with a `scontrol` that
+    notes what it gets; the last task is sent SIGUSR1 when the file `leave_after` is there; `apart`:
+    in folders a and b.
+    """
     scontrol = cwd / "bin" / "scontrol"
     scontrol.parent.mkdir(exist_ok=True)
     scontrol.write_text(f'#!/bin/sh\necho "$@" >> {cwd}/scontrol.log\n')
@@ -137,7 +169,13 @@ def srun(
         "SLURM_NODELIST": "localhost", "SLURM_NTASKS": str(tasks), "SLURM_NTASKS_PER_NODE": str(tasks),
     }  # fmt: skip
     started = [
-        start(cwd / folder, tiny(scans, *overrides), **environment, SLURM_PROCID=str(task), SLURM_LOCALID=str(task))
+        start(
+            cwd / folder,
+            tiny(scans, *overrides),
+            **environment,
+            SLURM_PROCID=str(task),
+            SLURM_LOCALID=str(task),
+        )
         for task, folder in zip(range(tasks), "ab" if apart else "..", strict=False)
     ]
     if leave_after:
@@ -167,7 +205,13 @@ def test_a_job_told_to_leave_is_queued_again_and_ends_as_the_one_left_alone(alon
 @pytest.mark.slow
 def test_two_tasks_leave_together_when_one_is_told_to(one: Path, scans: Path, tmp_path: Path):
     run = tmp_path / "runs" / "queued"
-    command = ["name=queued", *EXACT, *TWO, "callbacks.requeue.every=2", *hold_at(3, tmp_path / "held", seconds=5.0)]
+    command = [
+        "name=queued",
+        *EXACT,
+        *TWO,
+        "callbacks.requeue.every=2",
+        *hold_at(3, tmp_path / "held", seconds=5.0),
+    ]
     for code, said in srun(tmp_path, scans, *command, tasks=2, leave_after=tmp_path / "held"):
         assert code == LATER, said
     assert (tmp_path / "scontrol.log").read_text() == "requeue 4711\n"
@@ -183,7 +227,9 @@ def test_machines_whose_run_folders_differ_do_not_train(alone, scans: Path, tmp_
     run = Path(shutil.copytree(alone[0], tmp_path / "a" / "runs" / "alone"))
     checkpoints_of(run)[0].unlink()
     (tmp_path / "b").mkdir()
-    for task, (code, said) in enumerate(srun(tmp_path, scans, "name=alone", *TWO, tasks=2, apart=True)):
+    for task, (code, said) in enumerate(
+        srun(tmp_path, scans, "name=alone", *TWO, tasks=2, apart=True)
+    ):
         assert code == 2, said
         assert f"process {task} starts from step {(10, 0)[task]}, on 9 of 12 scans" in said
 
@@ -191,7 +237,13 @@ def test_machines_whose_run_folders_differ_do_not_train(alone, scans: Path, tmp_
 @pytest.mark.slow
 def test_two_processes_of_which_one_is_told_to_stop_leave_together(scans: Path, tmp_path: Path):
     held = tmp_path / "held"
-    options = ["name=stopped", *EXACT, *TWO, "callbacks.requeue.every=2", *hold_at(5, held, seconds=5.0)]
+    options = [
+        "name=stopped",
+        *EXACT,
+        *TWO,
+        "callbacks.requeue.every=2",
+        *hold_at(5, held, seconds=5.0),
+    ]
     process = start(tmp_path, tiny(scans, *options))
     wait_for(held, process)
     process.send_signal(signal.SIGTERM)  # to the launching process alone
@@ -204,7 +256,9 @@ def test_two_processes_of_which_one_is_told_to_stop_leave_together(scans: Path, 
 
 @pytest.mark.slow
 def test_a_run_that_waits_for_another_machine_ends_when_told_to(scans: Path, tmp_path: Path):
-    process = start(tmp_path, tiny(scans, "name=waits", "trainer.num_nodes=2", "trainer.strategy=ddp"))
+    process = start(
+        tmp_path, tiny(scans, "name=waits", "trainer.num_nodes=2", "trainer.strategy=ddp")
+    )
     try:
         wait_for(tmp_path / "runs" / "waits" / "config.yaml", process)
         time.sleep(5)  # in which it begins to wait
@@ -223,27 +277,39 @@ def test_a_run_that_waits_for_another_machine_ends_when_told_to(scans: Path, tmp
         ({"SLURM_JOB_ID": "12", "SLURM_JOB_NAME": "interactive"}, None),
     ],
 )
-def test_what_is_queued_again_is_named_as_scontrol_names_it(variables: dict[str, str], job: str | None):
+def test_what_is_queued_again_is_named_as_scontrol_names_it(
+    variables: dict[str, str], job: str | None
+):
     with patch.dict(os.environ, variables, clear=True):
         assert slurm_job() == job
 
 
 def test_tasks_of_a_job_train_together_or_alone(scans: Path):
-    slurm = dict.fromkeys(("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID"), "0") | {"SLURM_NTASKS": "1"}
-    with patch.dict(os.environ, slurm), patch.object(rank_zero_only, "rank", 3):  # Lightning's SLURM_PROCID
+    slurm = dict.fromkeys(("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID"), "0") | {
+        "SLURM_NTASKS": "1"
+    }
+    # Lightning's SLURM_PROCID
+    with patch.dict(os.environ, slurm), patch.object(rank_zero_only, "rank", 3):
         build(compose(tiny(scans)))
         assert rank_zero_only.rank == 0  # else it has no curves
-        with pytest.raises(InputError, match="1 of 2 .* srun --ntasks-per-node=2"):  # it would train on one device
+        # it would train on one device
+        with pytest.raises(InputError, match="1 of 2 .* srun --ntasks-per-node=2"):
             build(compose(tiny(scans, *TWO)))
 
 
 @pytest.mark.slow
-def test_a_sweep_through_submitit_runs_every_job_and_reports_a_failed_one(train: Run, tmp_path: Path):
+def test_a_sweep_through_submitit_runs_every_job_and_reports_a_failed_one(
+    train: Run, tmp_path: Path
+):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra 'slurm'")
     launcher = ["hydra/launcher=submitit_local", "trainer.max_steps=2"]
     done = train(*launcher, "stage.loss=mse,nonsense", check=False, flags=("-m",))
     assert done.returncode == 2
-    assert f"of the sweep's jobs failed: {tmp_path / 'runs' / 'sweep' / 'stage.loss=nonsense'}-" in done.stderr
+    assert (
+        f"of the sweep's jobs failed: {tmp_path / 'runs' / 'sweep' / 'stage.loss=nonsense'}-"
+        in done.stderr
+    )
     (finished,) = (tmp_path / "runs" / "sweep").glob("*/samples")
-    assert "stage.loss=mse" in finished.parent.name  # named by what is swept although another process made it
+    # named by what is swept although another process made it
+    assert "stage.loss=mse" in finished.parent.name
     assert train(*launcher, "stage.loss=mse", flags=("-m",)).returncode == 0

@@ -14,7 +14,8 @@ class ToyBackbone(Backbone):
         self.shift = nn.Linear(2, base_channels)
         sizes = [self.in_channels, base_channels, base_channels, self.out_channels]
         self.layers = nn.ModuleList(
-            nn.Conv2d(before, after, 3, padding=1, padding_mode="circular") for before, after in pairwise(sizes)
+            nn.Conv2d(before, after, 3, padding=1, padding_mode="circular")
+            for before, after in pairwise(sizes)
         )
 
     def velocity(self, t, x, s=None):

@@ -8,7 +8,8 @@ from r2flow.stages import STAGES, Rectify
 
 
 class Completion(RectifiedFlow):
-    """v(t, x) of a network that also sees the known rays, `image` (B, C, H, W), and `mask` (B, 1, H, W), 1 where known.
+    """v(t, x) of a network that also sees the known rays, `image` (B, C, H, W), and `mask` (B, 1,
+    H, W), 1 where known.
 
     A generated scan has the known rays as they were given.
     """
@@ -27,7 +28,9 @@ class Completion(RectifiedFlow):
     def forward(self, noise, condition=None, **options):
         made = super().forward(noise, condition, **options)
         if condition:
-            made.x.copy_(torch.where(condition["mask"].to(made.x) > 0, condition["image"].to(made.x), made.x))
+            made.x.copy_(
+                torch.where(condition["mask"].to(made.x) > 0, condition["image"].to(made.x), made.x)
+            )
         return made
 
 
@@ -38,7 +41,9 @@ class LearnCompletion(Rectify):
 
     def condition(self, batch):
         draws = [noise.generator(self.hparams.seed, "condition", int(k)) for k in batch["k"]]
-        rows = [torch.from_numpy(draw.random(batch["x_1"].shape[-2]) < draw.random()) for draw in draws]
+        rows = [
+            torch.from_numpy(draw.random(batch["x_1"].shape[-2]) < draw.random()) for draw in draws
+        ]
         mask = torch.stack(rows)[:, None, :, None].to(batch["x_1"]).expand_as(batch["x_1"][:, :1])
         return {"image": batch["x_1"], "mask": mask}
 

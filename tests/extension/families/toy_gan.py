@@ -1,4 +1,6 @@
-"""A GAN: x = G(z), learned against a discriminator with the non-saturating loss (Goodfellow et al. 2014)."""
+"""A GAN: x = G(z), learned against a discriminator with the non-saturating loss (Goodfellow et al.
+2014).
+"""
 
 from dataclasses import dataclass
 from math import prod
@@ -45,7 +47,9 @@ class ToyGAN(Stage):
     def training_step(self, batch, batch_idx):
         for_generator, for_discriminator = self.own_optimizers()
         made = self.generator.network(batch["x_0"])
-        wrong = softplus(self.discriminator(made.detach())) + softplus(-self.discriminator(batch["x_1"]))
+        wrong = softplus(self.discriminator(made.detach())) + softplus(
+            -self.discriminator(batch["x_1"])
+        )
         self.take_step(for_discriminator, wrong.mean())
         loss = softplus(-self.discriminator(made)).mean()
         self.take_step(for_generator, loss)
