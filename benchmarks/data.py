@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from r2flow.data.loader import FlowDataset
-from r2flow.data.opening import SOURCES, find_drives
-from r2flow.data.options import SourceOptions
+from r2flow.data.loader import FlowDataset, ItemFormat
+from r2flow.data.opening import describe, find_drives
 from r2flow.data.prepared import plan_files, prepare
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import spread
@@ -115,12 +114,12 @@ def measure_shards(paths: Sequence[Path], folder: Path, times: int) -> None:
             folder / "prepared", "folder", chosen, find_drives("folder", chosen), Reading(HDL64E)
         )
     )
-    options = SourceOptions("prepared", str(folder / "prepared"))
-    prepared = SOURCES["prepared"].open(options, Reading(HDL64E, reflectance=True))
+    scans = describe(folder / "prepared")
+    prepared = scans.open(Reading(HDL64E, reflectance=True))
     arrays = [folder / f"{i}.npy" for i in range(len(paths))]
     for number, path in enumerate(arrays):
         np.save(path, prepared[number])
-    items = FlowDataset(prepared, encoding, 0, "training")
+    items = FlowDataset(prepared, ItemFormat(encoding, encoding.shape), 0, "training")
 
     taken = by_turns(
         {

@@ -45,8 +45,7 @@ def plain(annotation: Any) -> str:
     """An annotation or a signature without modules, bounds and quotes."""
     text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
     text = re.sub(
-        r"Annotated\[(\w+), "
-        r"(?:Bound\(.*?>\)|<[^>]*>)\]",
+        r"Annotated\[(\w+), (?:\w+\((?:[^()]|\([^()]*\))*\)|<[^>]*>)\]",
         r"\1",
         re.sub(r"\b(?:[a-z_]\w*\.)+(?=\w)", "", text),
     )

@@ -181,6 +181,7 @@ def build(
         stage.check_data(data)
         data.adopt(stage.item_format)
         trainer = _build_trainer(run, stage)
+        data.share(trainer)  # refuses a batch that cannot be shared before there is a folder
         complete = config_of(stage.hparams, data.hparams, run.stage["name"])
         return Run(
             {**config, **complete, "plugins": list(run.plugins) or loaded_plugins()},
@@ -306,7 +307,11 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
     if not options["fast_dev_run"]:
         callbacks = build_callbacks(run.callbacks)
     for callback in callbacks:
-        if isinstance(callback, SamplePictures) and stage.generator.unconditional:
+        if (
+            isinstance(callback, SamplePictures)
+            and callback.every
+            and stage.generator.unconditional
+        ):
             with naming("callbacks.pictures"):
                 callback.sampler(stage.generator)  # refuses wrong steps before there is a folder
     for key, kind in (("enable_checkpointing", Checkpoint), ("enable_progress_bar", ProgressBar)):
@@ -335,6 +340,10 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
             f"trainer: the cluster starts {tasks} of {processes} processes; under SLURM start it "
             "by srun "
             f"--ntasks-per-node={trainer.num_devices}, or on one machine by env -u SLURM_NTASKS."
+        )
+    if tasks > 1 and isinstance(interval, str):  # Lightning asks the clock of each process
+        raise InputError(
+            "a trainer.val_check_interval in time comes at another step on each device; give steps."
         )
     return trainer
 

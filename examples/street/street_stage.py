@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.flow.losses import LOSSES, absolute
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
@@ -48,8 +49,8 @@ class LearnStreetMap(LearnFlowMap):
         super().__init__(*model, objective=objective, **options)
         self.end_loss, self.ends_from = LOSSES[end_loss], ends_from
 
-    def check_data(self, name: str, data: Any) -> None:
-        self.on_pairs = data["name"] == "pairs"
+    def check_data(self, data: ScanDataModule) -> None:
+        """All data serve: scans, pairs or both."""
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         if not self.training:

@@ -58,8 +58,7 @@ def uncast(layer: nn.Module, x: Tensor) -> Tensor:
     """layer(x) in the dtype of its weights, even under autocast.
 
     For the first and last layers of a network, which process image values: rounded to bfloat16,
-        with
-    8 bits, these are rougher than real surfaces.
+    with 8 bits, these are rougher than real surfaces.
     """
     with _without_autocast(x):
         return cast(Tensor, layer(x.to(next(layer.parameters()).dtype)))
@@ -171,8 +170,8 @@ def rows_at_once(x: Tensor) -> int:
     """Number of rows of a map (B, H, W, ...) to process at a time.
 
     All rows, except on a CPU without gradients: a band of about `_BAND` tokens, so that
-        intermediate
-    results stay in the cache and in mapped memory, which makes the paper's HDiT a fifth faster.
+    intermediate results stay in the cache and in mapped memory, which makes the paper's HDiT a
+    fifth faster.
     """
     batch, rows, columns = x.shape[:3]
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or not x.is_cpu:

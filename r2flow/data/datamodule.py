@@ -330,18 +330,24 @@ class ScanDataModule(L.LightningDataModule):
         """
         source, _ = self._ready()
         rank, ranks = self.ranks
-        parts = self.trainer.accumulate_grad_batches if self.trainer else 1
+        share = self.share(self.trainer) if self.trainer else self.batch_size
+        images = max(len(source) // self.batch_size, 1) * self.batch_size
+        sampler = RunSampler(self._order(source), images, rank, ranks, self._place)
+        return self._loader(self._dataset(source, "training"), sampler, share)
+
+    def share(self, trainer: L.Trainer) -> int:
+        """Images of a batch on each device, of each accumulated part.
+
+        Raises:
+            InputError: the batch cannot be shared by the devices and accumulated parts.
+        """
+        ranks, parts = trainer.world_size, trainer.accumulate_grad_batches
         if self.batch_size % (ranks * parts):
             raise InputError(
                 f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
-                f"{parts} accumulated "
-                f"batches; give a multiple of {ranks * parts}."
+                f"{parts} accumulated batches; give a multiple of {ranks * parts}."
             )
-        images = max(len(source) // self.batch_size, 1) * self.batch_size
-        sampler = RunSampler(self._order(source), images, rank, ranks, self._place)
-        return self._loader(
-            self._dataset(source, "training"), sampler, self.batch_size // (ranks * parts)
-        )
+        return self.batch_size // (ranks * parts)
 
     def _place(self) -> tuple[int, int]:
         """The next k of the run, and the number of images of this epoch before it."""

@@ -3,8 +3,8 @@
     scans = open_scans("kitti_360:/data/KITTI-360", Reading(SENSORS["hdl64e"]), split="test")
     scans.source[0]                 range in metres and reflectance, (2, H, W)
 
-`SOURCES` is the registry of names. To add a kind of scans, register it: `SOURCES.add("mine",
-Layout(find_mine))` for scan files listed by `find_mine(root)`, or a subclass of `SourceKind`.
+`SOURCES` is the registry of names. To add a kind of scans, register a `Layout(find_mine)` for scan
+files that `find_mine(root)` lists, or a subclass of `SourceKind`.
 """
 
 import logging

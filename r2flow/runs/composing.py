@@ -87,8 +87,9 @@ def _hydra() -> Iterator[None]:
 
 
 def in_one_line(error: Exception) -> str:
-    """The message of another library's error, in one line."""
-    return " ".join((str(error) or str(error.__cause__)).split())
+    """The message of another library's error, in one line, without Hydra's own folders."""
+    text = str(error) or str(error.__cause__)
+    return " ".join(text.partition("Config search path:")[0].split())
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -131,6 +132,8 @@ def with_choices(compose: Callable[[], T]) -> T:
     """
     try:
         return compose()
+    except ValueError as error:  # of Hydra, of a group without a name
+        raise InputError(in_one_line(error)) from None
     except MissingConfigException as error:
         group, _, name = str(error.missing_cfg_file or "").rpartition("/")
         if group not in REGISTRIES:

@@ -351,7 +351,7 @@ def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_optio
             "chain.rf2 starts from rf9; give parent=EARLIER or an experiment",
         ),
         (["+chain.fr2.trainer.max_steps=9"], "chain.fr2 starts from nothing; give parent=EARLIER"),
-        (["~chain.rf9"], "no key 'chain.rf9'. See --cfg job"),
+        (["~chain.rf9"], "'chain.rf9' does not exist"),
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
     ],

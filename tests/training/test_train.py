@@ -272,7 +272,7 @@ def test_a_sweep_whose_jobs_reach_their_time_goes_on_with_the_same_command(
     assert "2 of the sweep's jobs failed" in mixed.stderr
     monkeypatch.setattr("r2flow.runs.launch.run_process", Mock(side_effect=[LATER, MemoryError]))
     assert (
-        "the memory has no room"
+        "out of memory"
         in in_process(tmp_path, ["-m", "backbone=glob(*_small)"], check=False).refusal
     )
 
