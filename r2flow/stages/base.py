@@ -20,7 +20,7 @@ from r2flow.generators import Generator, build_generator
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics import METRICS
-from r2flow.model.checkpoint import COMPILED, MODEL, NOTES, check_weights
+from r2flow.model.checkpoint import COMPILED, MODEL, NOTES, check_weights, step_of
 from r2flow.model.lineage import Parent, find_parent, model_options, plain
 from r2flow.model.sampling import draw
 from r2flow.noise import seed_torch
@@ -240,6 +240,22 @@ class Stage(L.LightningModule):
         data = getattr(self.trainer, "datamodule", None)
         if stage == "fit" and isinstance(data, ScanDataModule):
             self.check_data(data)
+
+    def on_fit_start(self) -> None:
+        data = getattr(self.trainer, "datamodule", None)
+        if self.trainer.world_size > 1 and isinstance(data, ScanDataModule):
+            self._refuse_other_starts(data.fingerprint())
+
+    def _refuse_other_starts(self, scans: str) -> None:
+        """Refuse machines whose folders of the run or of the scans differ."""
+        path = self.trainer.ckpt_path  # known after `setup`
+        step = step_of(Path(path)) if path else 0
+        strategy = self.trainer.strategy
+        if not strategy.reduce_boolean_decision((step, scans) == strategy.broadcast((step, scans))):
+            raise InputError(
+                f"process {self.global_rank} starts from step {step}, on {scans}, others do not: "
+                "the folders of the run and of its scans must be those that all machines share."
+            )
 
     def on_train_start(self) -> None:
         if any(COMPILED in name for name, _ in self.generator.named_parameters()):
