@@ -25,7 +25,13 @@ from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from r2flow.store import Store
 from tests.conftest import CONFIG, ROOT, SENSOR, prepare_folder
-from tests.lidar.test_scan_files_damage import REFLECTANCE, TABLE, XYZ, in_every_format
+from tests.lidar.test_scan_files_damage import (
+    FORMATS,
+    REFLECTANCE,
+    TABLE,
+    XYZ,
+    in_every_format,
+)
 
 SEED = 20261120
 DRAW = np.random.default_rng(0)
@@ -33,9 +39,10 @@ DRAW = np.random.default_rng(0)
 
 def write_scans(folder: Path) -> None:
     folder.mkdir(parents=True)
-    for name, content in in_every_format(folder.parent).items():
+    contents = in_every_format(folder.parent)
+    for name in FORMATS:
         ending, _, kind = name.partition(" ")
-        (folder / f"{kind or 'a'}.{ending}").write_bytes(content)
+        (folder / f"{kind or 'a'}.{ending}").write_bytes(contents[name])
     np.savetxt(
         folder / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="", fmt="%.2f"
     )
