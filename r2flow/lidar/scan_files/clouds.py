@@ -1,8 +1,8 @@
 """PCD (Point Cloud Library) and PLY (Stanford): readers of all encodings, writers of binary.
 
-The packages plyfile and pypcd4 do not serve. The one is under the GPL. The other returns half a scan
-from half a file (of 1,163 cut ones it takes 65) and refuses COUNT 0 and COLUMNS. Compressed PCDs
-need the package lzf.
+The packages plyfile and pypcd4 do not serve. The one is under the GPL. The other returns half a
+scan from half a file (of 1,163 cut ones it takes 65) and refuses COUNT 0 and COLUMNS. Compressed
+PCDs need the package lzf.
 """
 
 import math

@@ -28,20 +28,21 @@ def _read(path: Path) -> dict[str, ndarray]:
         if damaged := archive.testzip():  # torch does not compare checksums
             raise InputError(f"its part {damaged} is damaged; fetch or write it again.")
     stored = torch.load(path, map_location="cpu", weights_only=True)
-    tensors = [stored.get(name) for name in _CHANNELS] if isinstance(stored, dict) else [None]
-    if not all(isinstance(tensor, torch.Tensor) for tensor in tensors):
-        raise InputError(
-            "it is no sample of the published R2Flow code, which holds the tensors "
-            f"{', '.join(_CHANNELS)}. Is it a file of weights?"
-        )
-    sample = dict(zip(_CHANNELS, tensors, strict=True))
-    image = sample["depth"].shape[1:]
-    for name, tensor in sample.items():
-        channels = _CHANNELS[name]
-        if tensor.shape not in [(count, *image) for count in channels] or len(image) != 2:
-            raise InputError(f"its {name} is {tuple(tensor.shape)}, not ({channels[-1]}, H, W).")
-        if tensor.numel() > size:
+    sample: dict[str, torch.Tensor] = {}
+    for name, channels in _CHANNELS.items():
+        tensor = stored.get(name) if isinstance(stored, dict) else None
+        if not isinstance(tensor, torch.Tensor):
+            raise InputError(
+                "it is no sample of the published R2Flow code, which holds the tensors "
+                f"{', '.join(_CHANNELS)}. Is it a file of weights?"
+            )
+        shape = tuple(tensor.shape)
+        image = tuple(sample.get("depth", tensor).shape[1:])
+        if len(image) != 2 or shape not in [(count, *image) for count in channels]:
+            raise InputError(f"its {name} is {shape}, not ({channels[-1]}, H, W).")
+        if tensor.numel() > size:  # a view of few numbers
             raise InputError(f"its {name} is larger than the file. Is it damaged?")
+        sample[name] = tensor
     return {name: tensor.numpy() for name, tensor in sample.items()}
 
 
