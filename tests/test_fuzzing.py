@@ -48,6 +48,9 @@ def write_scans(folder: Path) -> None:
         folder / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="", fmt="%.2f"
     )
     np.savetxt(folder / "a.xyz", TABLE, fmt="%.2f")
+    sample = {"depth": (1, 4, 16), "xyz": (3, 4, 16), "reflectance": (1, 4, 16)}
+    drawn = {name: torch.from_numpy(DRAW.random(shape) + 1) for name, shape in sample.items()}
+    torch.save(drawn, folder / "a.pth")
     if importlib.util.find_spec("pyarrow"):
         import pyarrow
         from pyarrow import feather, parquet

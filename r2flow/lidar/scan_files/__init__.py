@@ -99,7 +99,8 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
         else:
             names = list(tables.usual_names(len(arrays), columns))
         points = column_points(names, arrays, raw)
-        warn_of_unused(path, names, arrays, points)
+        if stored:
+            warn_of_unused(path, names, arrays, points)
     if points.dropped:
         kind = f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped"
         warn_odd(path, kind, points.dropped)
