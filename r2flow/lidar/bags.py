@@ -60,8 +60,7 @@ def read_bag(
         InputError: There is no such topic, its clouds have another encoding, or the recording is
             damaged.
     """
-    require(str(path), "formats", "rosbags", "mcap")
-    import zstandard
+    require(str(path), "formats", "rosbags")
     from rosbags.typesys import Stores, get_typestore
 
     deserialize: dict[str, Callable[[bytes, str], Any]] = {
@@ -76,7 +75,7 @@ def read_bag(
             for channel, recorded, stored in file.messages(chosen):
                 if channel.kind != _CLOUD:
                     continue
-                data = zstandard.decompress(stored) if stored[:4] == _ZSTD else stored
+                data = _decompressed(stored) if stored[:4] == _ZSTD else stored
                 message = deserialize[channel.encoding](data, "sensor_msgs/msg/PointCloud2")
                 points: Points | InputError
                 try:
@@ -85,6 +84,12 @@ def read_bag(
                     points = InputError(f"{path} at {recorded}: {error}")
                 stamp = message.header.stamp
                 yield 10**9 * stamp.sec + stamp.nanosec or recorded, points
+
+
+def _decompressed(data: bytes) -> bytes:
+    import zstandard  # of mcap
+
+    return zstandard.decompress(data)
 
 
 def _files(path: Path) -> list[Path]:
@@ -131,6 +136,7 @@ def _open_ros(path: Path) -> Iterator[Recording]:
 
 @contextmanager
 def _open_mcap(path: Path) -> Iterator[Recording]:
+    require(str(path), "formats", "mcap")
     from mcap.reader import NonSeekingReader, make_reader
 
     with path.open("rb") as stream:
