@@ -48,7 +48,7 @@ class TorchDiffEqMethod:
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor) -> Solution:
         """Solve scenes one after another: torchdiffeq's error norm of a whole batch would hide a
-        hard scene.
+        hard scene. It computes in float64, since its interpolant at the end cancels.
 
         An adaptive method uses only the first and last time, and ends at the last one.
         """
@@ -72,7 +72,7 @@ class TorchDiffEqMethod:
             try:
                 *_, end = torchdiffeq.odeint(
                     scene,
-                    scene.last,
+                    scene.last.double(),
                     grid[[0, -1]],
                     rtol=tolerance,
                     atol=tolerance,
@@ -93,6 +93,7 @@ class _Scene:
     def __init__(self, v: Evaluations, x: Tensor, adapts: bool, ends: list[float]) -> None:
         self._v = v
         self._ends = ends
+        self._dtype = x.dtype
         self.last = x
         self._velocity = v.of_one if adapts else v
         if adapts:  # torchdiffeq warns about callbacks that a method does not call
@@ -100,10 +101,12 @@ class _Scene:
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         # The probe for the first step's length may lie beyond the end.
-        return self._velocity(t.clamp(*self._ends), x)
+        v = self._velocity(t.to(self._dtype).clamp(*self._ends), x.to(self._dtype))
+        return v.to(x)
 
     def keep(self, x: Tensor) -> bool:
         """Keep a state if it is finite."""
+        x = x.to(self._dtype)
         good = bool(x.isfinite().all())
         if good:
             self.last = x
