@@ -192,6 +192,32 @@ def test_no_pulse_longer_than_0_16_of_the_interval_is_missed(width):
         assert in_tolerances(found, pulses.solution(x_0, 1.0), tolerance).max() < 10
 
 
+@pytest.mark.parametrize("width", [0.05, 0.08, 0.1])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-4])
+def test_no_pulse_that_any_step_saw_is_stepped_over(width, tolerance):
+    """v is 0 outside of a pulse of integral 1 and height 2 / width; seen: any evaluation above 1."""
+    seen = torch.zeros(80, dtype=torch.float64)
+
+    class Pulses:
+        def __init__(self, scenes):
+            self.scenes = scenes
+            self.at = width / 2 + (1 - width) * scenes / 79
+
+        def select(self, scenes):
+            return Pulses(self.scenes[scenes])
+
+        def __call__(self, t, x):
+            z = (t - self.at) / width
+            v = torch.where(z.abs() < 0.5, 1 + torch.cos(2 * math.pi * z), 0) / width
+            seen[self.scenes] = torch.maximum(seen[self.scenes], v)
+            return v[:, None] + 0 * x
+
+    x_0 = torch.zeros(80, 1, dtype=torch.float64)
+    found = solve(Pulses(torch.arange(80)), x_0, method="dopri5", tolerance=tolerance)
+    assert (seen > 1).sum() > 20
+    assert (found.x[seen > 1] - 1).abs().max() < 0.05
+
+
 def test_a_velocity_that_does_not_depend_on_x_is_not_stiff():
     for speed in (40.0, 80.0, 160.0):
         found = solve(
