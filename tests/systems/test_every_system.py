@@ -65,6 +65,8 @@ def test_a_scan_is_a_function_of_its_number_alone(name: str):
     assert many.evaluations.tolist() == [evaluations] * 3
     assert sampler.evaluations(generator) == evaluations
     # as in 64-true runs
+    wide = generator(one.start(generator.noise_shape).double(), draws=one, sampler=sampler)
+    torch.testing.assert_close(wide.x.float(), alone.x, rtol=0, atol=1e-4)
     double = generator.double()(one.start(generator.noise_shape), draws=one, sampler=sampler)
     torch.testing.assert_close(double.x.float(), alone.x, rtol=0, atol=1e-4)
 
