@@ -285,7 +285,7 @@ def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
     """Read tensors and plain values from a torch file, without code execution; `InputError` for any
     other content.
     """
-    _refuse_unpacking(file, name)
+    _check_archive(file, name)
     try:
         with warnings.catch_warnings(action="ignore"), inert():  # torch may warn
             content = torch.load(file, map_location=map_location, weights_only=True)
@@ -310,18 +310,29 @@ def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
         raise InputError(f"{name} {problem}") from None
 
 
-def _refuse_unpacking(file: IO[bytes], name: object) -> None:
-    """Refuse zip archives with compressed entries (zip bombs): torch writes none."""
+def _check_archive(file: IO[bytes], name: object) -> None:
+    """Refuse zip archives with compressed entries (zip bombs), which torch never writes, and those
+    whose checksums (CRC-32) differ, which torch does not compare.
+    """
     try:
-        with zipfile.ZipFile(file) as archive:
-            entries = archive.infolist()
+        archive = zipfile.ZipFile(file)
     except Exception:  # torch's legacy format, or damaged: torch.load tells
-        entries = []
+        file.seek(0)
+        return
+    entries = archive.infolist()
     packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
     if packed or sum(entry.file_size for entry in entries) > file.seek(0, os.SEEK_END):
         raise InputError(
             f"{name} holds compressed tensors, which torch never writes. Ask its author for "
             "another file."
+        )
+    try:
+        broken = archive.testzip()
+    except Exception:  # a damaged header of an entry
+        broken = "an entry"
+    if broken is not None:
+        raise InputError(
+            f"{name} is damaged: the checksum of {broken} differs. Copy or fetch it again."
         )
     file.seek(0)
 
