@@ -46,13 +46,30 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
         yield
 
 
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _text(config: Mapping[str, Any]) -> str:
+    """A config as YAML without aliases, from `---` to `...`, which shows that it is whole."""
+    return yaml.dump(
+        dict(config), Dumper=_Dumper, sort_keys=False, explicit_start=True, explicit_end=True
+    )
+
+
 def read_config(run: str | Path) -> dict[str, Any] | None:
-    """The config of a run folder, or None."""
+    """The config of a run folder, or None; `InputError` if the file is cut or damaged."""
     path = Path(run, CONFIG)
     if not path.is_file():
         return None
     try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if text.startswith("---") and text.split()[-1] != "...":
+            raise ValueError("it is cut")
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise ValueError("it has aliases, which can stand for any size")
+        config = yaml.safe_load(text) or {}
         check_tree(config)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
         raise InputError(
@@ -100,7 +117,7 @@ def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) ->
     if locked and (
         old != dict(config) or not Path(run, CONFIG).is_file()
     ):  # free keys may have changed
-        write_file(Path(run, CONFIG), yaml.safe_dump(dict(config), sort_keys=False))
+        write_file(Path(run, CONFIG), _text(config))
     return last
 
 
