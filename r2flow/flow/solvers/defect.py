@@ -86,7 +86,7 @@ def inspect(control: StepController, tried: Tried, good: ndarray) -> ndarray:
     suspect &= good | (control.troubled == REMEMBERED) | control.rougher(*_REJECTED)
     compared = control.rougher(*_COMPARED)
     planned = {}
-    for place in good.nonzero()[0]:
+    for place in good.nonzero()[0].tolist():
         once = [0.5 + _OFF_CENTRE] if compared[place] else []
         usual = _probes(method, control.h[place] / control.length) or once
         planned[place] = usual + control.remembered(place)
@@ -108,7 +108,7 @@ def inspect(control: StepController, tried: Tried, good: ndarray) -> ndarray:
     for place in (suspect | (good & ~held)).nonzero()[0]:
         step = tried.of(np.array([place]))
         held[place] = _locate(control, step, place, found.setdefault(place, {}), held[place])
-    for place in (~held).nonzero()[0]:
+    for place in (~held).nonzero()[0].tolist():
         control.remember(place, _oddest(tried.of(np.array([place])), found.get(place, {})))
     return held
 
