@@ -76,7 +76,7 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
         InputError: unknown model, unusable file or unavailable device.
     """
     from r2flow.devices import choose_device
-    from r2flow.model.checkpoint import load_checkpoint  # slow, imports torch
+    from r2flow.model.checkpoint import load_checkpoint
 
     return load_checkpoint(name, choose_device(str(device), "device"))
 

@@ -25,7 +25,7 @@ from r2flow.callbacks.loggers import log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override
 from r2flow.errors import InputError, check_folder, one_line
-from r2flow.model.checkpoint import checkpoints_of, step_of
+from r2flow.model.paths import checkpoints_of, step_of
 from r2flow.reports.training import finish, read_curves
 from r2flow.runs.building import Run, build, check, quiet
 from r2flow.runs.composing import compose

@@ -14,14 +14,10 @@ from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import build_space
-from r2flow.model.checkpoint import (
-    Checkpoint,
-    check_weights,
-    load_checkpoint,
-    read_checkpoint,
-    save_checkpoint,
-)
+from r2flow.model.checkpoint import Checkpoint, check_weights, load_checkpoint
 from r2flow.model.published import published_config
+from r2flow.model.saving import save_checkpoint
+from r2flow.model.tensor_files import read_checkpoint
 from tests.conftest import CONFIG, Trap, refused, small_disk
 
 

@@ -22,7 +22,8 @@ from r2flow.data.pairs import PairStore
 from r2flow.data.reading import Reading
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, write_sensor
-from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.saving import save_checkpoint
 from r2flow.store import Store
 from tests.conftest import CONFIG, ROOT, SENSOR, prepare_folder
 from tests.fuzzing_readers import READERS

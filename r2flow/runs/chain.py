@@ -11,8 +11,8 @@ from typing import Any
 
 from r2flow.config import flatten, key_of, override, rule
 from r2flow.errors import InputError, naming
-from r2flow.model.checkpoint import FOLDER
 from r2flow.model.lineage import Parent
+from r2flow.model.paths import FOLDER
 from r2flow.runs.composing import compose
 from r2flow.signals import LATER, Stopped
 from r2flow.stages import STAGES

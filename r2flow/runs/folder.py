@@ -14,7 +14,9 @@ from filelock import FileLock, Timeout
 from r2flow.config import at_most_three, check_tree, differences, flatten, rule
 from r2flow.errors import InputError, check
 from r2flow.files import write_file
-from r2flow.model.checkpoint import FOLDER, HYPER, NOTES, checkpoints_of, read_checkpoint, step_of
+from r2flow.model.parts import HYPER, NOTES
+from r2flow.model.paths import FOLDER, checkpoints_of, step_of
+from r2flow.model.tensor_files import read_checkpoint
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,9 @@ import pytest
 import torch
 
 from r2flow.generators import build_generator
-from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.paths import checkpoints_of
+from r2flow.model.tensor_files import read_checkpoint
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import refused
