@@ -159,7 +159,7 @@ def sensor(
     rows = {
         "beams": f"{len(degrees)}: {beams.order}",
         "elevations": f"{degrees[0]:+.2f} to {degrees[-1]:+.2f} degrees; "
-        f"points lie {off:.2f} from their beams",
+        f"points lie {off[0]:.2f} from their beams, 95 % of them within {off[1]:.2f}",
         "nearest sensor": f"{nearest}, its beams {distance:.2f} degrees off" if nearest else "none",
         "resolution": f"{steps:,.0f} steps a turn; images of {mine.columns} columns",
         "range seen": f"{mine.min_range:g} to {mine.max_range:g} m; "

@@ -42,7 +42,7 @@ class Estimate(NamedTuple):
     sensor: Sensor
     beams: Beams
     steps: float  # azimuth steps per full turn, not rounded
-    off: float  # median distance of the points from their beams in degrees
+    off: tuple[float, float]  # median and 95th percentile of the points' distance from their beams
     ground: bool  # whether the height above it was found
 
 
@@ -222,7 +222,8 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         beams.firing,
         full_reflectance(scans),
     )
-    return Estimate(sensor, beams, steps, float(np.median(beams.off(scans))), ground is not None)
+    middle, most = np.quantile(beams.off(scans), [0.5, 0.95])
+    return Estimate(sensor, beams, steps, (float(middle), float(most)), ground is not None)
 
 
 def _height(xyz: ndarray) -> float | None:

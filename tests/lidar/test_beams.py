@@ -79,6 +79,48 @@ def test_a_sensor_is_found_again(name, how):
     assert found.beams.firing == (sensor.firing if how == FIRINGS else None)
 
 
+@pytest.mark.parametrize("start", [-60.0, 133.7])
+@pytest.mark.parametrize("y", [1, -1])  # axes with y to the left, and to the right
+@pytest.mark.parametrize("rows", [4, 32, 128])
+def test_rings_may_begin_at_any_azimuth_and_turn_either_way(start, y, rows):
+    sensor = Sensor("tall", tuple(np.linspace(12, -25, rows).tolist()), columns=360)
+    image = street(sensor, 0)[0]
+    azimuth = np.radians(start + np.arange(360))
+    e = np.radians(sensor.elevations)[:, None]
+    direction = [
+        np.cos(e) * np.cos(azimuth),
+        y * np.cos(e) * np.sin(azimuth),
+        np.sin(e) + 0 * azimuth,
+    ]
+    xyz = (image * np.stack(direction)).transpose(1, 2, 0)[image > 0].astype(np.float32)
+    beams = find_beams(Points(xyz))
+    assert beams.order == RING_AFTER_RING
+    np.testing.assert_allclose(beams.elevations, sensor.elevations, atol=1e-3)
+    np.testing.assert_array_equal(beams.of_point[0], np.nonzero(image)[0])
+
+
+def test_beams_of_one_elevation_are_no_rings():
+    """Each ring is stored as two halves of a turn, apart: 32 rings, but 16 beams."""
+    image = street(SENSORS["vlp16"].resized(columns=192), 0)
+    xyz, _ = image_to_points(image, SENSORS["vlp16"].resized(columns=192).rays())
+    ring = find_beams(Points(xyz)).of_point[0]
+    twice = np.concatenate([xyz[ring == row // 2] for row in range(32)])
+    found = find_beams(Points(twice))
+    np.testing.assert_allclose(found.elevations, SENSORS["vlp16"].elevations, atol=1e-3)
+
+
+def test_the_distance_of_most_points_is_told():
+    """One point in ten a degree off its beam: the median does not tell it."""
+    points = scan(MINE, RINGS)
+    off = np.random.default_rng(0).random(len(points.xyz)) < 0.1
+    distance = np.linalg.norm(points.xyz, axis=1)
+    e = np.arcsin(points.xyz[:, 2] / distance) + np.radians(off)
+    azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+    moved = distance * [np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)]
+    found = estimate_sensor([Points(moved.T.astype(np.float32), None, points.ring)])
+    assert found.off == (pytest.approx(0, abs=1e-3), pytest.approx(1, abs=1e-3))
+
+
 @pytest.mark.parametrize("share", [0.3, 0.0])  # of the rays with two returns
 def test_two_returns_of_each_ray_are_of_one_beam(share):
     points = scan(SENSORS["vlp16"].resized(columns=192), FIRINGS)

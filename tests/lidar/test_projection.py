@@ -226,13 +226,20 @@ def test_scans_whose_lasers_cannot_be_found_and_unknown_projections_are_refused_
         assert "\n" not in str(error.value)
 
 
-def test_rings_stored_from_behind_on_are_refused():
+@pytest.mark.parametrize("start", [0, 24, 31])
+@pytest.mark.parametrize("clockwise", [False, True])
+@pytest.mark.parametrize("upwards", [False, True])
+def test_rings_unfold_from_any_azimuth_in_either_direction(start, clockwise, upwards):
     sensor = SENSORS["vlp16"].resized(columns=48)
-    xyz, _ = image_to_points(np.full((1, 16, 48), 9, np.float32), sensor)
-    assert (project(xyz, None, sensor, "unfolding")[0] > 0).all()
-    from_behind = np.roll(xyz.reshape(16, 48, 3), 24, axis=1).reshape(-1, 3)
-    with pytest.raises(InputError, match="from azimuth 0 on"):
-        project(from_behind, None, sensor, "unfolding")
+    image = np.full((1, 16, 48), 9, np.float32)
+    image[0, :3, 10:44] = 0  # the upper rings see sky
+    image[0, 2, 20] = 9
+    order = np.roll(np.arange(48)[:: 1 if clockwise else -1], start)
+    e, a = sensor.rays().double().numpy()[:, :: -1 if upwards else 1, order]
+    xyz = 9 * np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
+    kept = image[0, :: -1 if upwards else 1][:, order] > 0
+    found = project(xyz[kept], None, sensor, "unfolding")[0]
+    np.testing.assert_allclose(found, image[0], rtol=1e-6)
 
 
 def test_lost_rays_of_whole_firings_may_be_nan(tmp_path):
