@@ -159,8 +159,11 @@ def test_ring_numbers_by_laser_give_the_firing_order(first):
         (np.linspace(0, 3000, 50), 3000),
         (np.linspace(0, 7000, 50), 65535),
         (np.linspace(0, 0.0115, 50), 0.012),
-        (np.append(np.linspace(0, 1, 29997), [1.5] * 3), 1),  # one in 10,000 is an outlier
-        (np.append(np.linspace(0, 1, 29997), [1.5] * 4), 2),
+        (np.append(np.full(960, 0.3), np.linspace(1.5, 4e4, 40)), 1),  # as Waymo's
+        (np.append(np.linspace(0, 1, 960), [2e4] * 100), 65535),  # too many for outliers
+        (np.append(np.tile(np.arange(256), 9), [4e4, 65535]), 255),
+        (np.append(np.tile(np.arange(2001), 9), [65535] * 9), 2000),  # saturated counts
+        (np.append(np.linspace(0, 0.0115, 999), [2e4]), 0.012),
         (np.zeros(5), None),
     ],
 )
@@ -175,6 +178,16 @@ def test_the_scale_of_reflectance_is_estimated(values, scale):
     assert scaled_reflectance(
         "a.bin", Points(np.ones((3, 3)), np.float32([0, 0.5, 1])), 255
     ).tolist() == [0, 0.5, 1]
+
+
+@pytest.mark.parametrize(("scale", "dark"), [(1, False), (65535, True)])
+def test_outliers_of_reflectance_are_clipped_with_a_warning(tmp_path, caplog, scale, dark):
+    values = np.append(np.full(997, 0.3), [2e4] * 3).astype(np.float32)
+    points = Points(np.ones((1000, 3), np.float32), values + (0 if scale == 1 else 1))
+    scaled = scaled_reflectance(tmp_path / "a.bin", points, scale)
+    np.testing.assert_allclose(scaled, (points.reflectance / scale).clip(0, 1), rtol=1e-6)
+    assert ("reflectance beyond 1 is clipped (3 points" in caplog.text) == (scale == 1)
+    assert ("half of it below a hundredth" in caplog.text) == dark
 
 
 def test_range_limits_include_all_but_stray_returns():
