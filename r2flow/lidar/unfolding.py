@@ -9,7 +9,8 @@ from scipy import ndimage
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention, Sensor
 
-SURE = 0.9  # minimum share of neighbouring lasers whose elevations decrease in that order
+NOISE = 0.1  # degrees by which a laser may lie above that of the row before it in any case
+FEW = 5  # returns below which the median elevation of a ring is not known
 FEWEST, MOST = 4, 256  # limits of the number of beams
 TIGHT = 0.1  # scatter below which points of one beam are together
 _BACK = 1 / 12  # of a turn, by which azimuths fall back at a new ring; at most half its width
@@ -45,7 +46,7 @@ def unfolded_rows(
     if order is None:
         raise InputError(
             "the scan has no ring numbers and is stored neither ring after ring nor in whole "
-            f"firings of the {rows} lasers of sensor '{sensor.name}'. {_CURE}"
+            f"firings of {rows}, the lasers of sensor '{sensor.name}'. {_CURE}"
         )
     rings = int(order.max()) + 1
     if not rows / 2 <= rings <= rows + 1:
@@ -141,42 +142,49 @@ def _starts(xyz: ndarray) -> ndarray:
 def _rows_from_field(xyz: ndarray, ring: ndarray, sensor: Sensor) -> ndarray:
     """Rows from a file's ring numbers, (N,) int64.
 
-    They count from 0 or 1, from the top, the bottom or by laser.
+    They count from 0 or 1, from the top, the bottom or by laser; or they have gaps, as those of
+    every fourth beam, and elevations decide.
     """
     rows = sensor.shape[0]
-    first = 0
     highest = int(ring.max(initial=0))
-    if ring.min(initial=highest) > 0 and highest <= rows:
+    elevation = _median_elevations(xyz, ring, max(highest + 1, rows + 1))
+    numbers = np.flatnonzero(np.bincount(ring))
+    first = 0
+    if numbers[0] > 0 and highest <= rows:
         # Elevations decide if neither the first nor the last ring has a return.
-        means = _mean_elevations(xyz, ring, rows + 1)
         from_0, from_1 = (
-            _misfit(part, best_order(part, sensor)[0], sensor) for part in (means[:-1], means[1:])
+            _misfit(part, best_order(part, sensor)[0], sensor)
+            for part in (elevation[:rows], elevation[1 : rows + 1])
         )
         first = int(highest == rows or from_1 < from_0 / 2)
-    ring = ring - first
     last = highest - first
-    if not rows / 2 <= last + 1 <= rows:
+    if last >= rows >= len(numbers):
+        order = abs(elevation[:, None] - np.asarray(sensor.elevations)).argmin(axis=1)
+        known = np.isfinite(elevation)
+        fits = len(set(order[known])) == known.sum()
+    elif rows / 2 <= last + 1 <= rows:
+        order, fits = best_order(elevation[first : first + rows], sensor)
+    else:
         raise InputError(
             f"the scan has ring numbers up to {last}, but sensor '{sensor.name}' has {rows} rows. "
             f"Is it this sensor's? {_CURE}"
         )
-    order, share = best_order(_mean_elevations(xyz, ring, rows), sensor)
-    if share < SURE:
+    if not fits:
         raise InputError(
             "the scan's ring numbers follow neither the elevations of its points nor the firing "
             f"order of sensor '{sensor.name}'. Give the sensor its `firing`. {_CURE}"
         )
-    return order[ring]
+    return order[ring - first]
 
 
-def _mean_elevations(xyz: ndarray, ring: ndarray, rows: int) -> ndarray:
-    """Mean elevation of each ring in degrees, (H,); NaN for rings without returns."""
+def _median_elevations(xyz: ndarray, ring: ndarray, rings: int) -> ndarray:
+    """Median elevation of each ring in degrees, (rings,); NaN for rings with few returns."""
     elevation = elevations_of(xyz)
     seen = np.isfinite(elevation)
-    count = np.bincount(ring[seen], minlength=rows)
-    total = np.bincount(ring[seen], elevation[seen], minlength=rows)
-    with np.errstate(invalid="ignore"):
-        return total / count
+    many = np.flatnonzero(np.bincount(ring[seen], minlength=rings) >= FEW)
+    middles = np.full(rings, np.nan)
+    middles[many] = ndimage.median(elevation[seen], ring[seen], many)
+    return middles
 
 
 def _misfit(elevation: ndarray, order: ndarray, sensor: Sensor) -> float:
@@ -195,8 +203,8 @@ def _rows_from_firings(xyz: ndarray, sensor: Sensor) -> ndarray | None:
     table = few_firings(xyz.reshape(firings, rows, 3))
     elevation = elevations_of(table.reshape(-1, 3)).reshape(-1, rows)
     middle, scatter = scatter_of(elevation)
-    order, share = best_order(middle, sensor)
-    return np.tile(order, firings) if scatter < 0.25 and share >= SURE else None
+    order, fits = best_order(middle, sensor)
+    return np.tile(order, firings) if scatter < 0.25 and fits else None
 
 
 def few_firings(firings: ndarray) -> ndarray:
@@ -235,14 +243,14 @@ def median_of_seen(values: ndarray) -> ndarray:
     return np.where(seen > 0, middle, np.nan)
 
 
-def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, float]:
+def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, bool]:
     """Row of each laser, (H,) int64, in the order that best fits their elevations.
 
     Candidates are top-down, bottom-up and the sensor's firing order.
 
     Returns:
-        The order, and the quality of its fit: the share of neighbouring lasers with decreasing
-        elevations. Ties go to the order with the smaller distance to the rows.
+        The order, and whether it fits: no laser lies above that of the row before it by more than
+        half the distance of the rows. Ties go to the order with the smaller distance to the rows.
     """
     top_down = np.arange(len(elevation))
     orders = [top_down, top_down[::-1]]
@@ -250,9 +258,10 @@ def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, float]:
         orders.append(np.asarray(sensor.firing))
     fits = []
     for order in orders:
-        falling = elevation[np.argsort(order)]
-        steps = np.diff(falling[np.isfinite(falling)])
-        share = float((steps < 0).mean()) if len(steps) else 1.0
-        fits.append((share, -_misfit(elevation, order, sensor)))
+        by_row = elevation[np.argsort(order)]
+        seen = np.isfinite(by_row)
+        apart = -np.diff(np.asarray(sensor.elevations)[seen])
+        wrong = np.diff(by_row[seen]) > np.maximum(apart / 2, NOISE)
+        fits.append((-int(wrong.sum()), -_misfit(elevation, order, sensor)))
     best = fits.index(max(fits))
-    return orders[best].astype(int), fits[best][0]
+    return orders[best].astype(int), fits[best][0] == 0

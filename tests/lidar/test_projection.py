@@ -1,5 +1,6 @@
 import math
 import re
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +10,7 @@ from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.beams import find_beams
-from r2flow.lidar.estimation import steps_of_a_turn
+from r2flow.lidar.estimation import estimate_sensor, steps_of_a_turn
 from r2flow.lidar.projection import image_to_points, project, project_indices
 from r2flow.lidar.scan_files import Points, read_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -224,6 +225,33 @@ def test_scans_whose_lasers_cannot_be_found_and_unknown_projections_are_refused_
                 }
             )
         assert "\n" not in str(error.value)
+
+
+def test_two_exchanged_rings_are_refused():
+    sensor = SENSORS["hdl32e"].resized(columns=48)
+    xyz, _ = image_to_points(np.full((1, 32, 48), 9, np.float32), sensor)
+    ring = np.repeat(np.arange(32), 48)
+    assert (project(xyz, None, sensor, "unfolding", ring=ring)[0] > 0).all()
+    for pair in ((0, 1), (17, 18), (3, 20)):
+        exchanged = np.arange(32)
+        exchanged[[*pair]] = pair[::-1]
+        with pytest.raises(InputError, match="follow neither the elevations"):
+            project(xyz, None, sensor, "unfolding", ring=exchanged[ring])
+
+
+@pytest.mark.parametrize(
+    "number", [lambda row: 4 * row, lambda row: 61 - 4 * row, lambda row: row**2]
+)
+def test_ring_numbers_with_gaps_unfold_to_their_own_sensor(number):
+    sensor = SENSORS["vlp16"].resized(columns=48)
+    image = np.full((1, 16, 48), 9, np.float32)
+    xyz, _ = image_to_points(image, sensor)
+    ring = number(np.repeat(np.arange(16), 48))
+    mine = estimate_sensor([Points(xyz, None, ring.astype(np.uint16))]).sensor
+    seen = ring != number(2)  # a beam without return
+    found = project(xyz[seen], None, replace(mine, columns=48), "unfolding", ring=ring[seen])[0]
+    image[0, 2] = 0
+    np.testing.assert_allclose(found, image[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("start", [0, 24, 31])
