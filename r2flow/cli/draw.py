@@ -188,7 +188,10 @@ class PartialOptions:
     ] = None
     to: Annotated[
         str | None,
-        Option(help="Sensor of the completed scans, name or YAML file. Default: the model's."),
+        Option(
+            help="Sensor of the completed scans, name or YAML file. Default: the model's; of "
+            "densify, their own view where it sees more."
+        ),
     ] = None
     size: SizeOption = None
     mask: Annotated[
@@ -218,12 +221,18 @@ class PartialOptions:
         """
         from r2flow.lidar.sensors import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
+        from r2flow.models import DENSIFY
 
         loaded = load_checkpoint(model, choose_device(device))
         if self.to or self.size:
             loaded = loaded.through(named_sensor(self.to or loaded.sensor, self.size))
         return loaded.open_partial(
-            what, self.source, scale=self.reflectance_scale, most=self.scans, columns=self.columns
+            what,
+            self.source,
+            keep_beams=model == DENSIFY and not (self.to or self.size),
+            scale=self.reflectance_scale,
+            most=self.scans,
+            columns=self.columns,
         )
 
 
