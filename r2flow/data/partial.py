@@ -227,8 +227,8 @@ def _seeing_all(source: Sensor, target: Sensor) -> Sensor | None:
         return None
     beams = len(source.elevations)
     rows = max(target.shape[0], math.ceil(beams / 16) * 16)  # networks halve them four times
-    limits = {"min_range": target.min_range, "max_range": target.max_range}
-    return replace(source.resized(rows, target.columns), **limits)
+    sensor = source.resized(rows, target.columns)
+    return replace(sensor, min_range=target.min_range, max_range=target.max_range)
 
 
 def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -> list[str]:

@@ -178,7 +178,7 @@ def _lasers_of_firings(elevations: list[ndarray]) -> int | None:
 def _beams_of_elevations(elevation: ndarray) -> Beams | None:
     """Beams as peaks of the density of elevations, or None.
 
-    The bandwidth is that where the number of peaks is most stable.
+    The bandwidth is the finest at which the number of peaks is stable.
     """
     from scipy.signal import find_peaks  # half a second
 
@@ -199,11 +199,11 @@ def _beams_of_elevations(elevation: ndarray) -> Beams | None:
         usual = np.median(heights[heights > 0.01 * heights.max()])
         peaks_of.append(edges[peaks[heights > FAINT * usual]] + BIN / 2)
     runs = [[*run] for count, run in groupby(peaks_of, len) if FEWEST <= count <= MOST]
-    runs.append([])
-    longest = max(reversed(runs), key=len)
-    if len(longest) < STABLE:
+    # The finest: wider ones merge weak beams with strong neighbours.
+    stable = next((run for run in runs if len(run) >= STABLE), None)
+    if stable is None:
         return None
-    peaks = longest[(len(longest) - 1) // 2][::-1]
+    peaks = stable[(len(stable) - 1) // 2][::-1]
     row = np.searchsorted(-(peaks[:-1] + peaks[1:]) / 2, -np.nan_to_num(elevation))
     row[~returned] = -1
     elevations = peaks.astype(elevation.dtype)

@@ -492,6 +492,18 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
         find_beams(Points(scan.xyz, ring=np.arange(len(scan.xyz)) % 6))
 
 
+def test_weak_beams_between_strong_ones_are_found_by_elevation():
+    """76 beams, the strongest with a hundred times the returns of the weakest."""
+    draw = np.random.default_rng(2)
+    true = 5 - np.cumsum(draw.uniform(0.1, 0.9, 76))
+    count = np.round(600 * np.exp(draw.normal(0, 1, 76))).astype(int)
+    e = np.radians([draw.normal(beam, 0.03) for beam in np.repeat(true, count)])
+    azimuth = draw.uniform(-np.pi, np.pi, len(e))
+    xyz = 10 * np.transpose([np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)])
+    found = find_beams(Points(draw.permutation(xyz).astype(np.float32)))
+    np.testing.assert_allclose(found.elevations, true, atol=0.05)
+
+
 def test_rings_of_one_elevation_have_a_row_each():
     points = scan(SENSORS["vlp16"].resized(columns=192), RINGS)
     thrice = [
