@@ -69,6 +69,9 @@ def sample(
     model: Annotated[
         str | None, Argument(help="A model, a run folder or a checkpoint file.")
     ] = None,
+    checkpoint: Annotated[
+        str | None, Option("--checkpoint", "-c", help="The model, as `complete` takes it.")
+    ] = None,
     precision: PrecisionOption = "32-true",
     format: Annotated[
         str | None, Option(help="Formats, of ply,bin,npy. Default: all possible.")
@@ -85,6 +88,9 @@ def sample(
     from r2flow.reports.outputs import write_samples
 
     check_folder(out)
+    if model and checkpoint:
+        raise InputError(f"give one model, {model} or -c {checkpoint}.")
+    model = model or checkpoint
     if model is None:
         _print_model(DEFAULT)
     loaded = load_checkpoint(model or find_model(DEFAULT), device=choose_device(draw.device))
