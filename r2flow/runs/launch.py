@@ -229,9 +229,10 @@ def _chain(settings: dict[str, Any], given: Sequence[str], folders: Sequence[str
         runs = {link.name: link.run_dir for link in links}
         report_chain(runs, out, _report_device(settings["trainer"]))
         if settings["preview"]:
+            picture = folder / "preview" / "samples.png"
             print(
-                f"Flows trained this briefly draw blurred scans; {folder / 'preview' / 'samples.png'} "
-                f"shows those of {settings['preview']}, after long training."
+                f"Flows trained this briefly draw blurred scans; {picture} shows those of "
+                f"{settings['preview']}, after long training."
             )
     return 0
 
