@@ -48,9 +48,9 @@ def view_of(*scans: tuple[np.ndarray, Tensor]) -> View:
     xyz = np.concatenate([image_to_points(*scan)[0] for scan in scans])
     if not len(xyz):
         return STREET
-    near, far = np.percentile(np.linalg.norm(xyz, axis=1), (2, 98))
-    low, high = np.percentile(xyz[:, 2], (2, 95))
-    reach = np.percentile(np.abs(xyz[:, :2]).max(axis=1), 96)
+    near, far = np.percentile(np.linalg.norm(xyz, axis=1), (2, 98)).tolist()
+    low, high = np.percentile(xyz[:, 2], (2, 95)).tolist()
+    reach = float(np.percentile(np.abs(xyz[:, :2]).max(axis=1), 96))
     # The margins keep colours apart that have hardly different values.
     return View((0.9 * near, 1.1 * far), (low - 0.5, high + 0.5), max(1.1 * reach, 1.0))
 
