@@ -21,7 +21,9 @@ from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
 
 _WIDTH = 7.16  # inches: two columns of an IEEE paper
-_EYE = np.array([-16.0, 0.0, 9.0])  # direction of the camera of the perspective
+# Camera of the perspective over a street, in units of the view's reach.
+_EYE = np.array([-0.32, 0.0, 0.18])
+_ROOM = 15.0  # metres of reach up to which the camera stands behind a room, four times as far
 # Its axes as columns: right, up, ahead; pitched down by 18 degrees.
 _AXES = np.array([[0, 0.3090, 0.9511], [-1, 0, 0], [0, 0.9511, -0.3090]])
 
@@ -33,14 +35,8 @@ class View(NamedTuple):
     heights: tuple[float, float]  # coloured, sensor frame
     reach: float  # shown to each side of the sensor in the bird's-eye view
 
-    @property
-    def eye(self) -> np.ndarray:
-        """Camera of the perspective: above a street, or behind a room and outside."""
-        return _EYE * self.reach / (50 if self.reach > _ROOM else 12)
-
 
 STREET = View((2.0, 80.0), (-2.8, 3.0), 50.0)
-_ROOM = 15.0  # largest reach of a room
 
 
 def view_of(*scans: tuple[np.ndarray, Tensor]) -> View:
@@ -200,7 +196,8 @@ def _draw_birds_eye(axes: Any, xyz: np.ndarray, view: View, label: bool = True) 
 
 def _draw_perspective(axes: Any, xyz: np.ndarray, view: View, label: bool = True) -> None:
     """Draw points by a pinhole camera behind and above the sensor, coloured by height."""
-    seen = np.column_stack([(xyz - view.eye) @ _AXES / view.reach, xyz[:, 2]])
+    eye = _EYE * (1 if view.reach > _ROOM else 4)
+    seen = np.column_stack([(xyz / view.reach - eye) @ _AXES, xyz[:, 2]])
     seen = seen[seen[:, 2] > 0.06]
     x, y, depth, z = seen[np.argsort(-seen[:, 2])].T
     size = np.clip(0.14 / depth, 0.3, 0.8) * np.sqrt(30_000 / max(len(xyz), 1))

@@ -41,16 +41,15 @@ def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
         grid.add_column(Text(heading), justify="right" if numeric else "left", overflow="fold")
     for line in lines[1:]:
         grid.add_row(*map(Text, line))
-    console = Console()
     if title:
         print(title)
-    if console.is_terminal:
-        console.print(grid)
-        return
-    console.width = grid.__rich_measure__(console, console.options.update_width(10**6)).maximum
+    console = Console()
+    if not console.is_terminal:
+        console.width = 10**6
     with console.capture() as captured:
         console.print(grid)
-    print(*map(str.rstrip, captured.get().splitlines()), sep="\n")
+    for line in captured.get().splitlines():
+        print(line.rstrip())
 
 
 def print_markdown(text: str) -> None:
