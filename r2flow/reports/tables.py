@@ -48,8 +48,8 @@ def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
         console.width = 10**6
     with console.capture() as captured:
         console.print(grid)
-    for line in captured.get().splitlines():
-        print(line.rstrip())
+    for printed in captured.get().splitlines():
+        print(printed.rstrip())
 
 
 def print_markdown(text: str) -> None:
