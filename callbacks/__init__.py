@@ -33,9 +33,8 @@ __all__ = [
     "build_callbacks",
 ]
 
-if (
-    __name__ != "r2flow.callbacks"
-):  # callbacks look up each other by class, and a second copy has other classes
+if __name__ != "r2flow.callbacks":
+    # Callbacks look up each other by class, and a second copy has other classes.
     raise ImportError(
         "import r2flow.callbacks, not callbacks: the folder is part of the package r2flow."
     )

@@ -71,14 +71,8 @@ class Checkpoints(Checkpoint):
         self._saved = 0
         self._stop = False
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, *given: Any) -> None:
+        *_, batch_idx = given
         stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         stop = self._stop or trainer.should_stop  # after a whole step: no run can resume within one
         trainer.should_stop = stop and stepped

@@ -33,15 +33,12 @@ class Curvature(Periodic):
         flow = pl_module.generator
         if not isinstance(flow, Flow) or not flow.unconditional or flow.fixed:
             return
-        x_0 = (
-            Draws(seed_of(pl_module), range(self.num)).start(flow.noise_shape).to(pl_module.device)
-        )
-        result = straightness(flow.velocity, x_0, self.steps)
+        x_0 = Draws(seed_of(pl_module), range(self.num)).start(flow.noise_shape)
+        result = straightness(flow.velocity, x_0.to(pl_module.device), self.steps)
         values = {
             "curvature/s": result.s.mean().item(),
             "curvature/bend": result.s_normalised.mean().item(),
         }
         for logger in trainer.loggers:
-            logger.log_metrics(
-                values, trainer.global_step - 1
-            )  # the index of the step, as Lightning logs
+            # The index of the step, as Lightning logs.
+            logger.log_metrics(values, trainer.global_step - 1)

@@ -71,9 +71,9 @@ class EMA(WeightAveraging):
 
     def _decay(self) -> float:
         """Decay after step `_step`, counted from 0."""
-        return (
-            0.0 if self._copies else self._decay_at(self._step, self.warmup_steps or 0, self.decay)
-        )
+        if self._copies:
+            return 0.0
+        return self._decay_at(self._step, self.warmup_steps or 0, self.decay)
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
         return average.lerp(weight, 1 - self._decay())
@@ -88,20 +88,18 @@ class EMA(WeightAveraging):
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         self._device = trainer.strategy.root_device  # the module moves there later
-        trainer.precision_plugin.convert_module(
-            pl_module
-        )  # as the strategy does later: the average has its type
+        # As the strategy does later: the average has its type.
+        trainer.precision_plugin.convert_module(pl_module)
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
-            self._average_model.n_averaged.fill_(
-                1
-            )  # at 0 the base class copies the weights, whatever the rule
+            # At 0 the base class copies the weights, whatever the rule.
+            self._average_model.n_averaged.fill_(1)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._end = trainer.estimated_stepping_batches - 1
         if self.warmup_steps is None:
             images = pl_module.hparams.get("warmup_images", 0)
-            self.warmup_steps = images // pl_module.images_per_step if images else 0
+            self.warmup_steps = images and images // pl_module.images_per_step
 
 
 def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:

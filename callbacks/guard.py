@@ -3,6 +3,7 @@ many.
 """
 
 import logging
+import math
 from collections.abc import Iterable
 from typing import Any, NoReturn
 
@@ -72,52 +73,37 @@ class Guard(L.Callback):
                 parameter.grad = None  # AdamW skips it and keeps its averages
         self._found.append(finite)
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: object,
-        batch: object,
-        batch_idx: int,
-    ) -> None:
+    def on_train_batch_end(self, *given: Any) -> None:
         if self._found:  # else the batch was accumulated
-            self.in_a_row = 0 if all(self._found) else self.in_a_row
+            if all(self._found):
+                self.in_a_row = 0
             self._losses.clear()
             self._found.clear()
 
     def _skip(self, trainer: L.Trainer, pl_module: L.LightningModule, first: bool) -> None:
         """Count a skipped step, once for all optimisers, and stop the run after too many."""
         scaler = getattr(trainer.precision_plugin, "scaler", None)
-        scale = None if scaler is None else float(scaler.get_scale())
-        loss = float(trainer.strategy.reduce(torch.stack(self._losses).sum(), reduce_op="mean")) / (
-            scale or 1.0
-        )
-        overflow = scale is not None and loss - loss == 0
+        scale = float(scaler.get_scale()) if scaler else 1.0
+        loss = trainer.strategy.reduce(torch.stack(self._losses).sum(), reduce_op="mean").item()
+        loss /= scale
+        overflow = bool(scaler) and math.isfinite(loss)
         self.in_a_row += first
         self.total += first and not overflow
-        if self.in_a_row >= self.skips or (scale is not None and scale < self.lowest_scale):
-            what = f"{self.in_a_row} steps in a row were" if self.in_a_row > 1 else "the step was"
-            scaled = (
-                f"loss scale {scale:g}"
-                if scale is not None
-                else f"no loss scale in {trainer.precision}"
-            )
-            hint = "" if trainer.precision == "32-true" else "try trainer.precision=32-true; "
+        step = trainer.global_step + 1
+        if self.in_a_row >= self.skips or (scaler and scale < self.lowest_scale):
             self._end(
                 trainer,
-                f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss "
-                "or gradient, "
-                f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; "
-                f"{scaled}; "
-                f"{describe_batch(trainer)}. {last_good(trainer)} Look at these scans; {hint}try, "
-                "in a run of another "
-                "name, a lower stage.learning_rate.",
+                f"stopped at step {step}: steps skipped in a row for a non-finite loss or "
+                f"gradient: {self.in_a_row}, {self.total} in the run. Loss {loss:g}, loss "
+                f"scale {scale:g} of {trainer.precision}; {describe_gradients(pl_module)}; "
+                f"{describe_batch(trainer)}. {last_good(trainer)} Look at these scans; try "
+                "trainer.precision=32-true or, in a run of another name, a lower "
+                "stage.learning_rate.",
             )
         if trainer.is_global_zero and not overflow:
-            what = "gradients" if loss - loss == 0 else f"loss {loss}"
             log.warning(
-                "step %d skipped: non-finite %s (%d in a row; the run ends at %d)",
-                trainer.global_step + 1, what, self.in_a_row, self.skips,
+                "step %d skipped: non-finite gradient, loss %g (%d in a row; the run ends at %d)",
+                step, loss, self.in_a_row, self.skips,
             )  # fmt: skip
 
     def on_save_checkpoint(
@@ -127,18 +113,12 @@ class Guard(L.Callback):
         for key in ("current_model_state", "state_dict"):
             state = checkpoint.get(key, {})
             if broken := _not_finite((name, state[name]) for name in learned if name in state):
-                what = (
-                    "averaged weights"
-                    if key == "state_dict" and "current_model_state" in checkpoint
-                    else "weights"
-                )
                 self._end(
                     trainer,
-                    f"stopped at step {trainer.global_step}: the {what} are no longer finite "
-                    f"({broken[0]} first, "
-                    f"{len(broken)} of {len(learned)}), so no checkpoint was written. "
-                    f"{last_good(trainer)} "
-                    "Start under another name with a lower stage.learning_rate.",
+                    f"stopped at step {trainer.global_step}: the weights or their average are no "
+                    f"longer finite ({broken[0]} first, {len(broken)} of {len(learned)}), so no "
+                    f"checkpoint was written. {last_good(trainer)} Start under another name with "
+                    "a lower stage.learning_rate.",
                 )
 
     def _end(self, trainer: L.Trainer, message: str) -> NoReturn:
@@ -150,7 +130,7 @@ class Guard(L.Callback):
         return {"in_a_row": self.in_a_row, "total": self.total}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.in_a_row, self.total = state_dict["in_a_row"], state_dict["total"]
+        vars(self).update(state_dict)
 
 
 def last_good(trainer: L.Trainer) -> str:
@@ -165,11 +145,9 @@ def describe_gradients(module: torch.nn.Module) -> str:
     """Describe the first parameter, in the module's order, with a non-finite gradient."""
     named = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
     broken = _not_finite(named)
-    return (
-        f"gradient of {broken[0]} non-finite first, {len(broken)} of {len(named)}"
-        if broken
-        else "gradients finite"
-    )
+    if not broken:
+        return "gradients finite"
+    return f"gradient of {broken[0]} non-finite first, {len(broken)} of {len(named)}"
 
 
 def describe_batch(trainer: L.Trainer) -> str:
@@ -181,9 +159,7 @@ def describe_batch(trainer: L.Trainer) -> str:
     if not isinstance(sampler, RunSampler) or size is None:
         return "images unknown to the loader"
     images = range(trainer.global_step * size, (trainer.global_step + 1) * size)
-    scans = ", ".join(str(sampler.order[k]) for k in images[:16]) + (
-        ", ..." if len(images) > 16 else ""
-    )
+    scans = ", ".join(str(sampler.order[k]) for k in images)
     return f"images k = {images[0]} to {images[-1]}, scans {scans}"
 
 

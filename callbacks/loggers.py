@@ -19,20 +19,21 @@ from lightning.pytorch.loggers import (
     TensorBoardLogger,
     WandbLogger,
 )
-from matplotlib.image import imread
 
-from r2flow.errors import InputError, require
+from r2flow.errors import InputError, one_line, require
 from r2flow.registry import Registry
 
 PROJECT = "r2flow"
 
 
+def _by_age(folder: Path, pattern: str) -> list[Path]:
+    return sorted(folder.glob(pattern), key=lambda path: path.stat().st_mtime)
+
+
 def _wandb(run_dir: Path) -> Logger:
     """W&B logger; resumes the run of an existing folder `run-DATE-ID`."""
     require("loggers=[wandb]", "wandb", "wandb")
-    folders = sorted(
-        (run_dir / "wandb").glob("*run-*-*"), key=lambda folder: folder.stat().st_mtime
-    )
+    folders = _by_age(run_dir / "wandb", "*run-*-*")
     run_id = folders[-1].name.rsplit("-", 1)[1] if folders else None
     return WandbLogger(name=run_dir.name, save_dir=run_dir, project=PROJECT, id=run_id)
 
@@ -42,20 +43,20 @@ def _mlflow(run_dir: Path) -> Logger:
     run.
     """
     require("loggers=[mlflow]", "mlflow", "mlflow")
-    uri, run_id = os.environ.get("MLFLOW_TRACKING_URI"), None
+    uri = os.environ.get("MLFLOW_TRACKING_URI")
+    run_id = None
     os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # otherwise a folder is refused
     if uri is None or uri in _STORES:
         store = run_dir.absolute() / "mlruns"
         uri = store.as_uri()
-        _STORES.add(
-            uri
-        )  # MLflow writes it into the environment, which the next run of this process reads
-        files = sorted(store.glob("*/*/meta.yaml"), key=lambda file: file.stat().st_mtime)
+        # MLflow writes it into the environment, which the next run of this process reads.
+        _STORES.add(uri)
+        files = _by_age(store, "*/*/meta.yaml")
         run_id = files[-1].parent.name if files else None
     try:
         return MLFlowLogger(PROJECT, run_dir.name, uri, run_id=run_id)
     except Exception as error:  # as of a scheme that it does not know
-        raise InputError(f"loggers=[mlflow]: {' '.join(str(error).split())[:300]}") from error
+        raise InputError(f"loggers=[mlflow]: {one_line(str(error))}") from error
 
 
 _STORES: set[str] = set()
@@ -81,7 +82,6 @@ PICTURES: dict[type, Callable[[Any, str, np.ndarray, int], None]] = {
         log.run_id, pixels, key=name, step=step
     ),
 }
-ELSEWHERE = (WandbLogger, MLFlowLogger)  # may be viewed without access to the run's folder
 
 
 class LearningRates(LearningRateMonitor):
@@ -106,26 +106,13 @@ def log_picture(loggers: Iterable[Logger], name: str, pixels: np.ndarray, step: 
 
 def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
     """Log a run's config to the loggers outside its folder."""
-    for logger in (one for one in loggers if isinstance(one, ELSEWHERE)):
+    for logger in loggers:
         try:
-            if (
-                isinstance(logger, MLFlowLogger)
-                and logger.experiment.get_run(logger.run_id).data.params
-            ):
-                continue  # parameters of a resumed run cannot be changed
-            logger.log_hyperparams(dict(config))
-        except (
-            Exception
-        ) as error:  # the services raise many kinds, as without a key or a connection
-            text = " ".join(str(error).split())[:300]
-            raise InputError(f"{type(logger).__name__}: {type(error).__name__}: {text}") from error
-
-
-def log_figures(loggers: Iterable[Logger], run_dir: Path, step: int) -> None:
-    """Log the loss curve and the samples of a finished run to the loggers outside its folder."""
-    external = [logger for logger in loggers if isinstance(logger, ELSEWHERE)]
-    for path in (run_dir / "loss.png", run_dir / "samples" / "samples.png"):
-        if external and path.is_file():
-            log_picture(
-                external, path.stem, np.round(255 * imread(path)[..., :3]).astype(np.uint8), step
-            )
+            if isinstance(logger, MLFlowLogger):
+                # Parameters of a resumed run cannot be changed.
+                if not logger.experiment.get_run(logger.run_id).data.params:
+                    logger.log_hyperparams(dict(config))
+            elif isinstance(logger, WandbLogger):
+                logger.log_hyperparams(dict(config))
+        except Exception as error:  # of many kinds, as without a key or a connection
+            raise InputError(f"{type(logger).__name__}: {one_line(str(error))}") from error

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
@@ -35,27 +36,17 @@ class Periodic(L.Callback, ABC):
         self._last = trainer.global_step  # a resumed run has already acted at this step
 
     def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: object,
-        batch: object,
-        batch_idx: int,
+        self, trainer: L.Trainer, pl_module: L.LightningModule, *given: Any
     ) -> None:
-        step = trainer.global_step
-        last = step == trainer.estimated_stepping_batches
-        if self.every > 0 and (step % self.every == 0 or last):
-            self._act_once(trainer, pl_module)
+        if self.every and trainer.global_step % self.every == 0:
+            self.on_train_end(trainer, pl_module)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if self.every > 0:  # as of a run that was stopped early
-            self._act_once(trainer, pl_module)
-
-    def _act_once(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Act at this step, unless it was done: with gradient accumulation a step spans several
         batches.
         """
-        if not trainer.is_global_zero or trainer.global_step in (0, self._last):
+        done = trainer.global_step in (0, self._last)
+        if done or not self.every or not trainer.is_global_zero:
             return
         self._last = trainer.global_step
         training = pl_module.training
@@ -91,9 +82,8 @@ class SamplePictures(Periodic):
         return generator.choose(steps=None if generator.fixed else self.steps)
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        generator: Generator = pl_module.generator  # type: ignore[assignment]
-        if self.every and generator.unconditional:
-            self.sampler(generator)  # refuses wrong steps before training
+        if self.every and pl_module.generator.unconditional:
+            self.sampler(pl_module.generator)  # refuses wrong steps before training
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         step = trainer.global_step

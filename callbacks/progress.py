@@ -42,16 +42,18 @@ class Progress(ProgressBar):
             return  # within a step: the losses are those of a part of its batch
         if trainer.global_step == self._total:
             self._noted = self._bar.every = 0.0  # the last figures are always written
-        note, now = None, time.monotonic()
+        note = None
+        now = time.monotonic()
         if now - self._noted >= min(self.seconds, 1):  # reading a loss waits for the GPU
-            self._noted, shown = now, trainer.progress_bar_metrics  # logged with prog_bar=True
-            losses = [f"{key.removeprefix('train/')} {value:.4f}" for key, value in shown.items()]
+            self._noted = now
+            shown = trainer.progress_bar_metrics  # logged with prog_bar=True
+            notes = [f"{key.removeprefix('train/')} {value:.4f}" for key, value in shown.items()]
             data = getattr(trainer, "datamodule", None)
             rate = (self._bar.tasks[0].speed or 0.0) * int(getattr(data, "batch_size", 1))
-            fits = (
-                self._bar.disable or self._bar.console.width >= 100
-            )  # else the time left would be cut
-            note = "  ".join([*losses, *[f"{rate:.1f} scans/s"] * bool(fits and rate)])
+            # In a narrow terminal the time left would be cut.
+            if rate and (self._bar.disable or self._bar.console.width >= 100):
+                notes.append(f"{rate:.1f} scans/s")
+            note = "  ".join(notes)
         self._bar.set(trainer.global_step, note)
 
     def on_train_end(self, trainer: L.Trainer, *given: Any) -> None:

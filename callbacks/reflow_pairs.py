@@ -23,14 +23,13 @@ class ReflowPairs(L.Callback):
             raise InputError(
                 "pairs are drawn by a trained flow: give the stage a parent, or pairs={'of': RUN}."
             )
-        record = (
-            find_parent(data.pairs.of).record() if data.pairs.of else pl_module.hparams["parent"]
-        )
+        record = pl_module.hparams["parent"]
+        if data.pairs.of:
+            record = find_parent(data.pairs.of).record()
         data.drawn_by(record)
         store = data.pair_store
         if store.missing_pairs():
             # File locks, not a barrier: collective calls time out after half an hour, and a slow
             # rank may take longer.
-            make_pairs(
-                store, load_checkpoint(record["path"]).generator.to(trainer.strategy.root_device)
-            )
+            flow = load_checkpoint(record["path"]).generator
+            make_pairs(store, flow.to(trainer.strategy.root_device))

@@ -69,9 +69,8 @@ class Stopping(L.Callback):
             try:
                 yield
             except Exception:
-                if (
-                    self.received is None
-                ):  # other errors, as of a killed worker, follow from the signal
+                # Other errors, as of a killed worker, follow from the signal.
+                if self.received is None:
                     raise
             if self.received is not None:
                 self._leave("stopped")
@@ -109,15 +108,10 @@ class Stopping(L.Callback):
                 if trainer.strategy.reduce_boolean_decision(self.received == number, all=False):
                     self.received = number
         if stopped and trainer.global_step < trainer.estimated_stepping_batches:
-            if (
-                trainer.checkpoint_callbacks
-            ):  # a plug-in's own callback does not save where the run stops
-                ours = (
-                    callback
-                    for callback in trainer.checkpoint_callbacks
-                    if isinstance(callback, Checkpoints)
-                )
-                next(ours, Checkpoints(keep=sys.maxsize)).save(trainer)
+            if trainer.checkpoint_callbacks:
+                # A plug-in's own callback does not save where the run stops.
+                ours = [c for c in trainer.checkpoint_callbacks if isinstance(c, Checkpoints)]
+                next(iter(ours), Checkpoints(keep=sys.maxsize)).save(trainer)
             self._training = False
             # as Lightning does after the callbacks
             trainer._logger_connector.update_train_step_metrics()
@@ -126,17 +120,16 @@ class Stopping(L.Callback):
                 wait_for_launcher()
             self._leave(f"stopped at step {trainer.global_step}")
 
-    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_end(self, *given: Any) -> None:
         self._training = False
 
-    def on_exception(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
-    ) -> None:
+    def on_exception(self, *given: Any) -> None:
         self._training = False
 
     def _leave(self, where: str) -> None:
         assert self.received is not None
-        code, first = code_of(self.received), getattr(rank_zero_only, "rank", 0) == 0
+        code = code_of(self.received)
+        first = getattr(rank_zero_only, "rank", 0) == 0
         if self.received == signal.SIGUSR1:
             code = LATER
             if first:
@@ -144,18 +137,14 @@ class Stopping(L.Callback):
                 try:
                     subprocess.run(["scontrol", "requeue", str(self.job)], check=True)
                 except (OSError, subprocess.CalledProcessError) as error:
-                    refused = (
-                        f"error: {where}, but SLURM did not take job {self.job} back ({error})"
-                    )
                     raise Stopped(
-                        2, f"{refused}. Submit the same script again."
-                    ) from None  # `handling_signals` passes it on
-        has_checkpoint = bool(checkpoints_of(self.run_dir))
-        consequence = (
-            "resumes from the last checkpoint"
-            if has_checkpoint
-            else "starts it again: no checkpoint yet"
-        )
+                        2,
+                        f"error: {where}, but SLURM did not take job {self.job} back ({error}). "
+                        "Submit the same script again.",
+                    ) from None
+        consequence = "starts it again: no checkpoint yet"
+        if checkpoints_of(self.run_dir):
+            consequence = "resumes from the last checkpoint"
         raise Stopped(code, f"{where}; the same command {consequence}" if first else "") from None
 
 

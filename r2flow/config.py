@@ -1,88 +1,89 @@
 """Rules of config keys: whether a key may change on resume, and which links of a chain it applies
 to.
 
-Constructors document and type the keys; defaults are in `conf/`. A key without an entry in `RULES`
-follows its innermost group with one, else the defaults of `Key`.
+Constructors document and type the keys; defaults are in `conf/`. A rule of a group is that of its
+keys, too.
 """
 
 import json
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+# May differ on resume, since they do not affect the result. data.pairs.parent identifies the flow
+# of data.pairs.of.
+FREE = {
+    "experiment",
+    "size",
+    "hydra",
+    "name",
+    "run_dir",
+    "chain",
+    "preview",
+    "plugins",
+    "loggers",
+    "samples",
+    "sampler",
+    "few",
+    "stage.parent.path",
+    "stage.parent.pairs",
+    "data.root",
+    "data.parts.*.root",
+    "data.validation.data.root",
+    "data.workers",
+    "data.memory_gib",
+    "data.pairs.of",
+    "data.scans.root",
+    "callbacks.reflow_pairs",
+    "callbacks.pictures",
+    "callbacks.curvature",
+    "callbacks.guard",
+    "callbacks.requeue",
+    "callbacks.checkpoint",
+    "callbacks.progress",
+    "trainer.accelerator",
+    "trainer.strategy",
+    "trainer.devices",
+    "trainer.num_nodes",
+    "trainer.precision",
+    "trainer.default_root_dir",
+    "trainer.enable_progress_bar",
+    "trainer.log_every_n_steps",
+    "trainer.max_time",
+    "trainer.profiler",
+    "trainer.val_check_interval",
+}
 
-@dataclass(frozen=True)
-class Key:
-    """Rule of a config key."""
-
-    resume: Literal["fixed", "free"] = (
-        "fixed"  #: `free`: may differ on resume, since it does not affect the result
-    )
-    #: Links of a chain that take the key from the chain's command line: `all`, those that read
-    #: `scans` (others inherit from them), those trained on `pairs`, or none, for keys of the
-    #: `chain`.
-    links: Literal["all", "scans", "pairs", "chain"] = "all"
-
-
-FREE = Key(resume="free")
-OF_THE_CHAIN = Key(resume="free", links="chain")
-OF_SCANS = Key(links="scans")
-OF_PAIRS = Key(links="pairs")
-
-RULES: dict[str, Key] = {
+# Links of a chain that take a key from the chain's command line: none, those that read scans
+# (others inherit from them), those trained on pairs; of other keys all links.
+LINKS = {
+    **dict.fromkeys(("experiment", "size", "hydra", "name", "run_dir", "chain", "preview"), "none"),
+    **dict.fromkeys(("sensor", "encoding", "generator", "backbone", "data"), "scans"),
     **dict.fromkeys(
-        ("experiment", "size", "hydra", "name", "run_dir", "chain", "preview"), OF_THE_CHAIN
+        ("data.validation", "data.batch_size", "data.workers", "data.memory_gib"), "all"
     ),
-    **dict.fromkeys(("plugins", "loggers", "samples", "sampler", "few"), FREE),
-    **dict.fromkeys(("stage.parent.path", "stage.parent.pairs"), FREE),
-    **dict.fromkeys(
-        ("sensor", "encoding", "generator", "backbone", "data", "data.validation.data"), OF_SCANS
-    ),
-    **dict.fromkeys(
-        ("data.root", "data.parts.*.root", "data.validation.data.root"),
-        replace(OF_SCANS, resume="free"),
-    ),
-    **dict.fromkeys(("data.validation", "data.batch_size"), Key()),
-    **dict.fromkeys(("data.workers", "data.memory_gib"), FREE),
-    **dict.fromkeys(("data.pairs", "data.scans"), OF_PAIRS),
-    # data.pairs.parent identifies the flow that draws them.
-    **dict.fromkeys(("data.pairs.of", "data.scans.root"), replace(OF_PAIRS, resume="free")),
-    **dict.fromkeys(
-        (
-            *(
-                "callbacks.reflow_pairs",
-                "callbacks.pictures",
-                "callbacks.curvature",
-                "callbacks.guard",
-            ),
-            *("callbacks.requeue", "callbacks.checkpoint", "callbacks.progress"),
-            *(
-                "trainer.accelerator",
-                "trainer.strategy",
-                "trainer.devices",
-                "trainer.num_nodes",
-                "trainer.precision",
-            ),
-            *(
-                "trainer.default_root_dir",
-                "trainer.enable_progress_bar",
-                "trainer.log_every_n_steps",
-            ),
-            *("trainer.max_time", "trainer.profiler", "trainer.val_check_interval"),
-        ),
-        FREE,
-    ),
+    "data.validation.data": "scans",
+    "data.pairs": "pairs",
+    "data.scans": "pairs",
 }
 
 
-def rule(key: str) -> Key:
-    """Rule of a key, such as `data.parts.0.root`, or of its innermost group with a rule."""
+def _groups(key: str) -> list[str]:
+    """A key such as `data.parts.0.root` with stars for numbers, and its groups, innermost first."""
     parts = re.sub(r"\.\d+(?=\.|$)", ".*", key).split(".")
-    groups = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
-    return next((RULES[group] for group in groups if group in RULES), Key())
+    return [".".join(parts[:n]) for n in range(len(parts), 0, -1)]
+
+
+def is_free(key: str) -> bool:
+    """Whether a key may differ on resume."""
+    return not FREE.isdisjoint(_groups(key))
+
+
+def links_of_key(key: str) -> str:
+    """The links of a chain that take a key from the command line, as in `LINKS`."""
+    return next((LINKS[group] for group in _groups(key) if group in LINKS), "all")
 
 
 def key_of(override: str) -> str:
@@ -93,16 +94,17 @@ def key_of(override: str) -> str:
 def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """('a.b', value) for every leaf of a nested mapping; groups in a list are numbered, 'a.0.b'."""
     for key, value in config.items():
-        if (
-            isinstance(value, Sequence)
-            and value
-            and all(isinstance(group, Mapping) for group in value)
-        ):
+        if _lists_groups(value):
             value = dict(enumerate(value))
         if isinstance(value, Mapping):
             yield from flatten(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
+
+
+def _lists_groups(value: Any) -> bool:
+    listed = isinstance(value, list | tuple) and len(value) > 0
+    return listed and all(isinstance(group, Mapping) for group in value)
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
@@ -159,17 +161,10 @@ def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         if isinstance(value, Mapping) and value:
             if inner := learned(value, f"{prefix}{key}."):
                 fixed[key] = inner
-        elif rule(f"{prefix}{key}").resume == "fixed":
-            groups = (
-                isinstance(value, Sequence)
-                and value
-                and all(isinstance(group, Mapping) for group in value)
-            )
-            fixed[key] = (
-                [learned(group, f"{prefix}{key}.{n}.") for n, group in enumerate(value)]
-                if groups
-                else value
-            )
+        elif not is_free(f"{prefix}{key}"):
+            fixed[key] = value
+            if _lists_groups(value):
+                fixed[key] = [learned(group, f"{prefix}{key}.*.") for group in value]
     return fixed
 
 

@@ -21,7 +21,7 @@ import lightning as L
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.model_helpers import is_overridden
 
-from r2flow.callbacks.loggers import log_config, log_figures
+from r2flow.callbacks.loggers import log_config
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override
 from r2flow.errors import InputError, check_folder, one_line
@@ -99,7 +99,6 @@ def fit(run: Run) -> Result:
                     finished,
                     kept=kept,
                 )
-                log_figures(run.trainer.loggers, run.folder, step)
     return _result(run, step, finished)
 
 

@@ -11,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from r2flow.callbacks import CALLBACKS
 
 from r2flow.backbones import BACKBONES, configurations
-from r2flow.config import RULES, as_override, flatten, key_of
+from r2flow.config import FREE, LINKS, as_override, flatten, key_of
 from r2flow.data.augment import Augmentation
 from r2flow.data.options import DataOptions, PairOptions
 from r2flow.errors import InputError
@@ -48,7 +48,7 @@ def test_every_rule_is_of_a_key_that_exists(config):
         "data.scans.root",
         *(f"callbacks.{name}" for name in CALLBACKS),
     }
-    for key in RULES:
+    for key in FREE | LINKS.keys():
         assert any(known == key or known.startswith(f"{key}.") for known in keys), key
 
 

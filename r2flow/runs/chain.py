@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2flow.config import flatten, key_of, override, rule
+from r2flow.config import flatten, key_of, links_of_key, override
 from r2flow.errors import InputError, naming
 from r2flow.model.lineage import Parent
 from r2flow.model.paths import FOLDER
@@ -61,7 +61,7 @@ def links_of(
             config = compose([*own, *alone], configs)
         on_pairs = config["data"]["name"] == "pairs" or STAGES[config["stage"]["name"]].needs_pairs
         concerning = ("all", "pairs" if on_pairs else "scans")
-        overrides = [text for text in given if rule(key_of(text)).links in concerning] + alone
+        overrides = [text for text in given if links_of_key(key_of(text)) in concerning] + alone
         sets = [text for text in (*own, *overrides) if key_of(text) == "data"]
         # Other scans have no scenes, or their own.
         if sets and not re.fullmatch("data='?simulated'?", sets[-1]):

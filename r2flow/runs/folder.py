@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from filelock import FileLock, Timeout
 
-from r2flow.config import at_most_three, check_tree, differences, flatten, rule
+from r2flow.config import at_most_three, check_tree, differences, flatten, is_free
 from r2flow.errors import InputError, check
 from r2flow.files import write_file
 from r2flow.model.parts import HYPER, NOTES
@@ -25,7 +25,7 @@ CONFIG = "config.yaml"
 
 def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Differences that prevent a command from resuming a run."""
-    return [text for key, text in differences(old, new).items() if rule(key).resume != "free"]
+    return [text for key, text in differences(old, new).items() if not is_free(key)]
 
 
 @contextmanager

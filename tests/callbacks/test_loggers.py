@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.image import imread, imsave
-from r2flow.callbacks.loggers import LOGGERS, log_config, log_figures, log_picture
+from matplotlib.image import imread
+from r2flow.callbacks.loggers import LOGGERS, log_config, log_picture
 
 from r2flow.errors import InputError
 
@@ -23,18 +23,11 @@ def test_a_missing_package_names_its_extra(name, tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
-def write_figures(run: Path) -> None:
-    (run / "samples").mkdir(parents=True)
-    for path in (run / "loss.png", run / "samples" / "samples.png"):
-        imsave(path, PIXELS)
-
-
 def log_all(run: Path, name: str, loss: float, step: int) -> None:
     loggers = [logger := LOGGERS[name](run)]
     log_config(loggers, {"seed": step, "stage": {"name": "rectify"}})
     logger.log_metrics({"train/loss": loss}, step)
     log_picture(loggers, "samples", PIXELS, step)
-    log_figures(loggers, run, step)
     logger.finalize("success")
 
 
@@ -45,7 +38,6 @@ def test_mlflow_keeps_curves_pictures_and_the_config_in_the_run(tmp_path, monkey
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "")  # and put back what MLflow writes there
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
-    write_figures(tmp_path)
     log_all(tmp_path, "mlflow", 0.5, 4)
     log_all(tmp_path / "other", "mlflow", 1.0, 4)
     log_all(tmp_path, "mlflow", 0.25, 8)  # the same run goes on
@@ -56,7 +48,7 @@ def test_mlflow_keeps_curves_pictures_and_the_config_in_the_run(tmp_path, monkey
     history = client.get_metric_history(run.info.run_id, "train/loss")
     assert [(m.step, m.value) for m in history] == [(4, 0.5), (8, 0.25)]
     pictures = sorted((tmp_path / "mlruns").rglob("images/*.png"))
-    assert {re.split("[+%]", path.name)[0] for path in pictures} == {"samples", "loss"}
+    assert {re.split("[+%]", path.name)[0] for path in pictures} == {"samples"}
     np.testing.assert_array_equal(np.round(255 * imread(pictures[0])[..., :3]), PIXELS)
 
 
@@ -65,7 +57,6 @@ def test_mlflow_keeps_curves_pictures_and_the_config_in_the_run(tmp_path, monkey
 def test_wandb_keeps_curves_pictures_and_the_config_offline(tmp_path, monkeypatch):
     wandb = pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
-    write_figures(tmp_path)
     log_all(tmp_path, "wandb", 0.5, 4)
     wandb.finish()
     log_all(tmp_path, "wandb", 0.25, 8)  # the same run goes on
@@ -73,7 +64,7 @@ def test_wandb_keeps_curves_pictures_and_the_config_offline(tmp_path, monkeypatc
     folders = [path for path in (tmp_path / "wandb").glob("offline-run-*-*") if path.is_dir()]
     assert len({path.name.rsplit("-", 1)[1] for path in folders}) == 1
     pictures = [*(tmp_path / "wandb").rglob("media/images/*.png")]
-    assert {path.name.split("_")[0] for path in pictures} == {"samples", "loss"}
+    assert {path.name.split("_")[0] for path in pictures} == {"samples"}
     np.testing.assert_array_equal(np.round(255 * imread(pictures[0])[..., :3]), PIXELS)
     content = b"".join(path.read_bytes() for path in (tmp_path / "wandb").rglob("*.wandb"))
     assert b"train/loss" in content
