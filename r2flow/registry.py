@@ -4,13 +4,12 @@ constructors' signatures.
 
 import difflib
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import is_dataclass
 from functools import cache, partial
 from importlib.resources import files
 from pkgutil import resolve_name
-from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, TypeVar
 
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
@@ -49,12 +48,9 @@ def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:
 
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
     """' Did you mean ...?' with the closest known name, or an empty string if there is none."""
-    others = [
-        other for other in known if other != name
-    ]  # a broken link is there under its own name
-    close = difflib.get_close_matches(name, others, n=1, cutoff=0.6) or [
-        o for o in others if o.startswith(name)
-    ]
+    others = [other for other in known if other != name]  # as a broken link
+    close = difflib.get_close_matches(name, others, n=1, cutoff=0.6)
+    close += [other for other in others if other.startswith(name)]
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
@@ -151,14 +147,12 @@ class Registry(Mapping[str, T]):
             raise InputError(
                 f"a {self.kind} config needs a 'name', found {given!r}; known: {known}."
             )
-        name = chosen["name"]
+        options = dict(chosen)
+        name = options["name"]
         if name in self._entries or name not in presets(self.kind):
-            return dict(chosen)
-        return {
-            **chosen,
-            **presets(self.kind)[name],
-            **{key: chosen[key] for key in chosen if key != "name"},
-        }
+            return options
+        preset = presets(self.kind)[name]
+        return {**preset, **options, "name": preset["name"]}
 
     def build(self, given: str | Mapping[str, Any], *args: Any) -> Any:
         """Call the entry of `options` with `args` and its options as keywords."""
@@ -182,10 +176,10 @@ def presets(group: str) -> dict[str, dict[str, Any]]:
 
     def merged(name: str) -> dict[str, Any]:
         options = dict(read[name])
-        bases = [base for base in options.pop("defaults", ()) if base in read]
-        return {
-            key: value for part in (*map(merged, bases), options) for key, value in part.items()
-        }
+        for base in options.pop("defaults", ()):
+            if base in read:
+                options = merged(base) | options
+        return options
 
     return {name: merged(name) for name in read}
 
@@ -209,9 +203,7 @@ def construct(
 ) -> T:
     """Call a constructor with `args` and checked options of a config; None: its defaults."""
     checked = check_options(what, constructor, options or {}, given=len(args))
-    with _in_one_line(
-        what, constructor, checked, len(args)
-    ):  # the constructor of an `options_class` checks too
+    with _in_one_line(what, constructor, checked, len(args)):  # a strict dataclass checks, too
         return constructor(*args, **checked)
 
 
@@ -260,23 +252,15 @@ def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[dict[str
     fields: dict[str, Any] = {}
     for name, parameter in _by_keyword(constructor, given).items():
         annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
-        fields[name] = (
-            Required[annotation]
-            if parameter.default is parameter.empty
-            else NotRequired[annotation]
-        )
+        required = parameter.default is parameter.empty
+        fields[name] = Required[annotation] if required else NotRequired[annotation]
     config = STRICT
-    if _takes_any(constructor):
+    kinds = [p.kind for p in inspect.signature(constructor).parameters.values()]
+    if inspect.Parameter.VAR_KEYWORD in kinds and not inspect.isclass(constructor):
         config = ConfigDict(**{**STRICT, "extra": "allow"})
     typed_dict: Any = TypedDict  # of fields that are known now alone
     schema: Any = with_config(config)(typed_dict("options", fields))
     return TypeAdapter(schema)
-
-
-def _takes_any(constructor: Callable[..., Any]) -> bool:
-    """Whether a function, not a class, takes any keyword."""
-    kinds = [p.kind for p in inspect.signature(constructor).parameters.values()]
-    return inspect.Parameter.VAR_KEYWORD in kinds and not inspect.isclass(constructor)
 
 
 def _first_problem(
@@ -286,14 +270,15 @@ def _first_problem(
     problem = error.errors(include_url=False)[0]
     if isinstance(own := problem.get("ctx", {}).get("error"), InputError):  # of a nested class
         return str(own)
-    *path, last = problem["loc"] or ("",)
+    option = ".".join(map(str, problem["loc"]))
     if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = _keys_below(constructor, given, path)
-        hint = did_you_mean(str(last), known)
-        option = ".".join(map(str, [*path, last]))
+        if len(problem["loc"]) > 1:
+            return f"no option '{option}'."
+        known = list(_by_keyword(constructor, given))
+        hint = did_you_mean(option, known)
         return f"no option '{option}'; it has {', '.join(known) or 'none'}.{hint}"
     if problem["type"] in ("missing", "missing_argument"):
-        return f"needs the option '{'.'.join(map(str, [*path, last]))}'."
+        return f"needs the option '{option}'."
     keys: list[str] = []
     for part in problem["loc"]:  # the rest are members of a union
         inside = part in options if isinstance(options, Mapping) else isinstance(part, int)
@@ -304,17 +289,3 @@ def _first_problem(
     words = problem["msg"].removeprefix("Value error, ")
     words = words.replace("an instance of Sequence", "a list")
     return f"{'.'.join(keys)}: {words[:1].lower()}{words[1:]}, found {problem['input']!r}."
-
-
-def _keys_below(
-    constructor: Callable[..., Any], given: int, path: Sequence[int | str]
-) -> list[str]:
-    """The options of a constructor, or of an options class that annotates one of them."""
-    parameters = _by_keyword(constructor, given)
-    for part in path:
-        annotation = parameters[str(part)].annotation if part in parameters else None
-        members = [annotation, *get_args(annotation)]
-        parameters = next(
-            (_by_keyword(one) for one in members if is_dataclass(one) and isinstance(one, type)), {}
-        )
-    return list(parameters)

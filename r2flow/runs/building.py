@@ -136,9 +136,8 @@ def build(
         stage: Stage = construct(
             f"stage '{run.stage['name']}'", stage_class, {**stage_options, **options}
         )
-        if stage.hparams["backbone"] is None and any(
-            key_of(text).partition(".")[0] == "backbone" for text in asked
-        ):
+        groups = {key_of(text).partition(".")[0] for text in asked}
+        if stage.hparams["backbone"] is None and "backbone" in groups:
             raise InputError(
                 f"stage={run.stage['name']} has its own network: leave the backbone out."
             )
@@ -146,13 +145,9 @@ def build(
         data.adopt(stage.item_format)
         trainer = _build_trainer(run, stage)
         data.share(trainer)  # refuses a batch that cannot be shared before there is a folder
-        complete = config_of(stage.hparams, data.hparams, run.stage["name"])
-        return Run(
-            {**config, **complete, "plugins": list(run.plugins) or loaded_plugins()},
-            stage,
-            data,
-            trainer,
-        )
+        complete = {**config, **config_of(stage.hparams, data.hparams, run.stage["name"])}
+        complete["plugins"] = list(run.plugins) or loaded_plugins()
+        return Run(complete, stage, data, trainer)
 
 
 def check(
@@ -178,10 +173,10 @@ def _given(
     keys = [key_of(text) for text in asked]
     for group in ("backbone", "sensor", "encoding"):
         if group not in keys:
-            own = {key.split(".")[1] for key in keys if key.startswith(f"{group}.")}
-            given[group] = {
-                key: value for key, value in (config[group] or {}).items() if key in own
-            } or None
+            options = config[group] or {}
+            asked_for = {key.split(".")[1] for key in keys if key.startswith(f"{group}.")}
+            own = {key: options[key] for key in options if key in asked_for}
+            given[group] = own or None
     return given
 
 
@@ -191,7 +186,8 @@ def _build_data(
     """The DataModule of a config, for the model's sensor and encoding."""
     data = dict(run.data)
     chosen = construct("data", DataOptions, data)
-    _refuse_unread(data["name"], [key_of(text) for text in asked])
+    keys = [key_of(text) for text in asked]
+    _refuse_unread(data["name"], keys)
     of_simulated = all(part.get("name") == SIMULATED for part in chosen.parts or [data])
     drawer = parent
     if data["name"] == PAIRS:
@@ -201,7 +197,7 @@ def _build_data(
     theirs = (drawer.config.get("data") or {}).get("reading") if drawer else None
     if data["name"] == PAIRS:
         for key, value in chosen.chosen.items():
-            given = {"data.reading", f"data.reading.{key}"} & {key_of(text) for text in asked}
+            given = {"data.reading", f"data.reading.{key}"}.intersection(keys)
             if given and value != (theirs or {}).get(key):
                 raise InputError(
                     f"data.reading.{key} is that of the flow that draws the pairs: leave it out."
@@ -216,16 +212,14 @@ def _build_data(
     encoding = dict(options["encoding"])
     if parent is None:
         encoding["reflectance"] = run.encoding.get("reflectance", True)  # `auto` looks at the scans
-    if "encoding.levels" not in map(key_of, asked):
+    if "encoding.levels" not in keys:
         encoding["levels"] = None  # those of the scans, else of the parent
     module = ScanDataModule(**data, sensor=options["sensor"], encoding=encoding, seed=run.seed)
     if module.encoding.levels is None:
         module.encoding.levels = options["encoding"].get("levels")
-    if module.pairs is not None:
-        assert parent is not None
-        assert drawer is not None
+    if parent and drawer and data["name"] == PAIRS:
         for group in ("sensor", "encoding"):
-            if drawer is not parent and drawer.config[group] != parent.config[group]:
+            if drawer.config[group] != parent.config[group]:
                 raise InputError(
                     f"data.pairs.of={module.pairs.of} has another {group} than {parent.path}."
                 )

@@ -53,10 +53,8 @@ def links_of(
         if parent is not None:
             own.append(override("stage.parent", str(Path(folder, parent))))
         # Overrides given for this link alone come last: they replace the link's own keys.
-        prefix = f"chain.{name}."
-        alone = [text.lstrip("+") for text in given]
-        alone = [text.removeprefix(prefix) for text in alone if text.startswith(prefix)]
-        alone = [text for text in alone if not text.startswith("parent=")]
+        prefix = re.compile(rf"\+*chain\.{re.escape(name)}\.(?!parent=)")
+        alone = [prefix.sub("", text, count=1) for text in given if prefix.match(text)]
         with naming(f"chain.{name}"):
             config = compose([*own, *alone], configs)
         on_pairs = config["data"]["name"] == "pairs" or STAGES[config["stage"]["name"]].needs_pairs
@@ -67,9 +65,8 @@ def links_of(
         if sets and not re.fullmatch("data='?simulated'?", sets[-1]):
             own = [text for text in own if key_of(text) != "data.scenes"]
         run_dir = Path(folder, name)
-        links.append(
-            Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent)
-        )
+        own += [*overrides, override("run_dir", str(run_dir))]
+        links.append(Link(name, run_dir, tuple(own), parent))
     return links
 
 
@@ -107,7 +104,6 @@ def train_links(links: Sequence[Link], folders: Sequence[str] = ()) -> int:
             print(
                 f"the chain stopped in {link.name}; the same command resumes there",
                 file=sys.stderr,
-                flush=True,
             )
             raise
         if not finished:

@@ -29,12 +29,8 @@ from r2flow.registry import did_you_mean, options_of
 T = TypeVar("T")
 
 CONF = Path(str(files("r2flow.conf")))
-WRONG = (
-    HydraException,
-    OmegaConfBaseException,
-    yaml.YAMLError,
-    UnicodeDecodeError,
-)  # raised for a wrong config
+# Raised for a wrong config.
+WRONG = (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError)
 
 # Hydra groups: the registry of each, and the options that other groups of the config set.
 REGISTRIES = {
@@ -149,14 +145,11 @@ def with_choices(compose: Callable[[], T]) -> T:
 
 def choices(group: str) -> list[str]:
     """Names of the choices of a group."""
-    if GlobalHydra.instance().is_initialized():  # knows `--config-dir`, too
-        return [
-            name
-            for name in GlobalHydra.instance().config_loader().get_group_options(group)
-            if name != "base"
-        ]
-    with _hydra():
-        return choices(group)
+    if not GlobalHydra.instance().is_initialized():  # it knows `--config-dir`, too
+        with _hydra():
+            return choices(group)
+    names = GlobalHydra.instance().config_loader().get_group_options(group)
+    return [name for name in names if name != "base"]
 
 
 def register_resolver(name: str, resolver: Callable[[str], str]) -> None:
@@ -179,9 +172,9 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     to the config, where it is null by default.
     """
     converted: list[str] = []
-    for text, parsed in zip(
-        overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True
-    ):
+    parser = OverridesParser.create()
+    for text in overrides:
+        parsed = parser.parse_override(text)
         key = parsed.key_or_group
         if key == "sensor" and str(parsed.value()).lower().endswith((".yaml", ".yml")):
             converted += _sensor_of_file(str(parsed.value()), overrides)
@@ -206,9 +199,9 @@ def _sensor_of_file(path: str, overrides: Sequence[str]) -> list[str]:
     from r2flow.lidar.sensors import options_of_sensor, read_sensor
 
     given = set(map(key_of, overrides))
-    options = options_of_sensor(read_sensor(path)).items()
+    options = options_of_sensor(read_sensor(path))
     return [
-        override(f"++sensor.{name}", value)
-        for name, value in options
+        override(f"++sensor.{name}", options[name])
+        for name in options
         if f"sensor.{name}" not in given
     ]

@@ -33,7 +33,8 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
     """Lock a run's folder for one process. The lock is released when its process ends, even if
     killed.
     """
-    path, holder = Path(run, ".lock"), Path(run, ".lock.holder")
+    path = Path(run, ".lock")
+    holder = Path(run, ".lock.holder")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = FileLock(path, timeout=patience).acquire(poll_interval=0.2)
@@ -100,25 +101,19 @@ def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) ->
     for leftover in Path(run, FOLDER).glob(".*.part") if locked else ():  # of killed writers
         leftover.unlink(missing_ok=True)
     old = read_config(run)
-    last = next((path for path, _ in _readable(run, RESUMED)), None)
+    last = next(_readable(run, RESUMED), None)
     if last is not None and old is None:
         raise InputError(
             f"{run} has checkpoints without their {CONFIG}: give name=OTHER stage.parent={last}."
         )
     if old is not None and last is not None:
         _refuse_another_config(run, old, config)
-        samplers = [
-            text for key, text in differences(old, config).items() if key.startswith("sampler.")
-        ]
-        if samplers and has_ended(run, last):
+        if old["sampler"] != config["sampler"] and has_ended(run, last):
             raise InputError(
-                f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the "
-                "setting, and draw with "
-                f"another sampler by r2flow sample {run} --sampler NAME --steps N."
+                f"{run} is finished and keeps its sampler, {old['sampler']}. Keep the setting, and "
+                f"draw with another sampler by r2flow sample {run} --sampler NAME --steps N."
             )
-    if locked and (
-        old != dict(config) or not Path(run, CONFIG).is_file()
-    ):  # free keys may have changed
+    if locked and old != dict(config):  # free keys may have changed
         write_file(Path(run, CONFIG), _text(config))
     return last
 
@@ -131,14 +126,15 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     if old is None or not checkpoints_of(run):
         return
     later = (
-        "scans.",
-        "stage.parent.",
-        "encoding.reflectance.",
-        "encoding.levels.",
-        "data.pairs.parent.",
+        "scans",
+        "stage.parent",
+        "encoding.reflectance",
+        "encoding.levels",
+        "data.pairs.parent",
     )
     there, here = (
-        {k: v for k, v in flatten(side) if not f"{k}.".startswith(later)} for side in (old, config)
+        {key: value for key, value in flatten(side) if not key.startswith(later)}
+        for side in (old, config)
     )
     _refuse_another_config(run, there, here, alone=False)
 
@@ -147,13 +143,11 @@ def _refuse_another_config(
     run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any], alone: bool = True
 ) -> None:
     if differing := contradictions(old, new):
-        length = alone and all(text.startswith("trainer.max_steps=") for text in differing)
-        last = next(
-            (path for path, _ in _readable(run)), run
-        )  # not the folder: the run may not be finished
-        more_steps = (
-            f", stage.parent={last} name=OTHER to learn on from its weights" if length else ""
-        )
+        more_steps = ""
+        if alone and all(text.startswith("trainer.max_steps=") for text in differing):
+            # Not the folder: the run may not be finished.
+            last = next(_readable(run), run)
+            more_steps = f", stage.parent={last} name=OTHER to learn on from its weights"
         raise InputError(
             f"{run} holds a run of another config: {at_most_three(differing)}. "
             f"Give the same settings and scans to resume it{more_steps}, or name=OTHER for a new "
@@ -164,7 +158,7 @@ def _refuse_another_config(
 RESUMED = (HYPER, NOTES, "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step")
 
 
-def _readable(run: str | Path, needed: Sequence[str] = ()) -> Iterator[tuple[Path, dict[str, Any]]]:
+def _readable(run: str | Path, needed: Sequence[str] = ()) -> Iterator[Path]:
     """The readable checkpoints that have the needed keys, newest first."""
     for path in checkpoints_of(run):
         try:
@@ -175,4 +169,4 @@ def _readable(run: str | Path, needed: Sequence[str] = ()) -> Iterator[tuple[Pat
         except InputError as error:
             log.warning("%s Passing it over.", error)
         else:
-            yield path, content
+            yield path

@@ -49,25 +49,18 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
     Arguments are Hydra's overrides and flags. `command` starts this program, for the processes of
     sweeps.
     """
-    os.environ["HYDRA_FULL_ERROR"] = (
-        "1"  # otherwise Hydra prints errors itself, over many lines, and exits with 1
-    )
+    # Otherwise Hydra prints errors itself, over many lines, and exits with 1.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
     codes: list[int] = []  # of jobs
     errors: list[Exception] = []
     # SLURM signals every process of a job: a run handles the signal, a chain waits for the run.
     ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
     try:
         with handling_signals(signal.SIG_IGN, ignored):
-            _run_hydra(
-                _parsed(_with_plugins(arguments, plugins) or ["experiment=demo"]),
-                command,
-                codes,
-                errors,
-            )
-            if errors:  # jobs have printed theirs
-                raise next(
-                    (error for error in errors if not isinstance(error, JobEnded)), errors[0]
-                )
+            parsed = _parsed(_with_plugins(arguments, plugins) or ["experiment=demo"])
+            _run_hydra(parsed, command, codes, errors)
+            if errors:  # jobs have printed theirs, and come last
+                raise min(errors, key=lambda error: isinstance(error, JobEnded))
             return max(codes, default=0)
     except SystemExit as end:
         if end.code:
@@ -92,13 +85,10 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
 def _with_plugins(arguments: Sequence[str], plugins: Sequence[str]) -> list[str]:
     """Load the plug-ins of a command line and collect them into one `plugins=[...]`."""
     given = [text for text in arguments if text.lstrip("+").startswith("plugins=")]
-    listed = [
-        name.strip(" '\"")
-        for text in given
-        for name in text.partition("=")[2].strip("[]").split(",")
-    ]
     others = [text for text in arguments if text not in given]
-    names = list(filter(None, [*plugins, *listed]))
+    names = list(plugins)
+    for text in given:
+        names += re.findall(r"[^\[\], '\"]+", text.partition("=")[2])
     if not names:
         return others
     load_plugins(names)
@@ -117,9 +107,8 @@ def _parsed(arguments: Sequence[str]) -> Namespace:
     parsed = parser.parse_intermixed_args(arguments)  # flags may stand between them
     if sum(map(bool, (parsed.run, parsed.multirun, parsed.cfg, parsed.info))) > 1:
         raise InputError("give one of --run, --multirun, --cfg and --info.")
-    for text in (
-        parsed.overrides if parsed.multirun or "hydra.mode=MULTIRUN" in parsed.overrides else ()
-    ):
+    sweeps = parsed.multirun or "hydra.mode=MULTIRUN" in parsed.overrides
+    for text in parsed.overrides if sweeps else ():
         # A sweep over several names is valid.
         if key_of(text) == "run_dir" or (key_of(text) == "name" and "," not in text):
             raise InputError(
@@ -137,9 +126,10 @@ def _run_hydra(
     """Run the command line's job, or those of its sweep; collects exit codes, and errors, which
     Hydra would print.
     """
-    folders = [os.path.abspath(parsed.config_dir)] if parsed.config_dir else []
-    for folder in folders:
-        command = [*command, "--config-dir", folder]
+    folders = []
+    if parsed.config_dir:
+        folders = [os.path.abspath(parsed.config_dir)]
+        command = [*command, "--config-dir", *folders]
     launcher = os.getpid()
     original = sys.argv
 
@@ -147,11 +137,9 @@ def _run_hydra(
         sys.argv = original  # Lightning starts the processes of other devices by it
         try:
             given = list(HydraConfig.get().overrides.task)
-            # Check the command line, not the overrides: a config file can make a sweeper add
-            # overrides.
-            if config["plugins"] and not any(
-                text.startswith("plugins=") for text in parsed.overrides
-            ):
+            # The command line, not the overrides: a config file can make a sweeper add overrides.
+            named_here = any(text.startswith("plugins=") for text in parsed.overrides)
+            if config["plugins"] and not named_here:
                 named = " ".join(f"--plugin {name}" for name in config["plugins"])
                 raise InputError(
                     f"plug-ins are named on the command line, never in a file: give {named}."
