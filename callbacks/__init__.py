@@ -1,10 +1,8 @@
 """Callbacks of a run, as part of the package r2flow."""
 
-from collections.abc import Mapping
-from typing import Any
-
 from lightning.pytorch.callbacks import Callback
 
+from r2flow.config import Options
 from r2flow.errors import InputError
 from r2flow.registry import Registry, construct
 
@@ -54,7 +52,7 @@ CALLBACKS: Registry[type[Callback]] = Registry(
 )
 
 
-def build_callbacks(options: Mapping[str, Any]) -> list[Callback]:
+def build_callbacks(options: Options) -> list[Callback]:
     """Build callbacks from the options of each, by its name in `CALLBACKS`; null disables one."""
     wanted = {name: given for name, given in options.items() if given is not None}
     for name in wanted:

@@ -12,6 +12,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+Options = Mapping[str, Any]  # plain values by name: a config, or a part of it
+Config = dict[str, Any]
+
 # May differ on resume, since they do not affect the result. data.pairs.parent identifies the flow
 # of data.pairs.of.
 FREE = {
@@ -91,7 +94,7 @@ def key_of(override: str) -> str:
     return override.lstrip("+~").partition("=")[0].partition("@")[0].replace("/", ".")
 
 
-def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(config: Options, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """('a.b', value) for every leaf of a nested mapping; groups in a list are numbered, 'a.0.b'."""
     for key, value in config.items():
         if _lists_groups(value):
@@ -107,9 +110,10 @@ def _lists_groups(value: Any) -> bool:
     return listed and all(isinstance(group, Mapping) for group in value)
 
 
-def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
+def differences(old: Options, new: Options) -> dict[str, str]:
     """Keys whose values differ between two configs, with a text of both values."""
-    before, now = dict(flatten(old)), dict(flatten(new))
+    before = dict(flatten(old))
+    now = dict(flatten(new))
     keys = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     return {
         key: f"{key}={_brief(before.get(key))} there, {_brief(now.get(key))} here" for key in keys
@@ -117,11 +121,8 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str
 
 
 def _brief(value: Any) -> str:
-    return (
-        f"a list of {len(value)}"
-        if isinstance(value, list | tuple) and len(value) > 6
-        else str(value)
-    )
+    long = isinstance(value, list | tuple) and len(value) > 6
+    return f"a list of {len(value)}" if long else str(value)
 
 
 def at_most_three(texts: Sequence[str]) -> str:
@@ -132,7 +133,7 @@ def at_most_three(texts: Sequence[str]) -> str:
 MOST = 10**6  # values of a config
 
 
-def check_tree(config: Mapping[str, Any]) -> None:
+def check_tree(config: Options) -> None:
     """Raise an error for a config that contains itself or one part too often, as YAML and pickles
     can, or whose groups are not groups.
     """
@@ -154,9 +155,9 @@ def _size(value: Any, known: dict[int, int]) -> int:
     return known[id(value)]
 
 
-def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def learned(config: Options, prefix: str = "") -> Config:
     """A config without its free keys: the settings that affect the result."""
-    fixed: dict[str, Any] = {}
+    fixed: Config = {}
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
             if inner := learned(value, f"{prefix}{key}."):

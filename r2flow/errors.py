@@ -94,7 +94,8 @@ def warn_odd(path: Path, kind: str, points: int = 0) -> None:
     """Warn about odd values of a file, once per folder and kind in a process; points in memory
     count as a folder.
     """
-    folder, name = path.parent, path
+    folder = path.parent
+    name = path
     if folder.name.startswith(IN_MEMORY):  # each scan has a new folder
         folder = name = Path(IN_MEMORY)
     if (folder, kind) not in _warned:

@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
+from r2flow.config import Config, Options
 from r2flow.errors import InputError
 
 T = TypeVar("T")
@@ -46,7 +47,7 @@ def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:
     return AfterValidator(validate)
 
 
-def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
+def did_you_mean(name: str, known: Options | list[str]) -> str:
     """' Did you mean ...?' with the closest known name, or an empty string if there is none."""
     others = [other for other in known if other != name]  # as a broken link
     close = difflib.get_close_matches(name, others, n=1, cutoff=0.6)
@@ -137,7 +138,7 @@ class Registry(Mapping[str, T]):
             None,
         )
 
-    def options(self, given: str | Mapping[str, Any]) -> dict[str, Any]:
+    def options(self, given: str | Options) -> Config:
         """Name and options of an entry, from a name, also of a file in conf/, or a mapping with a
         name and options.
         """
@@ -154,7 +155,7 @@ class Registry(Mapping[str, T]):
         preset = presets(self.kind)[name]
         return {**preset, **options, "name": preset["name"]}
 
-    def build(self, given: str | Mapping[str, Any], *args: Any) -> Any:
+    def build(self, given: str | Options, *args: Any) -> Any:
         """Call the entry of `options` with `args` and its options as keywords."""
         chosen = self.options(given)
         name = chosen.pop("name")
@@ -163,18 +164,18 @@ class Registry(Mapping[str, T]):
 
 
 @cache
-def presets(group: str) -> dict[str, dict[str, Any]]:
+def presets(group: str) -> dict[str, Config]:
     """Options of each file of a folder of conf/, by its name, with those of the files in its
     `defaults`.
     """
     folder = files("r2flow.conf") / group
-    read: dict[str, Any] = {}
+    read: Config = {}
     for file in folder.iterdir() if folder.is_dir() else ():
         if file.name.endswith(".yaml"):
             content = OmegaConf.create(file.read_text(encoding="utf-8"))
             read[file.name.removesuffix(".yaml")] = OmegaConf.to_container(content)
 
-    def merged(name: str) -> dict[str, Any]:
+    def merged(name: str) -> Config:
         options = dict(read[name])
         for base in options.pop("defaults", ()):
             if base in read:
@@ -185,8 +186,8 @@ def presets(group: str) -> dict[str, dict[str, Any]]:
 
 
 def check_options(
-    what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0
-) -> dict[str, Any]:
+    what: str, constructor: Callable[..., Any], options: Options, given: int = 0
+) -> Config:
     """Options as a constructor takes them that has `given` further arguments by position.
 
     Raises:
@@ -198,9 +199,7 @@ def check_options(
         return _schema(constructor, given).validate_python(dict(options))
 
 
-def construct(
-    what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any
-) -> T:
+def construct(what: str, constructor: Callable[..., T], options: Options | None, *args: Any) -> T:
     """Call a constructor with `args` and checked options of a config; None: its defaults."""
     checked = check_options(what, constructor, options or {}, given=len(args))
     with _in_one_line(what, constructor, checked, len(args)):  # a strict dataclass checks, too
@@ -218,7 +217,7 @@ def _in_one_line(
         raise InputError(f"{what}: {_first_problem(error, options, constructor, given)}") from None
 
 
-def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
+def options_of(constructor: Callable[..., Any], given: int = 0) -> Config:
     """Keyword options of a constructor, after `given` positional ones, with their defaults;
     `MISSING` without one.
     """
@@ -248,8 +247,8 @@ def _by_keyword(constructor: Callable[..., Any], given: int = 0) -> dict[str, in
 
 
 @cache
-def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[dict[str, Any]]:
-    fields: dict[str, Any] = {}
+def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[Config]:
+    fields: Config = {}
     for name, parameter in _by_keyword(constructor, given).items():
         annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
         required = parameter.default is parameter.empty

@@ -27,7 +27,7 @@ from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from r2flow.config import at_most_three, differences
+from r2flow.config import Config, Options, at_most_three, differences
 from r2flow.errors import InputError
 from r2flow.files import read_json, write_file
 from r2flow.hashing import state_hash
@@ -57,10 +57,10 @@ class Store:
 
     option = "--out FOLDER"  # in messages: how a user gives another folder
 
-    def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any]) -> None:
+    def __init__(self, folder: str | Path, kind: str, recipe: Options) -> None:
         self.folder = Path(folder).expanduser()
         self.kind = kind
-        self.described: dict[str, Any] = json.loads(json.dumps(recipe))
+        self.described: Config = json.loads(json.dumps(recipe))
         self.digest = checksum(self.described)
 
     def files(self, item: int) -> list[Path]:
@@ -119,7 +119,7 @@ class Store:
         return [item for item in items if not self.has(item)]
 
     def write(
-        self, item: int, tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None
+        self, item: int, tensors: Mapping[str, np.ndarray], notes: Options | None = None
     ) -> None:
         """Write an item; it then counts as made."""
         note = {
@@ -134,7 +134,7 @@ class Store:
         stored = {name: np.asarray(value, order="C") for name, value in tensors.items()}
         write_file(path, save(stored, metadata={"r2flow": json.dumps(note)}))
 
-    def read(self, item: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def read(self, item: int) -> tuple[dict[str, np.ndarray], Config]:
         """Read tensors and notes of an item and verify its checksum.
 
         Raises `FileNotFoundError`, `Damaged`, or `InputError` if the item has another recipe.
@@ -145,13 +145,13 @@ class Store:
                 raise Damaged("its checksum differs")
             return tensors, note["notes"]
 
-    def head(self, item: int) -> dict[str, Any]:
+    def head(self, item: int) -> Config:
         """Read the notes of an item; raises the exceptions of `read`."""
         with self._opened(item) as (_, note):
             return dict(note["notes"])
 
     @contextmanager
-    def _opened(self, item: int) -> Iterator[tuple[Any, dict[str, Any]]]:
+    def _opened(self, item: int) -> Iterator[tuple[Any, Config]]:
         (path,) = self.files(item)
         if not path.is_file():
             raise FileNotFoundError(path)
@@ -249,7 +249,7 @@ class FileStore(Store):
     """
 
     def __init__(
-        self, folder: str | Path, kind: str, recipe: Mapping[str, Any], endings: Sequence[str]
+        self, folder: str | Path, kind: str, recipe: Options, endings: Sequence[str]
     ) -> None:
         super().__init__(folder, kind, recipe)
         self.endings = endings
@@ -261,11 +261,11 @@ class FileStore(Store):
         return all(file.is_file() for file in self.files(item))
 
 
-def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
+def read_manifest(folder: Path, kind: str | None = None) -> Config:
     """Read and verify the manifest of a folder."""
     path = folder / MANIFEST
     try:
-        content: dict[str, Any] = read_json(path)
+        content: Config = read_json(path)
         if "checksum" not in content:  # a common name: of a data set, say
             raise _Foreign(f"{path} is damaged, or not of r2flow: give another folder.")
         format_name, _ = content["format"], content["recipe"]
@@ -286,7 +286,7 @@ def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
     return content
 
 
-def manifest_of(folder: str | Path) -> dict[str, Any]:
+def manifest_of(folder: str | Path) -> Config:
     """The manifest that r2flow wrote in a folder; empty if there is none."""
     try:
         return read_manifest(Path(folder).expanduser())

@@ -1,6 +1,5 @@
 """Networks v(t, x) and u(x, t, s) by name, and their configurations in conf/backbone."""
 
-from collections.abc import Mapping
 from typing import Any
 
 from torch import Tensor
@@ -10,6 +9,7 @@ from r2flow.backbones.base import Backbone
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
+from r2flow.config import Config, Options
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.registry import Registry, presets
@@ -18,7 +18,7 @@ from r2flow.registry import Registry, presets
 class _Backbones(Registry[type[Backbone]]):
     def build(  # type: ignore[override]
         self,
-        options: str | Mapping[str, Any],
+        options: str | Options,
         rays: Tensor | None = None,
         *,
         shape: tuple[int, int, int] | None = None,
@@ -43,7 +43,7 @@ BACKBONES = _Backbones(
 
 
 def build_backbone(
-    options: Mapping[str, Any] | None,
+    options: Options | None,
     rays: Tensor,
     in_channels: int,
     out_channels: int | None = None,
@@ -60,7 +60,7 @@ def build_backbone(
         raise InputError(
             "stage.parent names a run without a backbone: leave it out, or name a flow."
         )
-    given: dict[str, Any] = {
+    given: Config = {
         "in_channels": in_channels,
         "out_channels": out_channels or in_channels,
     }
@@ -69,7 +69,7 @@ def build_backbone(
     return BACKBONES.build(options, rays, **given)
 
 
-def configurations() -> Registry[dict[str, Any]]:
+def configurations() -> Registry[Config]:
     """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of backbones without a
     file.
     """

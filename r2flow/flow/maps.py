@@ -7,13 +7,14 @@ derivatives.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from r2flow.config import Options
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.solvers.fixed import build_grid
@@ -56,7 +57,7 @@ class JumpTimes:
         share: Portion = 0.55,
         diagonal: Portion = 0.55,
         ends: Portion = 0.0,
-        time: Mapping[str, Any] | None = None,
+        time: Options | None = None,
     ) -> None:
         if diagonal + ends > 1:
             raise InputError(f"diagonal + ends must be at most 1; found {diagonal}, {ends}.")

@@ -5,12 +5,13 @@ the time of image k depends on k alone.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any
+from collections.abc import Callable
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
+from r2flow.config import Options
 from r2flow.errors import InputError
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.registry import Bound, Count, Portion, Positive, Registry
@@ -122,7 +123,7 @@ TIMES: Registry[Callable[..., _TimeDensity]] = Registry(
 )
 
 
-def build_density(config: Mapping[str, Any]) -> _TimeDensity:
+def build_density(config: Options) -> _TimeDensity:
     """Build a density of `TIMES`; InputError: it maps uniform numbers in [0, 1) to others than
     times, as p(t) does.
     """

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
+from r2flow.config import Config
 from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import wide
 from r2flow.lidar.encoding import ModelSpace
@@ -105,7 +106,7 @@ class Generator(nn.Module):
         self.few = few
         self.fixed = fixed
 
-    def drawing(self) -> dict[str, Any]:
+    def drawing(self) -> Config:
         """The default samplers as plain values, as stored in a checkpoint."""
         few = self.few and self.few.asdict()
         return {"sampler": self.sampler.asdict(), "few": few, "fixed": self.fixed}

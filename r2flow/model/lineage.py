@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.backbones import BACKBONES
+from r2flow.config import Config, Options
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
@@ -28,12 +29,12 @@ DEFAULT_GENERATOR = "rectified_flow"
 class Parent:
     """The model that a stage starts from, or only its config if it has not been trained yet."""
 
-    config: Mapping[str, Any]
+    config: Options
     path: Path
     step: int = 0
     checkpoint: Checkpoint | None = None
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> Config:
         """Identity of the parent as plain values, as stored in the checkpoints of its children.
 
         `weights` is the hash of its averaged weights; `first_pair` the first pair whose noise it
@@ -68,11 +69,11 @@ def find_parent(name: "str | Path | Parent") -> Parent:
 
 
 def model_options(
-    given: Mapping[str, Any],
+    given: Options,
     parent: Parent | None,
     generator_name: str | None,
     on_pairs: bool = False,
-) -> dict[str, Any]:
+) -> Config:
     """Complete options of a model: `backbone`, `sensor`, `encoding` and `generator`, as plain
     values.
 
@@ -98,7 +99,7 @@ def model_options(
     encoding = given.get("encoding")
     generator = _generator(given.get("generator"), theirs.get("generator"), generator_name)
     backbone = given.get("backbone")
-    options: dict[str, Any]
+    options: Config
     if parent is None:
         options = {
             "backbone": BACKBONES.options(backbone or DEFAULT_BACKBONE),
@@ -112,23 +113,20 @@ def model_options(
             "encoding": _changed(theirs["encoding"], encoding, encoding_options),
         }
         if options["encoding"]["reflectance"] == AUTO:
-            options["encoding"] = {
-                **options["encoding"],
-                "reflectance": theirs["encoding"]["reflectance"],
-            }
+            options["encoding"]["reflectance"] = theirs["encoding"]["reflectance"]
         free: dict[str, tuple[str, ...]] = {"backbone": FREE_BACKBONE, "encoding": ("levels",)}
         if on_pairs:
             free["sensor"] = ("reflectance_scale",)
         for group, keys in free.items():
             _refuse_other(group, options[group], theirs[group], keys, parent.path)
     if options["encoding"]["reflectance"] == AUTO:
-        options["encoding"] = {**options["encoding"], "reflectance": True}
+        options["encoding"]["reflectance"] = True
     return {**options, "generator": generator}
 
 
 def _changed(
-    theirs: Mapping[str, Any] | None, given: Any, complete: Callable[[Any], dict[str, Any]]
-) -> dict[str, Any] | None:
+    theirs: Options | None, given: Any, complete: Callable[[Any], Config]
+) -> Config | None:
     """The parent's options of a group with those given; a name stands for all options."""
     if given is None:
         return None if theirs is None else dict(theirs)
@@ -150,9 +148,7 @@ def _refuse_other(group: str, ours: Any, theirs: Any, free: tuple[str, ...], pat
             )
 
 
-def _generator(
-    given: str | Mapping[str, Any] | None, theirs: Mapping[str, Any] | None, of_stage: str | None
-) -> dict[str, Any]:
+def _generator(given: str | Options | None, theirs: Options | None, of_stage: str | None) -> Config:
     """The generator given, else the stage's, else the parent's, or what the parent's is fine-tuned
     as.
 
@@ -163,7 +159,7 @@ def _generator(
     parental = theirs or {"name": DEFAULT_GENERATOR}
     chosen = of_stage or GENERATORS[parental["name"]].finetuned_as or parental["name"]
     shared = options_of(GENERATORS[chosen], given=2)
-    return {"name": chosen, **{key: value for key, value in parental.items() if key in shared}}
+    return {"name": chosen} | {key: parental[key] for key in parental if key in shared}
 
 
 def plain(value: Any) -> Any:

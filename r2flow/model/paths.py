@@ -24,12 +24,12 @@ def step_of(path: Path) -> int:
 
 def checkpoints_of(run: str | Path) -> list[Path]:
     """The checkpoints of a run folder, the latest first."""
-    paths = [
-        path
-        for path in Path(run, FOLDER).glob("step-*.ckpt")
-        if path.is_file() and not path.is_symlink()
-    ]
-    return sorted(paths, key=step_of, reverse=True)
+    return _latest_first(Path(run, FOLDER))
+
+
+def _latest_first(folder: Path) -> list[Path]:
+    paths = [path for path in folder.glob("step-*.ckpt") if not path.is_symlink()]
+    return sorted(filter(Path.is_file, paths), key=step_of, reverse=True)
 
 
 def find_checkpoint(path: str | Path) -> Path:
@@ -38,12 +38,11 @@ def find_checkpoint(path: str | Path) -> Path:
 
     A file or a run in the current folder takes precedence over a model of the same name.
     """
-    name, path = str(path).rstrip("/"), Path(path).expanduser()
+    name = str(path).rstrip("/")
+    path = Path(path).expanduser()
     if path.is_file():
         return path
-    checkpoints = checkpoints_of(path) or sorted(
-        path.glob("step-*.ckpt"), key=step_of, reverse=True
-    )
+    checkpoints = checkpoints_of(path) or _latest_first(path)
     if checkpoints:
         return checkpoints[0]
     if name in MODELS and (path.is_dir() or not path.exists()):
@@ -55,11 +54,7 @@ def find_checkpoint(path: str | Path) -> Path:
     hint += did_you_mean(path.name, known)
     if path.is_dir():
         problem = f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt)."
-        runs = sorted(
-            str(folder.parent)
-            for folder in path.glob(f"*/{FOLDER}")
-            if checkpoints_of(folder.parent)
-        )
+        runs = sorted(str(run) for run in path.glob("*/") if checkpoints_of(run))
         hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
     elif path.exists():  # reading a pipe would block
         problem = f"{path} is not a regular file."

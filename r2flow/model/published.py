@@ -11,15 +11,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from r2flow.config import Config, Options
 from r2flow.registry import Registry, lazy
 
-ARCHITECTURES = Registry(
-    "published architecture",
-    nat_hdit="hdit",
-    hdit="hdit",
-    adm_unet="adm_unet",
-    efficient_unet="efficient_unet",
-)
 BACKBONE = "backbone."  # prefix of a flow's network in the generator
 
 
@@ -32,7 +26,7 @@ class Published:
     ]  # config for `r2flow.generators.build_generator`; the file's config is under `published`
     weights: dict[str, Tensor]  # the generator's weights by r2flow's names
     step: int = 0  # optimiser steps taken
-    sampler: Mapping[str, Any] | None = (
+    sampler: Options | None = (
         None  # published sampler, name and fields; None: the generator's default
     )
     elevations: Tensor | None = (
@@ -62,44 +56,39 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """Read a published R2Flow checkpoint, which has averaged weights only; a k-TD draws in its k
     Euler steps.
     """
-    cfg, weights = (
-        content["cfg"],
-        {BACKBONE + name: value for name, value in content["weights"].items()},
-    )
-    step = int(content.get("num_images", 0)) // max(
-        int(cfg.get("training", {}).get("batch_size", 1)), 1
-    )
+    cfg = content["cfg"]
+    weights = {BACKBONE + name: value for name, value in content["weights"].items()}
+    batch_size = int(cfg.get("training", {}).get("batch_size", 1))
+    step = int(content.get("num_images", 0)) // max(batch_size, 1)
     config = published_config(cfg)
     k = config["stage"].get("steps")  # None: not distilled
-    return Published(
-        config,
-        weights,
-        step,
-        {"name": "euler", "steps": k},
-        rings_of(config, weights),
-        k is not None,
-    )
+    sampler = {"name": "euler", "steps": k}
+    return Published(config, weights, step, sampler, rings_of(config, weights), k is not None)
 
 
-def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -> dict[str, Any]:
+def sensor_of(name: str, resolution: Sequence[int], limits: Options) -> Config:
     """Sensor config from the published image size and range limits in metres."""
     rows, columns = (int(n) for n in resolution)
     near, far = (float(limits[name]) for name in ("min_depth", "max_depth"))
     return {"name": name, "rows": rows, "columns": columns, "min_range": near, "max_range": far}
 
 
-def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
+def published_config(cfg: Options) -> Config:
     """Convert a published checkpoint's `cfg` (data, model, flow, training, finetuning) to an r2flow
     config.
     """
-    data, model = cfg["data"], cfg["model"]
-    tuning = cfg.get("finetuning") or {}  # empty: of an older file, which does not say its stage
-    k, name = tuning.get("k_distil"), "reflow" if tuning.get("init_ckpt") else "rectify"
+    data = cfg["data"]
+    tuning = cfg.get("finetuning")
+    stage = {}  # of an older file, which does not say it
+    if tuning:
+        stage = {"name": "reflow" if tuning.get("init_ckpt") else "rectify"}
+        if k := tuning.get("k_distil"):
+            stage = {"name": "distill", "steps": k}
     return {
-        "stage": {"name": "distill", "steps": k} if k else {"name": name} if tuning else {},
+        "stage": stage,
         "sensor": {**sensor_of("hdl64e", data["resolution"], data), "rays": "reference"},
         "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
-        "backbone": backbone_of(model),
+        "backbone": backbone_of(cfg["model"]),
         "data": {
             "name": data["dataset"],
             "reading": {
@@ -111,11 +100,12 @@ def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def backbone_of(model: Mapping[str, Any]) -> dict[str, Any]:
+def backbone_of(model: Options) -> Config:
     """Backbone options from a published config's `model`."""
-    heads, blocks = model["attn_num_heads"], model["num_residual_blocks"]
+    heads = model["attn_num_heads"]
+    blocks = model["num_residual_blocks"]
     common = {
-        "name": ARCHITECTURES[str(model["architecture"])],
+        "name": str(model["architecture"]).removeprefix("nat_"),
         "base_channels": model["base_channels"],
         "time_channels": model["temb_channels"],
         "position": model["coords_encoding"],
@@ -135,7 +125,7 @@ def backbone_of(model: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def rings_of(config: Mapping[str, Any], weights: Mapping[str, Tensor]) -> Tensor | None:
+def rings_of(config: Options, weights: Mapping[str, Tensor]) -> Tensor | None:
     """The elevations of the rows of unfolded scans, from the weights' `coords`, (1, 2, H, W)."""
     unfolded = config["data"]["reading"]["projection"] == "unfolding"
     return weights[BACKBONE + "coords"][0, 0, :, 0] if unfolded else None

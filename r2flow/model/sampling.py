@@ -70,31 +70,21 @@ def sample(
             generator cannot be cropped to.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    if not (
-        isinstance(num, Integral)
-        and isinstance(batch_size, Integral)
-        and num >= 1
-        and batch_size >= 1
-    ):
-        raise InputError(
-            f"needs at least one scan and a batch of at least one; found {num!r} and "
-            f"{batch_size!r}."
-        )
-    chosen = (
-        sampler.changed(**changes)
-        if isinstance(sampler, Sampler)
-        else generator.choose(sampler, **changes)
-    )
+    for count in (num, batch_size):
+        if not isinstance(count, Integral) or count < 1:
+            raise InputError(f"needs whole numbers of scans, at least one; found {count!r}.")
+    if isinstance(sampler, Sampler):
+        sampler = sampler.changed(**changes)
+    else:
+        sampler = generator.choose(sampler, **changes)
     for name, value in (condition or {}).items():
         check(
             len(value) == num, f"the condition's {name} has {len(value)} scans, but num is {num}."
         )
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
-        batch_condition = condition and {
-            name: value[first : numbers.stop] for name, value in condition.items()
-        }
-        drawn = draw(generator, numbers, seed, chosen, batch_condition, region, precision, progress)
+        part = condition and {n: value[first : numbers.stop] for n, value in condition.items()}
+        drawn = draw(generator, numbers, seed, sampler, part, region, precision, progress)
         warn_unsolved(drawn.converged, first)
         yield drawn
 
@@ -113,12 +103,15 @@ def draw(
     """Draw the scans of these numbers as one batch (see `sample`); all generated images come from
     this function.
     """
-    draws, space = Draws(seed, numbers), generator.space
+    draws = Draws(seed, numbers)
     noise = draws.start(generator.noise_shape)
-    evaluated = None if region is None or region.share == 1 else evaluated_region(generator, region)
-    if evaluated is not None:
-        whole = space.shape[1:]
-        generator, noise = generator.part(evaluated), evaluated.crop(noise)
+    if region is not None and region.share == 1:
+        region = None
+    if region is not None:
+        evaluated = evaluated_region(generator, region)
+        whole = generator.space.shape[1:]
+        generator = generator.part(evaluated)
+        noise = evaluated.crop(noise)
         condition = condition and {
             n: evaluated.crop(x) if x.shape[-2:] == whole else x for n, x in condition.items()
         }
@@ -129,7 +122,7 @@ def draw(
     x_1 = generated.x.cpu()  # also synchronises the GPU
     seconds = time.perf_counter() - start
     images = generator.space.decode(x_1)
-    if region is not None and evaluated is not None:
+    if region is not None:
         images = region.place(region.crop(evaluated.place(images)))
     return Samples(
         images, numbers[0], generated.evaluations.cpu(), generated.converged.cpu(), seconds
@@ -138,14 +131,13 @@ def draw(
 
 def warn_unsolved(converged: Tensor, first: int = 0, of: str = "") -> None:
     """Warn about unconverged scans; `first` is the number of the first scan, `of` says of what."""
-    if lost := [
-        str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved
-    ]:
+    if not converged.all():
+        lost = (first + (~converged).nonzero()[:, 0]).tolist()
         log.warning(
             "not solved, so no scans of this flow: %s%s; try another solver, or for a velocity "
             "that is singular at t = "
             "1 a last step before it: --sampler adams3:finish=0.001.",
-            ", ".join(lost), of,
+            ", ".join(map(str, lost)), of,
         )  # fmt: skip
 
 
@@ -153,6 +145,5 @@ def evaluated_region(generator: Generator, region: Region) -> Region:
     """The region plus its margin, rounded outward to the generator's units; the whole image for the
     whole image.
     """
-    return region.widened(
-        generator.unit if region.share < 1 else (1, 1)
-    )  # every generator has the whole image
+    # Every generator has the whole image.
+    return region.widened(generator.unit if region.share < 1 else (1, 1))

@@ -41,34 +41,26 @@ def save_checkpoint(checkpoint: "Checkpoint", path: str | Path, half: bool = Fal
     """
     path = Path(path)
     check(path.suffix == ".safetensors", f"{path}: a checkpoint is written as .safetensors.")
-    moved = checkpoint.sensor != build_space(checkpoint.config).sensor
     check(
-        not moved,
+        checkpoint.sensor == build_space(checkpoint.config).sensor,
         f"{path}: a file keeps the sensor of training alone: save the model before `through`.",
     )
-    state, parameters = checkpoint.generator.state_dict(), checkpoint.generator.named_parameters()
     weights = {
-        n.replace(COMPILED, ""): value.detach().cpu().contiguous().clone()
-        for n, value in state.items()
+        name.replace(COMPILED, ""): value.detach().cpu().contiguous().clone()
+        for name, value in checkpoint.generator.state_dict().items()
     }
-    if half:
-        large = [
-            n.replace(COMPILED, "")
-            for n, value in parameters
-            if value.ndim > 1 and value.numel() > SMALL
-        ]
-        weights |= {n: weights[n].half() for n in large}
-        finite = all(weights[n].isfinite().all() for n in large)
-        check(
-            finite, f"{path}: weights beyond 65504 do not fit into float16: save them without half."
-        )
-    plugins = [Path(name).name for name in checkpoint.config.get("plugins") or ()]
-    config = learned(checkpoint.config) | ({"plugins": plugins} if plugins else {})
+    for name, value in checkpoint.generator.named_parameters() if half else ():
+        if value.ndim > 1 and value.numel() > SMALL:
+            rounded = value.detach().cpu().half()
+            check(
+                rounded.isfinite().all(),
+                f"{path}: weights beyond 65504 do not fit into float16: save them without half.",
+            )
+            weights[name.replace(COMPILED, "")] = rounded
+    config = learned(checkpoint.config)
+    if plugins := checkpoint.config.get("plugins"):
+        config["plugins"] = [Path(name).name for name in plugins]
     notes = {"config": config, "step": checkpoint.step, **checkpoint.generator.drawing()}
+    notes["digest"] = state_hash(weights, notes)
     # Under one key, since the order of several metadata keys is not fixed.
-    write_file(
-        path,
-        save(
-            weights, metadata={NOTES: json.dumps({**notes, "digest": state_hash(weights, notes)})}
-        ),
-    )
+    write_file(path, save(weights, metadata={NOTES: json.dumps(notes)}))

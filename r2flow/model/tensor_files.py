@@ -68,8 +68,9 @@ def _check_archive(file: IO[bytes], name: object) -> None:
         file.seek(0)
         return
     entries = archive.infolist()
-    packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
-    if packed or sum(entry.file_size for entry in entries) > file.seek(0, os.SEEK_END):
+    if sum(entry.file_size for entry in entries) > file.seek(0, os.SEEK_END) or any(
+        entry.compress_type for entry in entries
+    ):
         raise InputError(
             f"{name} holds compressed tensors, which torch never writes. Ask its author for "
             "another file."

@@ -17,7 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from r2flow.callbacks import Progress, SamplePictures, build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.loggers import LOGGERS, LearningRates
-from r2flow.config import key_of
+from r2flow.config import Config, Options, key_of
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions
 from r2flow.errors import InputError, naming, one_line
@@ -41,7 +41,7 @@ EXPECTED_WARNINGS = (
     ".*your dataloader is not resumable.*",  # it resumes by the trainer's step
 )
 
-Named = Annotated[Mapping[str, Any], Bound("a group with a name", lambda group: "name" in group)]
+Named = Annotated[Options, Bound("a group with a name", lambda group: "name" in group)]
 InRuns = Annotated[
     str, Bound("a folder in runs", lambda name: name.strip("./") and ".." not in Path(name).parts)
 ]
@@ -63,21 +63,21 @@ class RunConfig:
     """
 
     stage: Named  # class of `STAGES`, with its options
-    backbone: Mapping[str, Any] | None  # the following four: as in `Stage`
-    sensor: Mapping[str, Any]
-    encoding: Mapping[str, Any]
+    backbone: Options | None  # the following four: as in `Stage`
+    sensor: Options
+    encoding: Options
     data: Named  # `ScanDataModule`
-    trainer: Mapping[str, Any]  # Lightning's Trainer
-    callbacks: Mapping[str, Mapping[str, Any] | None]  # classes of `CALLBACKS`
+    trainer: Options  # Lightning's Trainer
+    callbacks: Mapping[str, Options | None]  # classes of `CALLBACKS`
     samples: SampleOptions
     run_dir: Annotated[str, Bound("a folder", lambda name: name.strip("/ "))]
     seed: Seed
     name: InRuns | int | float = "run"
     experiment: str | Sequence[str] | None = None
-    generator: Mapping[str, Any] | str | None = None
-    sampler: Mapping[str, Any] | None = None
-    few: Mapping[str, Any] | None = None
-    chain: Mapping[str, Any] | None = None
+    generator: Options | str | None = None
+    sampler: Options | None = None
+    few: Options | None = None
+    chain: Options | None = None
     preview: str | None = None
     loggers: Sequence[str] | None = None
     plugins: Sequence[str] = ()
@@ -88,7 +88,7 @@ class RunConfig:
 class Run:
     """A run, ready to be fitted."""
 
-    config: dict[str, Any]  #: the complete config, including values from the parent and the data
+    config: Config  #: the complete config, including values from the parent and the data
     stage: Stage  #: the LightningModule, with initial weights
     data: ScanDataModule  #: the DataModule; no scans have been read yet
     trainer: L.Trainer  #: Lightning's Trainer, with callbacks and loggers
@@ -99,9 +99,7 @@ class Run:
         return Path(self.config["run_dir"])
 
 
-def build(
-    config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None
-) -> Run:
+def build(config: Options, asked: Sequence[str] = (), parent: Parent | None = None) -> Run:
     """Build the stage, the data and the Trainer of a config; scans are listed, not read.
 
     Args:
@@ -150,9 +148,7 @@ def build(
         return Run(complete, stage, data, trainer)
 
 
-def check(
-    config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None
-) -> dict[str, Any]:
+def check(config: Options, asked: Sequence[str] = (), parent: Parent | None = None) -> Config:
     """Check a config by building its run; no files are written.
 
     The result is completed with values of its parent; `parent` is one that has not been trained
@@ -163,9 +159,7 @@ def check(
     return run.config
 
 
-def _given(
-    config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None
-) -> dict[str, Any]:
+def _given(config: Options, asked: Sequence[str], parent: Parent | None) -> Config:
     """Options of the model; next to a parent's, only those of the command line."""
     given = {group: config.get(group) for group in MODEL}
     if parent is None:
@@ -181,7 +175,7 @@ def _given(
 
 
 def _build_data(
-    run: RunConfig, options: Mapping[str, Any], asked: Sequence[str], parent: Parent | None
+    run: RunConfig, options: Options, asked: Sequence[str], parent: Parent | None
 ) -> ScanDataModule:
     """The DataModule of a config, for the model's sensor and encoding."""
     data = dict(run.data)
@@ -217,7 +211,7 @@ def _build_data(
     module = ScanDataModule(**data, sensor=options["sensor"], encoding=encoding, seed=run.seed)
     if module.encoding.levels is None:
         module.encoding.levels = options["encoding"].get("levels")
-    if parent and drawer and data["name"] == PAIRS:
+    if parent and drawer and module.pairs:
         for group in ("sensor", "encoding"):
             if drawer.config[group] != parent.config[group]:
                 raise InputError(
@@ -290,7 +284,7 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
     return trainer
 
 
-def _callbacks(run: RunConfig, stage: Stage, options: dict[str, Any]) -> list[L.Callback]:
+def _callbacks(run: RunConfig, stage: Stage, options: Config) -> list[L.Callback]:
     """The callbacks of a config; `options` of the Trainer may leave some out."""
     callbacks: list[L.Callback] = [Progress()]
     if not options["fast_dev_run"]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2flow.config import flatten, key_of, links_of_key, override
+from r2flow.config import Config, Options, flatten, key_of, links_of_key, override
 from r2flow.errors import InputError, naming
 from r2flow.model.lineage import Parent
 from r2flow.model.paths import FOLDER
@@ -28,7 +28,7 @@ class Link:
 
 
 def links_of(
-    chain: Mapping[str, Any], folder: Path, given: Sequence[str], configs: Sequence[str] = ()
+    chain: Options, folder: Path, given: Sequence[str], configs: Sequence[str] = ()
 ) -> list[Link]:
     """The runs of a chain in the order of their parents; `parent` names a link's parent.
 
@@ -113,7 +113,7 @@ def train_links(links: Sequence[Link], folders: Sequence[str] = ()) -> int:
 
 def check_links(links: Sequence[Link], folders: Sequence[str] = ()) -> None:
     """Build all links before the first one is trained, so that errors are reported early."""
-    configs: dict[str, Any] = {}
+    configs: Config = {}
     for link in links:
         parent = None
         if link.parent is not None:

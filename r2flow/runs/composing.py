@@ -22,7 +22,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from r2flow.config import key_of, override
+from r2flow.config import Config, key_of, override
 from r2flow.errors import InputError
 from r2flow.registry import did_you_mean, options_of
 
@@ -45,7 +45,7 @@ REGISTRIES = {
 }
 
 
-def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -> dict[str, Any]:
+def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -> Config:
     """Compose the config of a command line, as plain dicts: `compose(["data=kitti_raw",
     "data.root=FOLDER"])`.
 
@@ -89,7 +89,7 @@ def in_one_line(error: Exception) -> str:
     return " ".join(text.partition("Config search path:")[0].split())
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
+def plain(config: DictConfig) -> Config:
     """Convert a composed config to plain dicts, resolved and without Hydra's own keys."""
     settings = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])  # type: ignore[misc]
     settings._set_parent(config._get_parent())
@@ -105,7 +105,7 @@ def add_choices() -> None:
         for name, entry in getattr(import_module(module), table).items():
             if (CONF / group / f"{name}.yaml").is_file():
                 continue
-            node: dict[str, Any] = {"name": name}
+            node: Config = {"name": name}
             if group == "data":
                 node = {"defaults": ["base", "_self_"], "name": name}
             elif group == "sensor":

@@ -3,7 +3,7 @@
 import logging
 import os
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from filelock import FileLock, Timeout
 
-from r2flow.config import at_most_three, check_tree, differences, flatten, is_free
+from r2flow.config import Config, Options, at_most_three, check_tree, differences, flatten, is_free
 from r2flow.errors import InputError, check
 from r2flow.files import write_file
 from r2flow.model.parts import HYPER, NOTES
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 CONFIG = "config.yaml"
 
 
-def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+def contradictions(old: Options, new: Options) -> list[str]:
     """Differences that prevent a command from resuming a run."""
     return [text for key, text in differences(old, new).items() if not is_free(key)]
 
@@ -54,14 +54,14 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-def _text(config: Mapping[str, Any]) -> str:
+def _text(config: Options) -> str:
     """A config as YAML without aliases, from `---` to `...`, which shows that it is whole."""
     return yaml.dump(
         dict(config), Dumper=_Dumper, sort_keys=False, explicit_start=True, explicit_end=True
     )
 
 
-def read_config(run: str | Path) -> dict[str, Any] | None:
+def read_config(run: str | Path) -> Config | None:
     """The config of a run folder, or None; `InputError` if the file is cut or damaged."""
     path = Path(run, CONFIG)
     if not path.is_file():
@@ -94,7 +94,7 @@ def has_ended(run: str | Path, last: Path | None = None) -> bool:
     return 0 < total <= step_of(last)
 
 
-def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) -> Path | None:
+def open_run(run: str | Path, config: Options, locked: bool = True) -> Path | None:
     """The newest readable checkpoint to resume a run from, or None for a new run; writes if its
     folder is `locked`.
     """
@@ -118,7 +118,7 @@ def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) ->
     return last
 
 
-def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
+def check_run(run: str | Path, config: Options) -> None:
     """Refuse a run folder of another config, ignoring keys that depend on the data or a trained
     parent.
     """
@@ -139,9 +139,7 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     _refuse_another_config(run, there, here, alone=False)
 
 
-def _refuse_another_config(
-    run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any], alone: bool = True
-) -> None:
+def _refuse_another_config(run: str | Path, old: Options, new: Options, alone: bool = True) -> None:
     if differing := contradictions(old, new):
         more_steps = ""
         if alone and all(text.startswith("trainer.max_steps=") for text in differing):

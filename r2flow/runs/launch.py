@@ -10,10 +10,10 @@ import re
 import signal
 import sys
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -22,7 +22,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from r2flow.config import key_of, override
+from r2flow.config import Config, Options, key_of, override
 from r2flow.errors import InputError
 from r2flow.plugins import load_plugins
 from r2flow.runs.composing import (
@@ -191,7 +191,7 @@ def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
         raise JobEnded(code, str(run_dir))
 
 
-def _chain(settings: dict[str, Any], given: Sequence[str], folders: Sequence[str]) -> int:
+def _chain(settings: Config, given: Sequence[str], folders: Sequence[str]) -> int:
     from r2flow.runs.chain import check_links, links_of, train_links
     from r2flow.runs.folder import has_ended
 
@@ -236,7 +236,7 @@ def _draw_preview(model: str, out: Path) -> None:
     print(f"preview: scans of the model {model} in {picture}, point clouds next to it", flush=True)
 
 
-def _report_device(trainer: Mapping[str, Any]) -> str:
+def _report_device(trainer: Options) -> str:
     import torch
 
     if not torch.cuda.is_available() or trainer["accelerator"] == "cpu":

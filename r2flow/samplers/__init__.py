@@ -8,10 +8,11 @@ in `r2flow.flow.solvers.SOLVERS` is also a sampler.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
+from r2flow.config import Config, Options
 from r2flow.errors import InputError
 from r2flow.flow.solvers import SOLVERS, usual_grid
 from r2flow.registry import Registry, lazy
@@ -70,7 +71,7 @@ SAMPLERS = _Samplers(
 )
 
 
-def parse_sampler(text: str) -> dict[str, Any]:
+def parse_sampler(text: str) -> Config:
     """Parse `NAME[:FIELD=VALUE]...`, as `sde:steps=16:grid=power:2`, into name and fields."""
     from omegaconf import OmegaConf
 
@@ -87,7 +88,7 @@ def split_samplers(text: str) -> list[str]:
     return re.split(r",(?![^\[]*\])", text)
 
 
-def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
+def build_sampler(options: str | Options, **fields: Any) -> Sampler:
     """Build a sampler from name and fields, or from a text; a grid of times gives `steps`."""
     if isinstance(options, str):
         options = parse_sampler(options)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from r2flow.config import Config, Options
 from r2flow.errors import InputError
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, wide
@@ -113,9 +114,9 @@ class Sampler(ABC):
             del given["grid"]  # its times are of another number of steps
         return build_sampler(given | options)
 
-    def asdict(self) -> dict[str, Any]:
+    def asdict(self) -> Config:
         """Name and fields as plain values, as stored in a config or a checkpoint."""
-        values: dict[str, Any] = {"name": self.name}
+        values: Config = {"name": self.name}
         for field in fields(self):  # type: ignore[arg-type]
             value = getattr(self, field.name)
             if (field.name, value) != ("method", self.name):  # a solver's name is its method
@@ -158,7 +159,7 @@ class OnGrid(Sampler):
         return build_grid(self.grid, 0.0, 1.0, self.steps)
 
 
-def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
+def _plain(options: Options) -> Config:
     """The options that are not None, in values of Python, and `steps` of a grid of times."""
     plain = {key: value for key, value in options.items() if value is not None}
     for key, value in plain.items():

@@ -6,6 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
+from r2flow.config import Config
 from r2flow.errors import InputError
 from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, solve
 from r2flow.registry import Count, Portion, Positive
@@ -16,7 +17,7 @@ class ODESampler(Sampler):
     """A sampler that solves the flow's ODE (`Flow.solve`), forward or backward in time."""
 
     @abstractmethod
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Config:
         """Options of `r2flow.flow.solvers.solve`."""
 
     def check(self, generator: Any) -> None:
@@ -56,7 +57,7 @@ class FixedSteps(OnGrid, ODESampler):
     def _finishes(self) -> bool:
         return self.finish > 0 and self.steps > 1
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Config:
         return {"method": self.method, "steps": self.steps, "grid": self.grid}
 
     def __call__(
@@ -85,7 +86,7 @@ class Adaptive(ODESampler):
     def name(self) -> str:
         return self.method
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Config:
         return {"method": self.method, "tolerance": self.tolerance}
 
 
@@ -107,7 +108,7 @@ class TorchDiffEq(ODESampler):
     def evaluations(self, generator: Any) -> None:
         return None
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Config:
         return {
             "method": TORCHDIFFEQ + self.method,
             "steps": self.steps,

@@ -57,6 +57,15 @@ class Posterior(OnGrid):
             raise InputError(
                 f"{self.name} completes scans: it needs a condition (r2flow complete)."
             )
+        y = condition["image"].to(noise)
+        known = condition["known"].to(noise) > 0
+        x = self.answer(generator, noise, y, known, draws, progress)
+        return Generated.after(torch.where(known, y, x), self.evaluations())
+
+    def answer(
+        self, generator: Any, x_0: Tensor, y: Tensor, known: Tensor, noise: Fresh, progress: Call
+    ) -> Tensor:
+        """x_1 of a generator given y where `known`, (B, ...)."""
 
         def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
             velocity: Tensor = generator.mean_velocity(t, x, s).to(x)
@@ -66,9 +75,7 @@ class Posterior(OnGrid):
                 velocity.register_hook(lambda _: progress())
             return velocity
 
-        y, known = condition["image"].to(noise), condition["known"].to(noise) > 0
-        x = self.given(u, noise, y, known, self.times(), draws)
-        return Generated.after(x, self.evaluations(generator))
+        return self.given(u, x_0, y, known, self.times(), noise)
 
     def given(
         self,
@@ -83,7 +90,7 @@ class Posterior(OnGrid):
         with torch.inference_mode(False), torch.no_grad():
             # Vector-Jacobian products need tensors that autograd can save.
             x_0, y, known, times = (part.clone() for part in (x_0, y, known, times.to(x_0)))
-            return torch.where(known, y, self.run(u, x_0, y, known, times, noise))
+            return self.run(u, x_0, y, known, times, noise)
 
 
 @dataclass(frozen=True)
@@ -138,14 +145,12 @@ class Repaint(Posterior):
                     x = torch.where(known, s * y + (1 - s) * next(draws), jump(u, t, x, s))
         return x
 
-    def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
-    ) -> Generated:
-        if condition is None or not hasattr(generator, "repaint"):
-            return super().__call__(generator, noise, condition, draws, progress)
-        y, known = condition["image"].to(noise), condition["known"].to(noise) > 0
-        x = generator.repaint(self, noise, y, known, draws, progress)
-        return Generated.after(torch.where(known, y, x), self.evaluations())
+    def answer(
+        self, generator: Any, x_0: Tensor, y: Tensor, known: Tensor, noise: Fresh, progress: Call
+    ) -> Tensor:
+        if hasattr(generator, "repaint"):
+            return generator.repaint(self, x_0, y, known, noise, progress)
+        return super().answer(generator, x_0, y, known, noise, progress)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,6 +13,7 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from r2flow.config import Config, Options
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import ItemFormat
 from r2flow.errors import InputError, naming
@@ -33,7 +35,6 @@ from r2flow.samplers import build_sampler
 from r2flow.stages.muon import Muon
 
 Batch = dict[str, Tensor]
-Options = Mapping[str, Any]
 
 
 class Stage(L.LightningModule):
@@ -77,16 +78,14 @@ class Stage(L.LightningModule):
     """
 
     learns: ClassVar[type[Generator]] = Generator  # class of the generators that it can train
-    generator_name: ClassVar[str | None] = (
-        None  # generator to train; None: the parent's, or a rectified flow
-    )
+    # Generator to train; None: the parent's, or a rectified flow.
+    generator_name: ClassVar[str | None] = None
     needs_pairs: ClassVar[bool] = False  # whether it trains on pairs of x_0 and x_1
     takes_pairs: ClassVar[bool] = False  # whether it can
     takes_scans: ClassVar[bool] = False  # whether it can on scans next to pairs
     needs_parent: ClassVar[bool] = False  # whether it must start from another run
-    several_sensors: ClassVar[bool] = (
-        False  # whether the parts of a mixture may be scans of different sensors
-    )
+    # Whether the parts of a mixture may be scans of different sensors.
+    several_sensors: ClassVar[bool] = False
     anneals: ClassVar[bool] = True  # whether the learning rate decays to 0 at the last step
 
     def __init__(
@@ -109,15 +108,11 @@ class Stage(L.LightningModule):
         super().__init__()
         self.save_hyperparameters(ignore=["parent", "sensor", "encoding", "generator"])
         source = None if parent is None or isinstance(parent, Mapping) else find_parent(parent)
-        if (
-            parent is None
-            and not isinstance(generator, Generator)
-            and (self.needs_parent or self.needs_pairs)
-        ):
-            raise InputError(f"{type(self).__name__} starts from a trained model: give parent=RUN.")
         if isinstance(generator, Generator):
             self.generator = generator
-            options: dict[str, Any] = dict.fromkeys(MODEL)
+            options: Config = dict.fromkeys(MODEL)
+        elif parent is None and (self.needs_parent or self.needs_pairs):
+            raise InputError(f"{type(self).__name__} starts from a trained model: give parent=RUN.")
         else:
             given = {
                 "backbone": backbone,
@@ -129,9 +124,9 @@ class Stage(L.LightningModule):
             seed_torch(seed, "weights")  # also of networks that a subclass adds
             self.generator = build_generator(options)
         if not isinstance(self.generator, self.learns):
-            learned, found = self.learns.__name__, type(self.generator).__name__
             raise InputError(
-                f"{type(self).__name__} learns a {learned}, found a {found}: give another stage."
+                f"{type(self).__name__} learns a {self.learns.__name__}, found a "
+                f"{type(self.generator).__name__}: give another stage."
             )
         if not hasattr(self.generator, "backbone"):  # it has its own network
             options["backbone"] = None
@@ -166,12 +161,12 @@ class Stage(L.LightningModule):
     @property
     def encoding(self) -> Encoding:
         """Encoding between model space and metres."""
-        return self.generator.space.encoding
+        return self.space.encoding
 
     @property
     def sensor(self) -> Sensor:
         """Sensor of the images."""
-        return self.generator.space.sensor
+        return self.space.sensor
 
     @property
     def item_format(self) -> ItemFormat:
@@ -302,24 +297,24 @@ class Stage(L.LightningModule):
         `configure_optimizers`.
         """
         options = self.hparams
-        adam: dict[str, Any] = {"lr": options["learning_rate"], "betas": tuple(options["betas"])}
-        adam["weight_decay"] = options["weight_decay"]
-        optimizers: list[torch.optim.Optimizer] = []
-        for group in groups:
-            muon = options["muon"]
-            optimizers.append(
-                torch.optim.AdamW(group, **adam) if muon is None else Muon(group, muon, **adam)
+        kind: Any = torch.optim.AdamW
+        if options["muon"] is not None:
+            kind = partial(Muon, rate=options["muon"])
+        optimizers = [
+            kind(
+                group,
+                lr=options["learning_rate"],
+                betas=tuple(options["betas"]),
+                weight_decay=options["weight_decay"],
             )
+            for group in groups
+        ]
         warmup = options["warmup_images"] // self.images_per_step
 
         def factor(step: int) -> float:
-            if step < warmup:
-                return step / warmup
-            if (
-                step == 0 or not self.anneals
-            ):  # the number of steps is known when training has begun
-                return 1.0
-            return learning_rate_factor(step, warmup, self.total_steps)
+            # The number of steps is known when training has begun.
+            total = self.total_steps if step and self.anneals else math.inf
+            return learning_rate_factor(step, warmup, total)
 
         schedules = [
             torch.optim.lr_scheduler.LambdaLR(optimizer, factor) for optimizer in optimizers
@@ -351,9 +346,7 @@ class Stage(L.LightningModule):
         # gradients of some only.
         with model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext():
             self.manual_backward(loss)
-        average_gradients(
-            parameter for group in optimizer.param_groups for parameter in group["params"]
-        )
+        average_gradients(p for group in optimizer.param_groups for p in group["params"])
         optimizer.step()
         for config in self.trainer.lr_scheduler_configs:
             if config.scheduler.optimizer is optimizer.optimizer:
@@ -363,7 +356,7 @@ class Stage(L.LightningModule):
         if not self.automatic_optimization:  # float16 gradients are unscaled only now
             self.clip_gradients(optimizer, self.gradient_clip_val)
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(self, checkpoint: Config) -> None:
         from r2flow.stages import STAGES  # the registry of the classes of this module
 
         checkpoint[NOTES] = {
@@ -373,7 +366,7 @@ class Stage(L.LightningModule):
             **self.generator.drawing(),
         }
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+    def on_load_checkpoint(self, checkpoint: Config) -> None:
         if "state_dict" in checkpoint:  # a sharded strategy reads its own
             with naming("the checkpoint to resume from"):  # a plug-in may have changed
                 check_weights(self, checkpoint["state_dict"])

@@ -78,7 +78,8 @@ class LearnFlowMap(Reflow):
         if not (self.training or self.on_pairs):
             t = s = self.jumps.velocities(u)  # scans have velocities only
         diagonal = t == s
-        x_0, x_1 = batch["x_0"], batch["x_1"]
+        x_0 = batch["x_0"]
+        x_1 = batch["x_1"]
         u_ts = self.generator.map(self.condition(batch))
         if self.training:
             # With independent noise, x_1 is not the end of x_0's path.

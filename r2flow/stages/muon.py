@@ -28,13 +28,11 @@ class Muon(torch.optim.AdamW):
         self, parameters: Iterable[Tensor], rate: float, momentum: float = 0.95, **options: Any
     ) -> None:
         weights = list(parameters)
+        matrices = [p for p in weights if is_hidden_matrix(p)]
+        others = [p for p in weights if not is_hidden_matrix(p)]
         groups: list[dict[str, Any]] = [
-            {"params": [p for p in weights if not is_hidden_matrix(p)], "momentum": None},
-            {
-                "params": [p for p in weights if is_hidden_matrix(p)],
-                "lr": rate,
-                "momentum": momentum,
-            },
+            {"params": others, "momentum": None},
+            {"params": matrices, "lr": rate, "momentum": momentum},
         ]
         super().__init__([group for group in groups if group["params"]], **options)
 
@@ -49,10 +47,9 @@ class Muon(torch.optim.AdamW):
         super().step()
         self.param_groups = groups
         for group in groups:
-            if group["momentum"] is not None:
-                for p in group["params"]:
-                    if p.grad is not None:
-                        self._step(p, p.grad, group)
+            for p in group["params"]:
+                if group["momentum"] is not None and p.grad is not None:
+                    self._step(p, p.grad, group)
         return loss
 
     def _step(self, p: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
@@ -77,14 +74,13 @@ def orthogonalised(matrix: Tensor) -> Tensor:
     """Approximate U V^T of a matrix U S V^T, (rows, columns): singular values become 0.68 to 1.14,
     tiny ones less.
 
-    Newton-Schulz iteration: each step is the polynomial a X + (b A + c A A) X with A = X X^T, in
-    bfloat16.
+    Newton-Schulz iteration in bfloat16: each step is a polynomial a X + (b A + c A A) X with A = X
+    X^T.
     """
-    a, b, c = 3.4445, -4.7750, 2.0315
     x = matrix.T if matrix.shape[0] > matrix.shape[1] else matrix
     x = (x / (torch.linalg.matrix_norm(x) + 1e-7)).bfloat16()
     for _ in range(5):
         square = x @ x.T
-        x = a * x + (b * square + c * square @ square) @ x
+        x = 3.4445 * x + (-4.7750 * square + 2.0315 * square @ square) @ x
     x = x.to(matrix.dtype)
     return x.T if matrix.shape[0] > matrix.shape[1] else x

@@ -61,7 +61,8 @@ class Tasks:
         elevations = space.rays[0, :, 0]
         large = x_1.shape[1] >= 2 * self.rows and x_1.shape[2] >= 4 * self.columns
         if halve < self.halved and large and x_1.shape[1] % 2 == x_1.shape[2] % 4 == 0:
-            x_1, elevations = coarser(space, x_1), elevations.unflatten(0, (-1, 2)).mean(1)
+            x_1 = coarser(space, x_1)
+            elevations = elevations.unflatten(0, (-1, 2)).mean(1)
         rows, columns = self.size(own)
         first = int(top * (x_1.shape[1] - rows + 1))
         chosen = (torch.arange(columns) + int(left * x_1.shape[2])) % x_1.shape[2]
