@@ -172,9 +172,8 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     to the config, where it is null by default.
     """
     converted: list[str] = []
-    parser = OverridesParser.create()
-    for text in overrides:
-        parsed = parser.parse_override(text)
+    parsed_overrides = OverridesParser.create().parse_overrides(list(overrides))
+    for text, parsed in zip(overrides, parsed_overrides, strict=True):
         key = parsed.key_or_group
         if key == "sensor" and str(parsed.value()).lower().endswith((".yaml", ".yml")):
             converted += _sensor_of_file(str(parsed.value()), overrides)

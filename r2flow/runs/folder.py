@@ -108,10 +108,13 @@ def open_run(run: str | Path, config: Options, locked: bool = True) -> Path | No
         )
     if old is not None and last is not None:
         _refuse_another_config(run, old, config)
-        if old["sampler"] != config["sampler"] and has_ended(run, last):
+        other = differences(old, config)
+        samplers = [other[key] for key in other if key.startswith("sampler.")]
+        if samplers and has_ended(run, last):
             raise InputError(
-                f"{run} is finished and keeps its sampler, {old['sampler']}. Keep the setting, and "
-                f"draw with another sampler by r2flow sample {run} --sampler NAME --steps N."
+                f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the "
+                "setting, and draw with another sampler by "
+                f"r2flow sample {run} --sampler NAME --steps N."
             )
     if locked and old != dict(config):  # free keys may have changed
         write_file(Path(run, CONFIG), _text(config))
