@@ -10,30 +10,12 @@ from torch import Tensor
 
 from r2flow.registry import Count, Natural, Portion, Positive, Registry
 
-
-def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
-    """min(highest, 1 - (1 + n)^(-power)) with n the steps after the warm-up; 0, a copy, during the
-    warm-up.
-    """
-    n = step - warmup
-    return 0.0 if n <= 0 else min(highest, 1 - (1 + n) ** -power)
-
-
-def constant_decay(step: int, warmup: int, highest: float) -> float:
-    """highest, and 0 during the warm-up (LiDARGen)."""
-    return 0.0 if step < warmup else highest
-
-
-def ratio_decay(step: int, warmup: int, highest: float) -> float:
-    """min(highest, (1 + n) / (10 + n)) with n the steps after the warm-up, from 1; 0 during the
-    warm-up (LiDM).
-    """
-    n = step + 1 - warmup
-    return 0.0 if n <= 0 else min(highest, (1 + n) / (10 + n))
-
-
-DECAYS: Registry[Callable[[int, int, float], float]] = Registry(
-    "decay of the average", power=ema_decay, constant=constant_decay, ratio=ratio_decay
+# Decays, at most `decay`, of n = 1, 2, ..., the steps after the warm-up, during which it is 0.
+DECAYS: Registry[Callable[[int], float]] = Registry(
+    "decay of the average",
+    power=lambda n: 1 - n ** (-2 / 3),
+    constant=lambda n: 1.0,  # LiDARGen
+    ratio=lambda n: (1 + n) / (10 + n),  # LiDM
 )
 
 
@@ -71,9 +53,8 @@ class EMA(WeightAveraging):
 
     def _decay(self) -> float:
         """Decay after step `_step`, counted from 0."""
-        if self._copies:
-            return 0.0
-        return self._decay_at(self._step, self.warmup_steps or 0, self.decay)
+        n = self._step + 1 - (self.warmup_steps or 0)
+        return 0.0 if self._copies or n < 1 else min(self.decay, self._decay_at(n))
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
         return average.lerp(weight, 1 - self._decay())

@@ -51,29 +51,8 @@ def check_folder(folder: Path) -> None:
     check(usable, f"{there} is not a folder that can be written to; give another one.")
 
 
-# System errors of files, disks and limits, for the user to act on; others (a lost connection) keep
-# their traceback.
-MENDABLE = {
-    errno.EACCES,
-    errno.EPERM,
-    errno.ENOENT,
-    errno.EEXIST,
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.ENOTEMPTY,
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EROFS,
-    errno.EFBIG,
-    errno.ENAMETOOLONG,
-    errno.ELOOP,
-    errno.ESTALE,
-    errno.EIO,
-    errno.EAGAIN,
-    errno.EMFILE,
-    errno.ENFILE,
-    errno.ENOMEM,
-}
+# System errors that are no fault of files, disks or limits: they keep their traceback.
+_BUGS = (ConnectionError, TimeoutError, ChildProcessError, ProcessLookupError)
 
 
 @contextmanager
@@ -107,21 +86,18 @@ def warn_odd(path: Path, kind: str, points: int = 0) -> None:
 def explain_mistake(error: InputError | OSError) -> str:
     """One line for an InputError or a system error that a user can fix; raises others."""
     if isinstance(error, OSError):
-        if error.errno not in MENDABLE:
+        if error.errno is None or isinstance(error, _BUGS):
             raise error
         if error.errno in (errno.ENOTDIR, errno.EEXIST) and error.filename:
             given = Path(os.fsdecode(error.filename))
-            if file := next(
-                (path for path in (given, *given.parents) if path.exists() and not path.is_dir()),
-                None,
-            ):
-                return one_line(f"{file} is a file, not a folder; give another name.")
+            for path in (given, *given.parents):
+                if path.exists() and not path.is_dir():
+                    return one_line(f"{path} is a file, not a folder; give another name.")
         where = f"{error.filename}: " if error.filename else ""
         return one_line(f"{where}{error.strerror or error}")
     text = str(error)
-    if (
-        "Traceback (most recent call last)" in text
-    ):  # from a loader's worker, with the message at the end
+    if "Traceback (most recent call last)" in text:
+        # From a loader's worker, with the message at the end.
         text = text.rpartition("InputError: ")[2]
     return one_line(text) or "unknown"
 
@@ -147,9 +123,8 @@ class PlainFormatter(logging.Formatter):
 class Unbroken(io.FileIO):
     """A file descriptor that can be written to after its reader, terminal or disk room is gone."""
 
-    lost: OSError | None = (
-        None  # of standard output, if it was not the end of its reader (`| head`)
-    )
+    # Of standard output, if it was not the end of its reader (`| head`).
+    lost: OSError | None = None
 
     def write(self, data: Any) -> int:
         try:
@@ -176,8 +151,5 @@ def open_streams() -> None:
             stream.flush()
             raw = io.BufferedWriter(Unbroken(stream.fileno(), "w", closefd=False))
             lines = name == "stderr" or stream.isatty()
-            setattr(
-                sys,
-                name,
-                io.TextIOWrapper(raw, stream.encoding, "backslashreplace", line_buffering=lines),
-            )
+            text = io.TextIOWrapper(raw, stream.encoding, "backslashreplace", line_buffering=lines)
+            setattr(sys, name, text)

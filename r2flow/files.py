@@ -15,7 +15,7 @@ from r2flow.errors import InputError, naming
 
 
 @contextmanager
-def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
+def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
     """Open a temporary file that replaces `path` when the block ends without an error.
 
     It is flushed to the disk before the rename and the folder after it: a reader, or a power cut,
@@ -28,12 +28,8 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     path.parent.mkdir(parents=True, exist_ok=True)
     target = Path(os.path.realpath(path))
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
-    # Texts may contain file names that are not UTF-8.
-    text: dict[str, Any] = (
-        {} if "b" in mode else {"encoding": "utf-8", "errors": "backslashreplace"}
-    )
     try:
-        with open(temporary, mode.replace("w", "x"), **text) as file:
+        with open(temporary, "xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -58,7 +54,9 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
 
 def write_file(path: str | Path, content: str | bytes) -> None:
     """Write a whole file atomically."""
-    with atomic_write(path, "w" if isinstance(content, str) else "wb") as file:
+    if isinstance(content, str):  # it may contain file names that are not UTF-8
+        content = content.encode(errors="backslashreplace")
+    with atomic_write(path) as file:
         file.write(content)
 
 
@@ -113,9 +111,8 @@ def reading_errors(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except OSError as error:
-        reason = " ".join(
-            str(error.strerror or error).split()
-        )  # pyarrow's messages have several lines
+        # pyarrow's messages have several lines.
+        reason = " ".join(str(error.strerror or error).split())
         raise InputError(f"{path} cannot be read: {reason}.") from None
     # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
     except BaseException as error:

@@ -102,17 +102,15 @@ def end_at_once(number: int, frame: FrameType | None = None) -> None:
 @contextmanager
 def handling_signals_of_program() -> Iterator[None]:
     """Answer stop signals by one line during a whole program, its imports and its exit."""
-    atexit.register(
-        partial(install_handlers, signal.SIG_IGN)
-    )  # registered first, so that it is called last
+    # Registered first, so that it is called last.
+    atexit.register(partial(install_handlers, signal.SIG_IGN))
     with handling_signals(end_at_once):
         try:
             yield
         finally:
             atexit.unregister(install_handlers)
-            atexit.register(
-                install_handlers, end_at_once
-            )  # registered last, so that it is called first
+            # Registered last, so that it is called first.
+            atexit.register(install_handlers, end_at_once)
 
 
 def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exit(1)) -> None:
@@ -169,11 +167,8 @@ def run_process(command: Sequence[str]) -> int:
     with handling_signals(pass_on):
         # PR_SET_PDEATHSIG: a run that outlived its sweep would block the same command when given
         # again.
-        end = (
-            (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL))
-            if sys.platform == "linux"
-            else None
-        )
+        linux = sys.platform == "linux"
+        end = partial(ctypes.CDLL(None).prctl, 1, signal.SIGKILL) if linux else None
         process = subprocess.Popen(command, preexec_fn=end)
         if received:
             process.send_signal(received[0])

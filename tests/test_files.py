@@ -14,10 +14,10 @@ from r2flow.hashing import state_hash
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "folder" / "file.txt"
-    with atomic_write(path, "w") as file:
-        file.write("old")
-    with pytest.raises(TypeError), atomic_write(path, "w") as file:
-        file.writelines(["half of the new o", None])
+    with atomic_write(path) as file:
+        file.write(b"old")
+    with pytest.raises(TypeError), atomic_write(path) as file:
+        file.writelines([b"half of the new o", None])
     assert path.read_text() == "old"
     assert os.listdir(path.parent) == ["file.txt"]
 
@@ -57,14 +57,14 @@ def test_the_file_that_a_link_leads_to_is_replaced(tmp_path, to):
     target = tmp_path / "other" / "file"
     target.parent.mkdir()
     (tmp_path / "dangling").symlink_to("other/file")
-    with atomic_write(tmp_path / "dangling", "w") as file:
-        file.write("old")
+    with atomic_write(tmp_path / "dangling") as file:
+        file.write(b"old")
     assert target.read_text() == "old"
     (tmp_path / "first").symlink_to(target)
     (tmp_path / "link").symlink_to(to)
     before = target.stat().st_ino
-    with atomic_write(tmp_path / "link", "w") as file:
-        file.write("new")
+    with atomic_write(tmp_path / "link") as file:
+        file.write(b"new")
     assert target.read_text() == "new"
     assert target.stat().st_ino != before  # replaced as a whole
     assert os.readlink(tmp_path / "link") == to

@@ -126,11 +126,8 @@ class TwoModes(GaussianMixture):
         super().__init__((0.5, 0.5), (-apart, apart), (std, std))
 
 
-class RayDrop(GaussianMixture):
-    """Mixture like a pixel of a scan: -1 (within `std`) for a dropped ray, else around 0.3."""
-
-    def __init__(self, dropped: float = 0.3, std: float = 1e-3) -> None:
-        super().__init__((dropped, 1 - dropped), (-1.0, 0.3), (std, 0.3))
+# Like a pixel of a scan: -1 for a dropped ray, else around 0.3.
+RayDrop = partial(GaussianMixture, (0.3, 0.7), (-1.0, 0.3), (1e-3, 0.3))
 
 
 class PointMass(Problem):

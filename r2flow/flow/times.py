@@ -6,6 +6,7 @@ the time of image k depends on k alone.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated
 
 import torch
@@ -29,6 +30,7 @@ class Uniform:
         return u
 
 
+@dataclass
 class UShaped:
     """p(t) proportional to e^(a t) + e^(a (1 - t)), a = 4 (Lee et al. 2024, as the paper uses it).
 
@@ -37,10 +39,7 @@ class UShaped:
     second is its mirror image.
     """
 
-    def __init__(
-        self, a: Annotated[float, Bound("above 0 and at most 80", lambda a: 0 < a <= 80)] = 4.0
-    ) -> None:
-        self.a = a
+    a: Annotated[float, Bound("above 0 and at most 80", lambda a: 0 < a <= 80)] = 4.0
 
     def __call__(self, u: Tensor) -> Tensor:
         rising = u < 0.5
@@ -50,18 +49,19 @@ class UShaped:
         return torch.where(rising, t, 1 - t).clamp(0, 1)
 
 
+@dataclass
 class LogitNormal:
     """logit(t) ~ N(mean, std^2) (Esser et al. 2024): most weight in the middle of the path."""
 
-    def __init__(self, mean: float = 0.0, std: Positive = 1.0) -> None:
-        self.mean = mean
-        self.std = std
+    mean: float = 0.0
+    std: Positive = 1.0
 
     def __call__(self, u: Tensor) -> Tensor:
         normal = torch.special.ndtri(u.double().clamp(1e-12, 1 - 1e-12))
         return torch.sigmoid(self.mean + self.std * normal).to(u.dtype)
 
 
+@dataclass
 class Late:
     """p(t) = 1 - share + share q(t) with logit(t) ~ N(mean, std^2) under q: uniform, with more
     weight near t = 1.
@@ -70,14 +70,15 @@ class Late:
     draws.
     """
 
-    def __init__(self, share: Portion = 0.5, mean: float = 2.0, std: Positive = 1.6) -> None:
-        self.share = share
-        self.logit_normal = LogitNormal(mean, std)
+    share: Portion = 0.5
+    mean: float = 2.0
+    std: Positive = 1.6
 
     def __call__(self, u: Tensor) -> Tensor:
         late = u < self.share
+        near_one = LogitNormal(self.mean, self.std)
         rest = (u - self.share) / (1 - self.share)
-        return torch.where(late, self.logit_normal(u / max(self.share, 1e-12)), rest.clamp(0, 1))
+        return torch.where(late, near_one(u / max(self.share, 1e-12)), rest.clamp(0, 1))
 
 
 class Discrete:

@@ -14,7 +14,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, reading
+from r2flow.files import reading, write_file
 from r2flow.registry import Registry, check_options, construct, options_of
 
 Rays = Literal["centre", "reference"]
@@ -284,11 +284,10 @@ def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> S
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
     """Write a sensor as a YAML file that begins with a comment, such as the numbers' source."""
     units = "Elevations in degrees, the top row first; ranges and height in metres."
-    with atomic_write(path, "w") as file:
-        file.writelines(f"# {line}\n" for line in (*comment.splitlines(), units))
-        yaml.safe_dump(
-            options_of_sensor(sensor), file, default_flow_style=None, sort_keys=False, width=100
-        )
+    lines = [f"# {line}\n" for line in (*comment.splitlines(), units)]
+    options = options_of_sensor(sensor)
+    text = yaml.safe_dump(options, default_flow_style=None, sort_keys=False, width=100)
+    write_file(path, "".join(lines) + text)
 
 
 def options_of_sensor(sensor: Sensor) -> dict[str, Any]:

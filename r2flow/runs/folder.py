@@ -72,13 +72,13 @@ def read_config(run: str | Path) -> Config | None:
             raise ValueError("it is cut")
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise ValueError("it has aliases, which can stand for any size")
-        config = yaml.safe_load(text) or {}
+        config = yaml.safe_load(text)
         check_tree(config)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
         raise InputError(
             f"{path} is damaged ({str(error).splitlines()[0]}); the checkpoints are usable."
         ) from None
-    return dict(config) or None
+    return dict(config)
 
 
 def has_ended(run: str | Path, last: Path | None = None) -> bool:

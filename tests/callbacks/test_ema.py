@@ -2,19 +2,30 @@ import lightning as L
 import pytest
 import torch
 from lightning.pytorch.callbacks import LambdaCallback
-from r2flow.callbacks.ema import DECAYS, EMA, averaged_weights
+from r2flow.callbacks.ema import EMA, averaged_weights
 from torch import nn
 
 from tests.conftest import quiet_trainer
 from tests.reference import load_case
 
 
-def test_decays_begin_behind_the_warm_up_and_are_bounded():
+@pytest.mark.parametrize(
+    ("rule", "decays"),
+    [
+        ("constant", [0, 0.9, 0.9, 0.9]),
+        ("ratio", [0, 2 / 11, 0.25, 0.9]),
+        ("power", [0, 0, 1 - 2 ** (-2 / 3), 0.9]),
+    ],
+)
+def test_decays_begin_behind_the_warm_up_and_are_bounded(rule: str, decays: list[float]):
     """LiDARGen's is constant, LiDM's (1 + n) / (10 + n) from n = 1."""
-    assert [DECAYS["constant"](step, 2, 0.9) for step in (1, 2, 3)] == [0, 0.9, 0.9]
-    assert [DECAYS["ratio"](step, 2, 0.26) for step in (1, 2, 3, 9)] == pytest.approx(
-        [0, 2 / 11, 0.25, 0.26]
-    )
+    ema = EMA(0.9, every=1, warmup_steps=2, rule=rule)
+    found = []
+    for step in (1, 2, 3, 999):
+        ema.should_update(step)
+        # decay of an average of 1 towards weights of 0
+        found.append(ema._average(torch.tensor(1.0), torch.tensor(0.0), None).item())
+    assert found == pytest.approx(decays)
 
 
 class Scripted(L.LightningModule):
