@@ -35,14 +35,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             cause = error.__context__ if isinstance(error, RuntimeError) else error
             if not isinstance(cause, OSError):
                 raise
-            kept = (
-                "The earlier checkpoints are intact; fix"
-                if any(Path(path).parent.glob("step-*.ckpt"))
-                else "Fix"
-            )
             raise InputError(
-                f"{path} cannot be written: {cause.strerror or cause}. {kept} this and give the "
-                "same command again."
+                f"{path} cannot be written: {cause.strerror or cause}. Fix this and give the same "
+                "command again, which resumes from an earlier checkpoint if there is one."
             ) from None
 
     def load_checkpoint(
@@ -53,9 +48,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         # Lightning's timer would resume with its time used up; trainer.max_time applies to each
         # command.
         states = checkpoint.get("callbacks") or {}
-        checkpoint["callbacks"] = {
-            name: state for name, state in states.items() if not name.startswith("Timer")
-        }
+        checkpoint["callbacks"] = {n: states[n] for n in states if not n.startswith("Timer")}
         return checkpoint
 
 
@@ -92,9 +85,10 @@ class Checkpoints(Checkpoint):
         self._saved = step
         run = trainer.default_root_dir
         trainer.save_checkpoint(Path(run, FOLDER, f"step-{step:08d}.ckpt"), weights_only=False)
-        if trainer.is_global_zero:
-            for path in checkpoints_of(run):
-                if step_of(path) > step:  # damaged: the run could not resume from it
-                    path.rename(path.with_suffix(".damaged"))
-            for old in checkpoints_of(run)[self.keep :]:
-                old.unlink(missing_ok=True)
+        if not trainer.is_global_zero:
+            return
+        for path in checkpoints_of(run):
+            if step_of(path) > step:  # damaged: the run could not resume from it
+                path.rename(path.with_suffix(".damaged"))
+        for old in checkpoints_of(run)[self.keep :]:
+            old.unlink(missing_ok=True)

@@ -114,8 +114,6 @@ def printable(text: str) -> str:
 
 
 class PlainFormatter(logging.Formatter):
-    """Escapes control characters in log lines."""
-
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
 

@@ -157,10 +157,9 @@ def interpolate_scans(
     flow = as_flow(checkpoint.generator, "interpolation")
     ends = invert(checkpoint, pair, sampler, progress)
     if not ends.converged.all():
-        which = "last" if ends.converged[0] else "first"
         raise InputError(
-            f"the {which} scan cannot be carried to its noise and back by {sampler.name}: try "
-            "another sampler, a larger tolerance or more steps."
+            f"the {'last' if ends.converged[0] else 'first'} scan cannot be carried to its noise "
+            f"and back by {sampler.name}: try another sampler, a larger tolerance or more steps."
         )
     arrived(2)
     weights = torch.linspace(0, 1, frames, dtype=torch.float64, device="cpu")

@@ -25,9 +25,8 @@ from r2flow.registry import Registry, UnknownName
 
 GROUP = "r2flow.plugins"
 
-_loaded: dict[
-    str, str
-] = {}  # names and files of loaded modules, and the names that were given for them
+# Names and files of loaded modules, and the names that were given for them.
+_loaded: dict[str, str] = {}
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -53,12 +52,11 @@ def load_plugins(names: Sequence[str]) -> None:
             file = _import(name)
         except (Exception, SystemExit) as error:  # modules may raise any exception
             message = " ".join(str(error).split()) or "no message"
-            lines = [
-                n
-                for frame, n in walk_tb(error.__traceback__)
-                if frame.f_code.co_filename == _identity(name)
-            ]
-            message += f" (line {lines[-1]})" if lines else ""  # the last one of the file itself
+            where = ""
+            for frame, line in walk_tb(error.__traceback__):
+                if frame.f_code.co_filename == _identity(name):  # the last one is shown
+                    where = f" (line {line})"
+            message += where
             raise InputError(
                 f"the plug-in {name} cannot be imported: {type(error).__name__}: {message}"
             ) from None

@@ -129,14 +129,10 @@ class Registry(Mapping[str, T]):
     def name_of(self, entry: Any) -> str | None:
         """The name of an entry, or None."""
         place = f"{getattr(entry, '__module__', '')}:{getattr(entry, '__qualname__', '')}"
-        return next(
-            (
-                name
-                for name, own in self._entries.items()
-                if own is entry or own == _Lazy(place, ())
-            ),
-            None,
-        )
+        for name, own in self._entries.items():
+            if own is entry or own == _Lazy(place, ()):
+                return name
+        return None
 
     def options(self, given: str | Options) -> Config:
         """Name and options of an entry, from a name, also of a file in conf/, or a mapping with a

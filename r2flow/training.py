@@ -86,19 +86,13 @@ def fit(run: Run) -> Result:
             # `Stopping` does.
             with handling_signals(SIG_DFL, STOPPING if run.trainer.num_nodes > 1 else ()):
                 step = _fit_in_folder(run, stopping)
-            finished = has_ended(run.folder) or not run.trainer.checkpoint_callbacks
+            kept = bool(run.trainer.checkpoint_callbacks)
+            finished = not kept or has_ended(run.folder)
             if first:
                 where = run.trainer.strategy.root_device
                 device = str(where) if where.type == "cuda" else "cpu"
-                kept = bool(run.trainer.checkpoint_callbacks)
-                finish(
-                    run.folder,
-                    run.config["samples"],
-                    run.config["seed"],
-                    device,
-                    finished,
-                    kept=kept,
-                )
+                samples = run.config["samples"]
+                finish(run.folder, samples, run.config["seed"], device, finished, kept=kept)
     return _result(run, step, finished)
 
 
@@ -144,11 +138,8 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
                 raise InputError(
                     "a process of this run on another device ended with an error."
                 ) from error
-            again = (
-                "resumes" if checkpoints_of(run.folder) else "starts it again: no checkpoint yet"
-            )
             raise Stopped(
-                LATER, f"a process of this run on another device ended; the same command {again}."
+                LATER, "a process of this run on another device ended; the same command resumes."
             ) from error
         raise
     return run.trainer.global_step
@@ -163,8 +154,7 @@ def _failed(process: Popen[bytes]) -> bool:
 
 def _result(run: Run, step: int, finished: bool) -> Result:
     logged = {name: float(values[-1]) for name, (_, values) in read_curves(run.folder).items()}
-    metrics = {
-        **logged,
-        **{name: float(value) for name, value in run.trainer.callback_metrics.items()},
-    }
-    return Result(metrics, next(iter(checkpoints_of(run.folder)), None), run.folder, step, finished)
+    measured = {name: float(value) for name, value in run.trainer.callback_metrics.items()}
+    return Result(
+        logged | measured, next(iter(checkpoints_of(run.folder)), None), run.folder, step, finished
+    )

@@ -76,7 +76,7 @@ def test_points_of_another_frame_are_warned_of(r2flow, tmp_path: Path):
         write_points(tmp_path / "0.ply", xyz + np.float32([mount, 0, mount]), ring=ring)
         code, said, error = r2flow("sensor", tmp_path / "0.ply")
         assert (code, "of one sensor, in its own frame" in error) == (0, warned)
-    assert "not found, 1.73 m assumed" in said  # a round room without a floor
+    assert "1.73 m above the ground, assumed" in said  # a round room without a floor
 
 
 def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, tmp_path: Path):

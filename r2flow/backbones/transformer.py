@@ -21,8 +21,6 @@ from r2flow.errors import InputError
 
 
 class Neighbourhood(NamedTuple):
-    """Options of `neighbourhood_attention`."""
-
     window: tuple[int, int]
     ring: bool
     backend: str

@@ -155,14 +155,11 @@ def sensor(
     degrees = mine.elevations
     nearest, distance = nearest_sensor(beams.elevations)
     scale = mine.reflectance_scale
-    height = f"{mine.height:.2f} m above the ground"
     reflectance = "none: encoding.reflectance=false"
     if scale:
         stored = [one.reflectance for one in points if one.reflectance is not None]
-        beyond = sum(int((values > 1.001 * scale).sum()) for values in stored)
-        reflectance = f"reflectance_scale={scale:g}"
-        if beyond:
-            reflectance += f"; {beyond:,} points beyond are clipped"
+        beyond = sum((values > 1.001 * scale).sum() for values in stored)
+        reflectance = f"reflectance_scale={scale:g}; {beyond:,} points beyond are clipped"
     rows = {
         "beams": f"{len(degrees)}: {beams.order}",
         "elevations": f"{degrees[0]:+.2f} to {degrees[-1]:+.2f} degrees; "
@@ -171,7 +168,7 @@ def sensor(
         "resolution": f"{steps:,.0f} steps a turn; images of {mine.columns} columns",
         "range seen": f"{mine.min_range:g} to {mine.max_range:g} m; "
         "raise min_range if the vehicle is visible",
-        "height": height if ground else f"not found, {mine.height:g} m assumed",
+        "height": f"{mine.height:.2f} m above the ground{'' if ground else ', assumed'}",
         "reflectance": reflectance,
     }
     print_table(list(rows.items()), ("", ""))

@@ -25,7 +25,6 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_columns(text: str) -> tuple[str, ...]:
-    """Names separated by commas."""
     return tuple(name.strip() for name in text.split(","))
 
 
@@ -104,7 +103,6 @@ def cores() -> int:
 
 
 def several(count: int, what: str = "scan") -> str:
-    """'1 scan', '2 scans'."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 

@@ -101,7 +101,6 @@ class Generator(nn.Module):
         self.run_by(self.default_sampler)
 
     def run_by(self, sampler: Sampler, few: Sampler | None = None, fixed: bool = False) -> None:
-        """Set the default samplers."""
         self.sampler = sampler
         self.few = few
         self.fixed = fixed

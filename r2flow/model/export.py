@@ -139,8 +139,6 @@ def _weighted_sum(row: list[float], vectors: list[Tensor]) -> Tensor:
 
 
 class Exported(NamedTuple):
-    """An exported file."""
-
     path: Path
     notes: dict[str, Any]  # metadata
 
@@ -170,10 +168,9 @@ def export(
     path = Path(path)
     flow = checkpoint.generator
     if not isinstance(flow, RectifiedFlow):
-        kind = type(flow).__name__
         raise InputError(
             f"only rectified flows and flow maps can be exported, and {checkpoint.path} holds a "
-            f"{kind}."
+            f"{type(flow).__name__}."
         )
     if network and type(flow).velocity is not RectifiedFlow.velocity:
         raise InputError(
@@ -250,7 +247,6 @@ def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> list[Tensor]
 
 
 def _traced(module: nn.Module, *inputs: Tensor) -> torch.export.ExportedProgram:
-    """Export the module for any batch size."""
     batch = torch.export.Dim("batch", max=1 << 31)  # torch 2.6 refuses a size without a limit
     shapes = tuple({0: batch} if value.ndim else {} for value in inputs)
     module = module.cpu().eval()
@@ -286,8 +282,7 @@ class Difference(NamedTuple):
     def __str__(self) -> str:
         return (
             f"range within {self.metres:.2g} m, reflectance within {self.reflectance:.2g}, "
-            f"{self.rays} rays differ in "
-            "ray-drop"
+            f"{self.rays} rays differ in ray-drop"
         )
 
 

@@ -46,16 +46,15 @@ def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         code = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
-        size = file.seek(0, os.SEEK_END)
-        problem = f"is not a checkpoint, or a damaged one ({size} bytes). "
-        problem += "Give a .ckpt of r2flow or a published file."
         if code is not None and isinstance(error, pickle.UnpicklingError):
-            problem = (
-                f"is refused: it holds objects that would run code when loaded ({code[1]}), not "
-                "only tensors and plain "
-                "values. Ask its author for a weights-only file."
-            )
-        raise InputError(f"{name} {problem}") from None
+            raise InputError(
+                f"{name} is refused: it holds objects that would run code when loaded ({code[1]}), "
+                "not only tensors and plain values. Ask its author for a weights-only file."
+            ) from None
+        raise InputError(
+            f"{name} is not a checkpoint, or a damaged one ({file.seek(0, os.SEEK_END)} bytes). "
+            "Give a .ckpt of r2flow or a published file."
+        ) from None
 
 
 def _check_archive(file: IO[bytes], name: object) -> None:

@@ -144,7 +144,6 @@ def with_choices(compose: Callable[[], T]) -> T:
 
 
 def choices(group: str) -> list[str]:
-    """Names of the choices of a group."""
     if not GlobalHydra.instance().is_initialized():  # it knows `--config-dir`, too
         with _hydra():
             return choices(group)

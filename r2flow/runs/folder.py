@@ -24,7 +24,6 @@ CONFIG = "config.yaml"
 
 
 def contradictions(old: Options, new: Options) -> list[str]:
-    """Differences that prevent a command from resuming a run."""
     return [text for key, text in differences(old, new).items() if not is_free(key)]
 
 

@@ -46,11 +46,6 @@ class _Samplers(Registry[Any]):
     def __iter__(self) -> Iterator[str]:
         return iter([*SOLVERS, *self._entries])
 
-    def name_of(self, kind: type[Sampler]) -> str:
-        reference = lazy(f"{kind.__module__}:{kind.__qualname__}")
-        names = (name for name, entry in self._entries.items() if entry in (kind, reference))
-        return next(names, kind.__name__)
-
 
 SAMPLERS = _Samplers(
     "sampler",

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, Self
 
 import torch
 from torch import Tensor
@@ -54,11 +54,11 @@ class Sampler(ABC):
     and the command line store its name and fields.
     """
 
-    draws: ClassVar[bool] = False  #: whether the sampler is stochastic: it draws noise after x_0
+    draws = False  #: whether the sampler is stochastic: it draws noise after x_0
     #: Whether x_1 depends on x_0 closely enough for a reflow pair (x_0, x_1).
-    paired: ClassVar[bool] = True
-    completes: ClassVar[bool] = False  #: whether a condition is required
-    needs: ClassVar[str] = "velocity"  #: attribute that a generator must have
+    paired = True
+    completes = False  #: whether a condition is required
+    needs = "velocity"  #: attribute that a generator must have
 
     @abstractmethod
     def __call__(
@@ -75,10 +75,9 @@ class Sampler(ABC):
 
     @property
     def name(self) -> str:
-        """Name in `SAMPLERS`."""
         from r2flow.samplers import SAMPLERS
 
-        return SAMPLERS.name_of(type(self))
+        return SAMPLERS.name_of(type(self)) or type(self).__name__
 
     def evaluations(self, generator: Any) -> int | None:
         """Network evaluations per scan; None if they depend on the scans."""

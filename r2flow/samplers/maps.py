@@ -83,7 +83,6 @@ class Refine(Renoise):
 
     @property
     def leading(self) -> int:
-        """Number of steps of the ODE."""
         first = self.steps - min(self.jumps, self.steps // 2)
         return first if first >= 4 else 0
 

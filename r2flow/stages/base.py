@@ -80,13 +80,13 @@ class Stage(L.LightningModule):
     learns: ClassVar[type[Generator]] = Generator  # class of the generators that it can train
     # Generator to train; None: the parent's, or a rectified flow.
     generator_name: ClassVar[str | None] = None
-    needs_pairs: ClassVar[bool] = False  # whether it trains on pairs of x_0 and x_1
-    takes_pairs: ClassVar[bool] = False  # whether it can
-    takes_scans: ClassVar[bool] = False  # whether it can on scans next to pairs
-    needs_parent: ClassVar[bool] = False  # whether it must start from another run
+    needs_pairs = False  # whether it trains on pairs of x_0 and x_1
+    takes_pairs = False  # whether it can
+    takes_scans = False  # whether it can on scans next to pairs
+    needs_parent = False  # whether it must start from another run
     # Whether the parts of a mixture may be scans of different sensors.
-    several_sensors: ClassVar[bool] = False
-    anneals: ClassVar[bool] = True  # whether the learning rate decays to 0 at the last step
+    several_sensors = False
+    anneals = True  # whether the learning rate decays to 0 at the last step
 
     def __init__(
         self,
@@ -212,7 +212,6 @@ class Stage(L.LightningModule):
         return batch
 
     def check_data(self, data: ScanDataModule) -> None:
-        """Refuse data that this stage cannot learn from."""
         from r2flow.stages import STAGES  # the registry of the classes of this module
 
         name = STAGES.name_of(type(self)) or type(self).__name__

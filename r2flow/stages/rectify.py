@@ -32,7 +32,7 @@ class Rectify(SingleLoss):
     """
 
     learns: ClassVar[type[Generator]] = Flow
-    default_loss: ClassVar[str] = "mse"
+    default_loss = "mse"
     default_time: ClassVar[Options] = {"name": "uniform"}
     generator: Flow
 

@@ -50,7 +50,6 @@ class Tried(NamedTuple):
     scale: Tensor  # tolerance of every element's error, (B, ...)
 
     def of(self, places: ndarray) -> "Tried":
-        """The step of the scenes with these indices."""
         k = [stage[places] for stage in self.k]
         return Tried(self.method, self.x[places], k, self.h[places], self.scale[places])
 

@@ -240,11 +240,9 @@ class _Krylov:
         return self.size * self._phi(order, h)
 
     def vector(self, y: ndarray) -> Tensor:
-        """V y."""
         return (self.basis.new_tensor(y)[:, None] * self.basis[: len(y)]).sum(0)
 
     def image(self, y: ndarray) -> Tensor:
-        """J V y."""
         return self.vector(self.matrix[: len(y) + 1, : len(y)] @ y)
 
 

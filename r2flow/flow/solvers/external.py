@@ -41,7 +41,6 @@ class TorchDiffEqMethod:
 
     @property
     def adapts(self) -> bool:
-        """Whether step sizes follow from a tolerance."""
         from torchdiffeq._impl.solvers import FixedGridODESolver
 
         return not issubclass(self._solver(), FixedGridODESolver)
@@ -105,7 +104,6 @@ class _Scene:
         return v.to(x)
 
     def keep(self, x: Tensor) -> bool:
-        """Keep a state if it is finite."""
         x = x.to(self._dtype)
         good = bool(x.isfinite().all())
         if good:
@@ -113,7 +111,6 @@ class _Scene:
         return good
 
     def callback_step(self, t: Tensor, x: Tensor, h: Tensor) -> None:
-        """Called before each step."""
         self._v.accepted[self._v.scenes] += 1
         self.keep(x)
 

@@ -97,7 +97,6 @@ class Evaluations:
         return self(t, x)
 
     def some(self, places: ndarray, t: Tensor, x: Tensor) -> Tensor:
-        """v of some scenes of the current state."""
         scenes = self.scenes
         self.only(scenes[places])
         v = self(t, x)

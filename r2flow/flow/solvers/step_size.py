@@ -118,7 +118,6 @@ class StepController:
         self.factor[place] = min(max(share, SHRINK), 0.7)
 
     def remember(self, place: int, share: float) -> None:
-        """Note a time of a scene's rejected step."""
         self.memories[place] += (self.reached[place] + share * self.h[place],)
 
     def remembered(self, place: int) -> list[float]:
