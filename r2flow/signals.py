@@ -113,7 +113,7 @@ def handling_signals_of_program() -> Iterator[None]:
             atexit.register(install_handlers, end_at_once)
 
 
-def end_with_parent(worker: int = 0, end: Callable[[], object] = lambda: os._exit(1)) -> None:
+def end_with_parent(end: Callable[[], object] = lambda: os._exit(1)) -> None:
     """End a worker when its parent process ends, since it would wait forever for a reader of its
     results.
     """

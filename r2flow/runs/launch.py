@@ -70,11 +70,10 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
         # A remote launcher raises the first only.
         jobs = [job.args for job in errors or [error]]
         failed = [folder for code, folder in jobs if code != LATER]
-        number = len(failed or jobs) if errors else "some"
         names = "; ".join(failed or [folder for _, folder in jobs])
         if failed:
-            raise InputError(f"{number} of the sweep's jobs failed: {names}") from None
-        print(f"{number} of the sweep's jobs resume with the same command: {names}")
+            raise InputError(f"jobs of the sweep failed: {names}") from None
+        print(f"jobs of the sweep resume with the same command: {names}")
         return LATER
     except WRONG as error:
         raise InputError(in_one_line(error)) from None

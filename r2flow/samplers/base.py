@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Any, Self
 
 import torch
@@ -116,10 +116,9 @@ class Sampler(ABC):
     def asdict(self) -> Config:
         """Name and fields as plain values, as stored in a config or a checkpoint."""
         values: Config = {"name": self.name}
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if (field.name, value) != ("method", self.name):  # a solver's name is its method
-                values[field.name] = list(value) if isinstance(value, tuple) else value
+        for name, value in vars(self).items():
+            if (name, value) != ("method", self.name):  # a solver's name is its method
+                values[name] = list(value) if isinstance(value, tuple) else value
         return values
 
     @property

@@ -133,7 +133,7 @@ class Stage(L.LightningModule):
         if source and source.checkpoint:
             self.generator.start_from(source.checkpoint.generator)
         self.prepare_generator()
-        chosen = {"name": sampler} if isinstance(sampler, str) else dict(sampler or {})
+        chosen = {"name": sampler} if isinstance(sampler, str) else sampler or {}
         own = self.generator.choose(**chosen)
         if own.completes:
             raise InputError(
@@ -142,10 +142,10 @@ class Stage(L.LightningModule):
         if few is not None:
             self.generator.few = build_sampler(few)
             self.generator.few.check(self.generator)
-        self.generator.run_by(own, self.generator.few, self.generator.fixed)
+        self.generator.sampler = own
         record = source.record() if source else parent
         complete = {**self.hparams, **options, "parent": record, "sampler": own.asdict()}
-        self.save_hyperparameters({name: plain(value) for name, value in complete.items()})
+        self.save_hyperparameters(plain(complete))
         self.gradient_clip_val: float | None = None
 
     def prepare_generator(self) -> None:

@@ -310,7 +310,7 @@ def test_a_sweep_through_submitit_runs_every_job_and_reports_a_failed_one(
     done = train(*launcher, "stage.loss=mse,nonsense", check=False, flags=("-m",))
     assert done.returncode == 2
     assert (
-        f"of the sweep's jobs failed: {tmp_path / 'runs' / 'sweep' / 'stage.loss=nonsense'}-"
+        f"jobs of the sweep failed: {tmp_path / 'runs' / 'sweep' / 'stage.loss=nonsense'}-"
         in done.stderr
     )
     (finished,) = (tmp_path / "runs" / "sweep").glob("*/samples")
