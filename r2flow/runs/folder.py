@@ -49,15 +49,10 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
 
 
 class _Dumper(yaml.SafeDumper):
+    """Writes YAML without aliases."""
+
     def ignore_aliases(self, data: Any) -> bool:
         return True
-
-
-def _text(config: Options) -> str:
-    """A config as YAML without aliases, from `---` to `...`, which shows that it is whole."""
-    return yaml.dump(
-        dict(config), Dumper=_Dumper, sort_keys=False, explicit_start=True, explicit_end=True
-    )
 
 
 def read_config(run: str | Path) -> Config | None:
@@ -116,7 +111,11 @@ def open_run(run: str | Path, config: Options, locked: bool = True) -> Path | No
                 f"r2flow sample {run} --sampler NAME --steps N."
             )
     if locked and old != dict(config):  # free keys may have changed
-        write_file(Path(run, CONFIG), _text(config))
+        # From `---` to `...`, which shows that it is whole.
+        text = yaml.dump(
+            dict(config), Dumper=_Dumper, sort_keys=False, explicit_start=True, explicit_end=True
+        )
+        write_file(Path(run, CONFIG), text)
     return last
 
 
