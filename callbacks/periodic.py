@@ -81,9 +81,13 @@ class SamplePictures(Periodic):
         """The sampler of the pictures; refuses `steps` that the generator does not take."""
         return generator.choose(steps=None if generator.fixed else self.steps)
 
+    def check(self, generator: Generator) -> None:
+        """Refuse `steps` that the generator of a run does not take."""
+        if self.every and generator.unconditional:
+            self.sampler(generator)
+
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        if self.every and pl_module.generator.unconditional:
-            self.sampler(pl_module.generator)  # refuses wrong steps before training
+        self.check(pl_module.generator)
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         step = trainer.global_step

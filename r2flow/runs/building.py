@@ -290,10 +290,9 @@ def _callbacks(run: RunConfig, stage: Stage, options: Config) -> list[L.Callback
     if not options["fast_dev_run"]:
         callbacks = build_callbacks(run.callbacks)
     for callback in callbacks:
-        draws = stage.generator.unconditional
-        if isinstance(callback, SamplePictures) and callback.every and draws:
+        if isinstance(callback, SamplePictures):
             with naming("callbacks.pictures"):
-                callback.sampler(stage.generator)  # refuses wrong steps before there is a folder
+                callback.check(stage.generator)  # before there is a folder
     for key, kind in (("enable_checkpointing", Checkpoint), ("enable_progress_bar", ProgressBar)):
         if not options[key]:
             callbacks = [callback for callback in callbacks if not isinstance(callback, kind)]
