@@ -18,11 +18,12 @@ from r2flow.model.saving import weights_hash
 from r2flow.models import name_of
 from r2flow.registry import options_of
 
-FREE_BACKBONE = ("attention", "dropout")  # options that weights do not depend on
-DEFAULT_BACKBONE = "hdit_tiny"
-DEFAULT_SENSOR = "hdl64e"
-DEFAULT_ENCODING = "logscale"
-DEFAULT_GENERATOR = "rectified_flow"
+# The default of each group, and the function that completes its options.
+_GROUPS: dict[str, tuple[str, Callable[[Any], Config]]] = {
+    "backbone": ("hdit_tiny", BACKBONES.options),
+    "sensor": ("hdl64e", sensor_options),
+    "encoding": ("logscale", encoding_options),
+}
 
 
 @dataclass(frozen=True)
@@ -95,32 +96,25 @@ def model_options(
             "have; "
             "start from a flow trained on spherical images."
         )
-    sensor = given.get("sensor")
-    encoding = given.get("encoding")
     generator = _generator(given.get("generator"), theirs.get("generator"), generator_name)
-    backbone = given.get("backbone")
-    options: Config
-    if parent is None:
-        options = {
-            "backbone": BACKBONES.options(backbone or DEFAULT_BACKBONE),
-            "sensor": sensor_options(sensor or DEFAULT_SENSOR),
-            "encoding": encoding_options(encoding or DEFAULT_ENCODING),
-        }
-    else:
-        options = {
-            "backbone": _changed(theirs["backbone"], backbone, BACKBONES.options),
-            "sensor": _changed(theirs["sensor"], sensor, sensor_options),
-            "encoding": _changed(theirs["encoding"], encoding, encoding_options),
-        }
-        if options["encoding"]["reflectance"] == AUTO:
-            options["encoding"]["reflectance"] = theirs["encoding"]["reflectance"]
-        free: dict[str, tuple[str, ...]] = {"backbone": FREE_BACKBONE, "encoding": ("levels",)}
+    options: Config = {}
+    for group, (default, complete) in _GROUPS.items():
+        own = given.get(group)
+        if parent is None:
+            options[group] = complete(own or default)
+        else:
+            options[group] = _changed(theirs[group], own, complete)
+    encoding = options["encoding"]
+    if parent is not None:
+        if encoding["reflectance"] == AUTO:
+            encoding["reflectance"] = theirs["encoding"]["reflectance"]
+        # But for options that weights do not depend on.
+        _refuse_other("backbone", options, parent, {"attention", "dropout"})
+        _refuse_other("encoding", options, parent, {"levels"})
         if on_pairs:
-            free["sensor"] = ("reflectance_scale",)
-        for group, keys in free.items():
-            _refuse_other(group, options[group], theirs[group], keys, parent.path)
-    if options["encoding"]["reflectance"] == AUTO:
-        options["encoding"]["reflectance"] = True
+            _refuse_other("sensor", options, parent, {"reflectance_scale"})
+    if encoding["reflectance"] == AUTO:
+        encoding["reflectance"] = True
     return {**options, "generator": generator}
 
 
@@ -135,16 +129,17 @@ def _changed(
     return complete(given)
 
 
-def _refuse_other(group: str, ours: Any, theirs: Any, free: tuple[str, ...], path: Path) -> None:
+def _refuse_other(group: str, options: Options, parent: Parent, free: set[str]) -> None:
     """Refuse options that differ from those of the weights; keys that only one side has are equal
     to the default.
     """
-    for key in (ours or {}).keys() & (theirs or {}).keys() - set(free):
+    ours = options[group] or {}
+    theirs = parent.config[group] or {}
+    for key in ours.keys() & theirs.keys() - free:
         if plain(ours[key]) != plain(theirs[key]):
             raise InputError(
-                f"{group}.{key} is {ours[key]} here, but {theirs[key]} in {path}, whose weights "
-                "this run starts from. "
-                f"Leave it out: the {group} is the parent's."
+                f"{group}.{key} is {ours[key]} here, but {theirs[key]} in {parent.path}, whose "
+                f"weights this run starts from. Leave it out: the {group} is the parent's."
             )
 
 
@@ -156,7 +151,7 @@ def _generator(given: str | Options | None, theirs: Options | None, of_stage: st
     """
     if given:
         return GENERATORS.options(given)
-    parental = theirs or {"name": DEFAULT_GENERATOR}
+    parental = theirs or {"name": "rectified_flow"}
     chosen = of_stage or GENERATORS[parental["name"]].finetuned_as or parental["name"]
     shared = options_of(GENERATORS[chosen], given=2)
     return {"name": chosen} | {key: parental[key] for key in parental if key in shared}
