@@ -51,12 +51,12 @@ def save_checkpoint(checkpoint: "Checkpoint", path: str | Path, half: bool = Fal
     }
     for name, value in checkpoint.generator.named_parameters() if half else ():
         if value.ndim > 1 and value.numel() > SMALL:
-            rounded = value.detach().cpu().half()
+            name = name.replace(COMPILED, "")
+            weights[name] = weights[name].half()
             check(
-                rounded.isfinite().all(),
+                weights[name].isfinite().all(),
                 f"{path}: weights beyond 65504 do not fit into float16: save them without half.",
             )
-            weights[name.replace(COMPILED, "")] = rounded
     config = learned(checkpoint.config)
     if plugins := checkpoint.config.get("plugins"):
         config["plugins"] = [Path(name).name for name in plugins]
