@@ -36,8 +36,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             if not isinstance(cause, OSError):
                 raise
             raise InputError(
-                f"{path} cannot be written: {cause.strerror or cause}. Fix this and give the same "
-                "command again, which resumes from an earlier checkpoint if there is one."
+                f"{path} cannot be written: {cause.strerror or cause}. Earlier checkpoints are "
+                "intact; fix this and give the same command again."
             ) from None
 
     def load_checkpoint(

@@ -46,6 +46,7 @@ def export(
     The file has a fixed number of steps; r2flow runs it and compares it with the flow. --to
     safetensors writes the averaged weights, config and sampler of any generator, reproducibly.
     """
+    from r2flow.generators import RectifiedFlow
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.saving import save_checkpoint
@@ -64,7 +65,10 @@ def export(
         digest = sha256(out.read_bytes()).hexdigest()
         print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {digest}")
         return
-    sampler = loaded.generator.choose(**how.given)
+    # Other generators are refused whatever their sampler.
+    sampler = None
+    if isinstance(loaded.generator, RectifiedFlow):
+        sampler = loaded.generator.choose(**how.given)
     logging.getLogger("r2flow.model.export").setLevel(logging.INFO)
     written = writing.export(loaded, out, sampler, network)
     content = "the network v(t, x)" if network else sampler
