@@ -35,9 +35,12 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             cause = error.__context__ if isinstance(error, RuntimeError) else error
             if not isinstance(cause, OSError):
                 raise
+            kept = "Fix"
+            if any(Path(path).parent.glob("step-*.ckpt")):
+                kept = "The earlier checkpoints are intact; fix"
             raise InputError(
-                f"{path} cannot be written: {cause.strerror or cause}. Earlier checkpoints are "
-                "intact; fix this and give the same command again."
+                f"{path} cannot be written: {cause.strerror or cause}. {kept} this and give the "
+                "same command again."
             ) from None
 
     def load_checkpoint(
