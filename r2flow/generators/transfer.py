@@ -79,6 +79,7 @@ class TransferFlow(Flow):
         self.sigma = sigma
         inputs = space.shape[0] + FEATURES + RowFeatures.FEATURES
         self.backbone = build_backbone(backbone, space.rays, inputs, 3 * _CANDIDATES + 2)
+        self.backbone.refuse_parametrised(type(self).__name__)
         if not self.backbone.any_size:
             raise InputError(
                 "a transfer flow needs a backbone for any size: give backbone=local, not "

@@ -67,6 +67,7 @@ class Diffusion(NetworkFlow):
         clip: Positive | None = 1.0,
     ) -> None:
         super().__init__(space, backbone)
+        self.backbone.refuse_parametrised(type(self).__name__)
         self.prediction = PREDICTIONS[prediction]
         self.clip = clip
         self.answer = f"{prediction}(z, log-SNR)"
