@@ -8,7 +8,7 @@ stopped by the clock would not.
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -23,6 +23,7 @@ from torch.autograd.graph import saved_tensors_hooks
 
 from r2flow.callbacks import ReflowPairs
 from r2flow.config import key_of, override
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import SIMULATED
 from r2flow.errors import InputError, naming
 from r2flow.files import read_json, write_file
@@ -108,7 +109,7 @@ def _now(device: torch.device) -> float:
     return time.perf_counter()
 
 
-@dataclass(frozen=True)
+@dataclass
 class Ablation:
     """A sweep of config keys in a folder, with seeds 0, 1, ..., `seeds` - 1.
 
@@ -123,6 +124,7 @@ class Ablation:
     seeds: int
     budget: float
     out: Path
+    _data: ScanDataModule | None = field(default=None, init=False)
 
     @cached_property
     def variants(self) -> dict[str, list[str]]:
@@ -205,7 +207,11 @@ class Ablation:
 
     def _build(self, own: Sequence[str], seed: int, folder: Path) -> Run:
         given = _overrides(own, seed, folder)
-        return build(compose(given), given)
+        run = build(compose(given), given)
+        if self._data is not None and self._data.described() == run.data.described():
+            run.data = self._data  # with the scans that it has read
+        self._data = run.data
+        return run
 
     def _plan(self) -> Mapping[str, int] | None:
         """Steps of each combination, from the folder's plan or measured now; None: as given."""
