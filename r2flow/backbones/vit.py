@@ -86,8 +86,8 @@ class ViT(Backbone):
         rays = F.avg_pool2d(self.coords, self.patch)
         features = self.position.embedding(rays).permute(0, 2, 3, 1)
         self.register_buffer("features", features, persistent=False)
+        # Registers are not rotated.
+        still = rays.new_zeros(1, 2, 1, self.registers.shape[1])
         first: Any = self.blocks[0]
-        table = first.residual_attn.rope.table(rays).flatten(1, 2)
-        still = torch.zeros_like(table[:, :1]).expand(-1, self.registers.shape[1], -1, -1, -1)
-        still = still + table.new_tensor([1, 0]).view(2, 1, 1, 1, 1)  # no rotation
-        self.register_buffer("table", torch.cat([still, table], 1)[:, None], persistent=False)
+        angles = torch.cat([still, rays.flatten(2)[:, :, None]], 3)
+        self.register_buffer("table", first.residual_attn.rope.table(angles), persistent=False)

@@ -34,7 +34,7 @@ from r2flow.metrics.things import LINES
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint, weights_hash
 from r2flow.noise import Draws
 from r2flow.reports.backbones import cost
-from r2flow.reports.pages import STYLES, Page, Plot, lines_figure
+from r2flow.reports.pages import Page, Plot, lines_figure
 from r2flow.reports.tables import Row, shown, table
 
 TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of the error of x_1
@@ -63,12 +63,7 @@ def measure_run(
     Every run has the same held-out scans and the same noise.
     """
     checkpoint = load_checkpoint(run, device)
-    recipe = {
-        "weights": weights_hash(checkpoint),
-        "real": [real.label, len(real), real.identity],
-        "evaluations": list(evaluations),
-    }
-    recipe = json.loads(json.dumps(recipe))
+    recipe = [weights_hash(checkpoint), real.label, len(real), str(real.identity), *evaluations]
     path = run / "ablation.json"
     if path.is_file():
         stored = read_json(path)
@@ -235,23 +230,22 @@ def print_ablation(groups: Groups, page: Page) -> None:
 
 def figure_of(groups: Groups) -> Figure:
     """Distance against evaluations and error of x_1 against time, with mean ± 2 standard errors."""
-    plots: list[Plot] = []
+    plots = []
     bands = []
     for start, label in (("distance in ", "network evaluations"), ("error of x_1, t = ", "t")):
         titles = [title for title in measures(groups) if title.startswith(start)]
         x = [float(title.removeprefix(start)) for title in titles]
-        lines = {}
-        for name, runs in groups.items():
-            spreads = [spread(errors(runs, title)) for title in titles]
-            lines[name] = x, [mean for mean, _ in spreads]
-            bands.append((len(plots), name, x, spreads))
+        spreads = [[spread(errors(runs, title)) for title in titles] for runs in groups.values()]
+        means = [[mean for mean, _ in one] for one in spreads]
+        lines = {name: (x, y) for name, y in zip(groups, means, strict=True)}
         plots.append(Plot(label, kind_of(start), lines, log_x=label != "t"))
+        bands.append((x, spreads))
     figure = lines_figure(plots, 2)
-    for panel, name, x, spreads in bands:
-        low = [mean - 2 * error for mean, error in spreads]
-        high = [mean + 2 * error for mean, error in spreads]
-        color = STYLES[list(groups).index(name) % len(STYLES)]["color"]
-        figure.axes[panel].fill_between(x, low, high, color=color, alpha=0.15, lw=0)
+    for axes, (x, spreads) in zip(figure.axes, bands, strict=True):
+        for line, one in zip(axes.lines, spreads, strict=True):
+            low = [mean - 2 * error for mean, error in one]
+            high = [mean + 2 * error for mean, error in one]
+            axes.fill_between(x, low, high, color=line.get_color(), alpha=0.15, lw=0)
     return figure
 
 

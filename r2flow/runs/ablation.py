@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import product
+from itertools import compress, product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -18,11 +18,12 @@ from typing import Any
 import lightning as L
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
 from r2flow.callbacks import ReflowPairs
-from r2flow.config import key_of, override
+from r2flow.config import override
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import SIMULATED
 from r2flow.errors import InputError, naming
@@ -36,6 +37,7 @@ from r2flow.training import Run, build, check, fit
 PLAN = "plan.json"
 HELD_OUT = "simulated:1000"  # a seed that no run trains on
 _TRIAL = 12  # steps that measure the seconds of one
+_LENGTHS = ("max_steps", "val_check_interval")
 _RESERVED = ("seed", "run_dir", "name", "chain", "preview")
 # Of every run, unless the command line says otherwise.
 _DEFAULTS = (
@@ -127,32 +129,37 @@ class Ablation:
     _data: ScanDataModule | None = field(default=None, init=False)
 
     @cached_property
-    def variants(self) -> dict[str, list[str]]:
-        """Overrides of each combination, by its swept values."""
-        swept: list[list[tuple[str, str]]] = []
-        for parsed in OverridesParser.create().parse_overrides(list(self.keys)):
-            key = parsed.get_key_element()
-            if key.lstrip("+~") in _RESERVED:
-                raise InputError(f"an ablation sets {key.lstrip('+~')} itself: leave it out.")
-            if parsed.is_sweep_override():
-                values = list(map(str, parsed.sweep_string_iterator()))
-                swept.append([(value, f"{key}={value}") for value in values])
-            else:
-                swept.append([("", str(parsed.input_line))])
-        found = {}
-        for combination in product(*swept):
-            name = ", ".join(value for value, _ in combination if value)
-            found[name] = [text for _, text in combination]
-        if len(found) < 2:
+    def _parsed(self) -> list[Override]:
+        parsed = OverridesParser.create().parse_overrides(list(self.keys))
+        for one in parsed:
+            if one.key_or_group in _RESERVED:
+                raise InputError(f"an ablation sets {one.key_or_group} itself: leave it out.")
+        if not any(one.is_sweep_override() for one in parsed):
             raise InputError(
                 "nothing to compare: give a key several values, as backbone=hdit_tiny,vit_tiny."
             )
-        return found
+        return parsed
+
+    @cached_property
+    def variants(self) -> dict[str, list[str]]:
+        """Overrides of each combination, by its swept values."""
+        choices = []
+        for one in self._parsed:
+            values = [str(one.input_line)]
+            if one.is_sweep_override():
+                key = one.get_key_element()
+                values = [f"{key}={value}" for value in one.sweep_string_iterator()]
+            choices.append(values)
+        swept = [one.is_sweep_override() for one in self._parsed]
+        return {
+            ", ".join(text.partition("=")[2] for text in compress(own, swept)): list(own)
+            for own in product(*choices)
+        }
 
     @property
     def swept(self) -> str:
         """The swept keys."""
-        return ", ".join(key_of(text) for text in self.keys if self._is_swept(text))
+        return ", ".join(one.key_or_group for one in self._parsed if one.is_sweep_override())
 
     @property
     def seconds(self) -> float:
@@ -192,8 +199,9 @@ class Ablation:
                 run = self.runs[name][seed]
                 if has_ended(run):
                     continue
-                length = [] if steps is None else [f"trainer.max_steps={steps[name]}"]
-                length += [] if steps is None else [f"trainer.val_check_interval={steps[name]}"]
+                length = []
+                if steps is not None:  # validated at the end alone
+                    length = [f"trainer.{key}={steps[name]}" for key in _LENGTHS]
                 print(f"[{number}/{count}] {name}, seed {seed}: {run}", flush=True)
                 if not self._fit(name, [*length, *own], seed, run):
                     return False
@@ -230,7 +238,7 @@ class Ablation:
                 length = _overrides(own, 0, self.runs[name][0])
                 check(compose(length), length)
         steps = None
-        if not any(key_of(text) == "trainer.max_steps" for text in self.keys):
+        if not any(one.key_or_group == "trainer.max_steps" for one in self._parsed):
             steps = {name: self._steps(name) for name in self.variants}
         write_file(path, json.dumps({"given": given, "steps": steps}, indent=1))
         return steps
@@ -245,9 +253,6 @@ class Ablation:
         seconds = median(clock.seconds[2:])
         print(f"{name}: {run.data.batch_size / seconds:.1f} images/s in training", flush=True)
         return max(round(self.seconds / seconds), 1)
-
-    def _is_swept(self, text: str) -> bool:
-        return OverridesParser.create().parse_override(text).is_sweep_override()
 
 
 def _overrides(own: Sequence[str], seed: int, folder: Path) -> list[str]:
