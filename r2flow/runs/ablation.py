@@ -28,11 +28,12 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import SIMULATED
 from r2flow.errors import InputError, naming
 from r2flow.files import read_json, write_file
+from r2flow.generators import as_flow
 from r2flow.model.checkpoint import find_checkpoint, read_checkpoint
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended
 from r2flow.runs.launch import job_folder
-from r2flow.training import Run, build, check, fit
+from r2flow.training import Run, build, fit
 
 PLAN = "plan.json"
 HELD_OUT = "simulated:1000"  # a seed that no run trains on
@@ -214,7 +215,7 @@ class Ablation:
             return fit(run).finished
 
     def _build(self, own: Sequence[str], seed: int, folder: Path) -> Run:
-        given = _overrides(own, seed, folder)
+        given = [*_DEFAULTS, *own, f"seed={seed}", override("run_dir", str(folder))]
         run = build(compose(given), given)
         if self._data is not None and self._data.described() == run.data.described():
             run.data = self._data  # with the scans that it has read
@@ -235,8 +236,8 @@ class Ablation:
             return plan["steps"]
         for name, own in self.variants.items():
             with naming(name):
-                length = _overrides(own, 0, self.runs[name][0])
-                check(compose(length), length)
+                run = self._build(own, 0, self.runs[name][0])
+                as_flow(run.stage.generator, "an ablation", distilled=True)
         steps = None
         if not any(one.key_or_group == "trainer.max_steps" for one in self._parsed):
             steps = {name: self._steps(name) for name in self.variants}
@@ -250,13 +251,9 @@ class Ablation:
         clock = Clock()
         run.trainer.callbacks += [ReflowPairs(), clock]  # type: ignore[attr-defined]
         fit(run)
-        seconds = median(clock.seconds[2:])
+        seconds = median(clock.seconds[2:]) * run.trainer.accumulate_grad_batches
         print(f"{name}: {run.data.batch_size / seconds:.1f} images/s in training", flush=True)
         return max(round(self.seconds / seconds), 1)
-
-
-def _overrides(own: Sequence[str], seed: int, folder: Path) -> list[str]:
-    return [*_DEFAULTS, *own, f"seed={seed}", override("run_dir", str(folder))]
 
 
 def training_cost(run: Path) -> dict[str, float]:
