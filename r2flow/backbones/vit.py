@@ -74,7 +74,8 @@ class ViT(Backbone):
         condition = self.condition(self.time, t, s)
         grid = uncast(self.tokenizer, x).permute(0, 2, 3, 1)
         grid = grid + self.position(self.features).to(grid.dtype)
-        registers = self.registers.to(grid.dtype).expand(len(grid), -1, -1)
+        # not len(grid), which torch.export would take for a constant
+        registers = self.registers.to(grid.dtype).expand(grid.shape[0], -1, -1)
         # A map of one row, as blocks take it.
         h = torch.cat([registers, grid.flatten(1, 2)], 1)[:, None]
         for block in self.blocks:
