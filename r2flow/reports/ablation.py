@@ -199,7 +199,7 @@ def errors(runs: Sequence[Row], title: str) -> list[float]:
 
 def _cell(values: Sequence[float]) -> str:
     mean, error = spread(values)
-    return shown(mean) if not error > 0 else f"{shown(mean)} ± {error:.1g}"
+    return shown(mean) if not error > 0 else f"{shown(mean)} ± {float(f'{error:.1g}'):g}"
 
 
 def conclusion(groups: Groups, title: str) -> str:
