@@ -11,7 +11,8 @@ from lightning.pytorch.callbacks import Checkpoint
 
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.model.checkpoint import FOLDER, checkpoints_of, read_checkpoint, step_of
+from r2flow.model.paths import FOLDER, checkpoints_of, step_of
+from r2flow.model.tensor_files import read_checkpoint
 from r2flow.registry import Count
 
 

@@ -13,7 +13,7 @@ from torch.nn.utils import get_total_norm
 
 from r2flow.data.loader import RunSampler
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import checkpoints_of
+from r2flow.model.paths import checkpoints_of
 from r2flow.registry import Count, NonNegative
 from r2flow.signals import wait_for_launcher
 

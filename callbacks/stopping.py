@@ -15,7 +15,7 @@ import lightning as L
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
-from r2flow.model.checkpoint import checkpoints_of
+from r2flow.model.paths import checkpoints_of
 from r2flow.registry import Count
 from r2flow.signals import (
     LATER,

@@ -76,7 +76,7 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
         InputError: unknown model, unusable file or unavailable device.
     """
     from r2flow.devices import choose_device
-    from r2flow.model.checkpoint import load_checkpoint  # slow, imports torch
+    from r2flow.model.checkpoint import load_checkpoint
 
     return load_checkpoint(name, choose_device(str(device), "device"))
 
@@ -91,15 +91,16 @@ def read(
     without a return.
 
     Args:
-        path: A scan file, or a range image (.npy).
+        path: A scan file, a range image (.npy) or a sample of the published R2Flow code (.pth).
         sensor: Sensor of the image, or its name or YAML file. Default: the sensor in the manifest
             of a folder that r2flow wrote, else the built-in sensor with the file's beams, else
-            hdl64e.
+            hdl64e; a range image keeps its size.
         reflectance_scale: Value of full reflectance in the file. Default: the sensor's, else the
             first of 1, 100 (with a warning), 255, 256, 65535 that no value exceeds or, with a
             warning, about the largest value if that is below a tenth of it. Fractions of 1 are not
             divided by 100, 255, 256 or 65535.
-        columns: Names of the columns of a file without names, as ("x", "y", "z", "intensity", "_").
+        columns: Names of the columns of a file without names, as ("x", "y", "z", "intensity", "_");
+            fields to rename in a file with names, as ("intensities=reflectance",).
 
     Raises:
         InputError: the file cannot be read, or no point is in the sensor's field of view.

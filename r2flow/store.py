@@ -1,8 +1,9 @@
 """Stores: folders of numbered items, written by any number of processes and resumable.
 
-    store = Store(folder, "scans", recipe) store.begin()                                    # claims
-    the folder, or refuses one with another recipe store.make(store.missing(range(9)), work, 4)
-    # work(i) calls store.write(i, tensors, notes) tensors, notes = store.read(3)
+    store = Store(folder, "scans", recipe)
+    store.begin()                                  # claims the folder, or refuses another recipe
+    store.make(store.missing(range(9)), work, 4)   # work(i) calls store.write(i, tensors, notes)
+    tensors, notes = store.read(3)
 
 An item depends only on the recipe and on its number: two processes that make the same item write
 the same bytes. `manifest.json` stores the recipe; an item is a safetensors file with the digest of

@@ -26,7 +26,8 @@ from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.model.checkpoint import MODEL, Checkpoint
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.parts import MODEL
 from r2flow.registry import construct
 from r2flow.reports.pictures import save_figure
 from r2flow.stages import STAGES

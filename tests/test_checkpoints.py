@@ -14,8 +14,10 @@ from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import build_space
-from r2flow.model.checkpoint import Checkpoint, check_weights, load_checkpoint, save_checkpoint
+from r2flow.model.checkpoint import Checkpoint, check_weights, load_checkpoint
 from r2flow.model.published import published_config
+from r2flow.model.saving import save_checkpoint
+from r2flow.model.tensor_files import read_checkpoint
 from tests.conftest import CONFIG, Trap, refused, small_disk
 
 
@@ -94,6 +96,24 @@ def test_compressed_tensors_are_refused_before_they_are_unpacked(saved):
     assert torch.load(path, weights_only=True)["global_step"] == 7
     with pytest.raises(InputError, match="compressed"):
         load_checkpoint(path)
+
+
+@pytest.mark.parametrize("bit", [0, 6])
+def test_a_flipped_bit_is_found(saved, tmp_path: Path, bit: int):
+    path, _ = saved
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as whole:
+        tensors = [entry for entry in whole.infolist() if "/data/" in entry.filename]
+        largest = max(tensors, key=lambda entry: entry.file_size)
+        stored = whole.read(largest)
+    content[content.index(stored) + largest.file_size // 2] ^= 1 << bit
+    (tmp_path / "flipped.ckpt").write_bytes(content)
+    torch.load(tmp_path / "flipped.ckpt", weights_only=True)  # which does not see it
+    for read in (load_checkpoint, read_checkpoint):
+        with pytest.raises(
+            InputError, match=r"flipped.ckpt is damaged: the checksum of .* differs"
+        ):
+            read(tmp_path / "flipped.ckpt")
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,8 @@ from r2flow.metrics import METRICS
 from r2flow.metrics.base import SumMetric
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.scans import Scans
-from r2flow.model.checkpoint import Checkpoint, save_checkpoint
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.saving import save_checkpoint
 from r2flow.reports.paper import read_results
 from r2flow.samplers import build_sampler
 from tests.conftest import CONFIG, SENSOR, folder, images

@@ -15,8 +15,8 @@ from r2flow.config import RULES, as_override, flatten, key_of
 from r2flow.data.augment import Augmentation
 from r2flow.data.options import DataOptions, PairOptions
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import MODEL
 from r2flow.model.lineage import Parent
+from r2flow.model.parts import MODEL
 from r2flow.registry import options_of
 from r2flow.runs.composing import CONF, choices, compose
 from r2flow.stages import STAGES

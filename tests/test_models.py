@@ -17,7 +17,9 @@ from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import parse_mask, ray_states
 from r2flow.lidar.sensors import build_sensor
 from r2flow.metrics.completion import errors
-from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.paths import find_checkpoint
+from r2flow.model.saving import save_checkpoint
 from r2flow.models import MODELS, find_model, name_of
 from r2flow.simulator import simulate
 from tests.conftest import ROOT

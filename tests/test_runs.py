@@ -9,6 +9,7 @@ import pytest
 import torch
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
+from r2flow.config import check_tree
 from r2flow.errors import InputError
 from r2flow.runs.folder import (
     RESUMED,
@@ -163,3 +164,35 @@ def test_the_lock_names_its_holder_and_ends_when_that_is_killed(tmp_path: Path):
         run_lock(tmp_path, patience=0),
     ):
         pass
+
+
+def test_a_config_cut_at_any_line_is_refused(tmp_path: Path):
+    open_run(tmp_path, CONFIG)
+    path = tmp_path / "config.yaml"
+    lines = path.read_text().splitlines(keepends=True)
+    assert read_config(tmp_path) == CONFIG
+    for kept in range(1, len(lines)):
+        path.write_text("".join(lines[:kept]))
+        with pytest.raises(
+            InputError, match=r"config.yaml is damaged .*; the checkpoints are usable"
+        ):
+            read_config(tmp_path)
+
+
+def test_nested_anchors_are_refused_unexpanded(tmp_path: Path):
+    """Ten lists of ten of the list before: 10^10 values, which no memory holds."""
+    lists = [f"l{n}: &l{n} [{', '.join([f'*l{n - 1}'] * 10)}]" for n in range(1, 11)]
+    (tmp_path / "config.yaml").write_text("\n".join(["l0: &l0 [1]", *lists]))
+    with pytest.raises(InputError, match="aliases"):
+        read_config(tmp_path)
+    nested: list = [1]
+    for _ in range(10):
+        nested = [nested] * 10
+    with pytest.raises(ValueError, match="more than 1,000,000 values"):
+        check_tree({"data": {"root": nested}})
+
+
+def test_one_part_in_two_places_is_written_twice(tmp_path: Path):
+    shared = ["a", "b"]
+    open_run(tmp_path, CONFIG | {"x": shared, "y": shared})
+    assert read_config(tmp_path) == CONFIG | {"x": shared, "y": shared}

@@ -27,7 +27,8 @@ from r2flow.cli.app import app
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.saving import save_checkpoint
 from tests.conftest import CONFIG, ground, write_checkpoint
 
 VERBS = """

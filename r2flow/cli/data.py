@@ -192,6 +192,7 @@ def unpack(
     most: Annotated[
         int | None, Option("--num", min=1, help="Maximum number of scans to write.")
     ] = None,
+    columns: ColumnsOption = None,
 ) -> None:
     """Write the PointCloud2 messages of a recording as scan files, named by time in ns.
 
@@ -203,7 +204,7 @@ def unpack(
     from r2flow.progress import track
 
     stamps = Counter[int]()
-    messages = track(read_bag(recording, topic), "unpacking", "scans", most or 0)
+    messages = track(read_bag(recording, topic, columns), "unpacking", "scans", most or 0)
     for stamp, points in islice(messages, 0, None, every):
         if isinstance(points, InputError):
             _log.warning("left out: %s", points)

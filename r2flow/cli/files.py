@@ -48,7 +48,8 @@ def export(
     """
     from r2flow.generators import RectifiedFlow
     from r2flow.model import export as writing
-    from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.saving import save_checkpoint
 
     network = what == "network"
     name = checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name

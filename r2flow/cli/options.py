@@ -68,8 +68,8 @@ ColumnsOption = Annotated[
     Option(
         parser=parse_columns,
         metavar="NAMES",
-        help="Columns of scan files without column names, such as x,y,z,intensity,_. "
-        "Default: the format's.",
+        help="All columns of scan files without names, such as x,y,z,intensity,_; of files with "
+        "names those to rename, such as intensities=reflectance. Default: the format's.",
     ),
 ]
 

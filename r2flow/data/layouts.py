@@ -208,8 +208,7 @@ def nuscenes(root: Path) -> list[Drive]:
 
 
 def folder(root: Path) -> list[Drive]:
-    """Any folder of .bin, .pcd.bin, .pcd, .ply, .npy, .xyz, .las, .feather, .parquet, else of .csv,
-    .txt, .npz.
+    """Any folder of .bin, .pcd, .ply, .npy, .xyz, .las, .feather, .parquet, else .csv, .txt, .pth.
 
     Each folder below it with such files is a drive. If a scan exists in several formats, one file
     is taken: its range image, else the last by its ending. Folders that r2flow wrote below a folder

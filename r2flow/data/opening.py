@@ -418,7 +418,7 @@ def read(
         raise InputError(f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
     fields: dict[str, Any] = {"reflectance_scale": reflectance_scale, "columns": columns}
     reading = reading_for([scans], sensor=sensor, estimate_scale=True, **fields)
-    image = torch.from_numpy(
-        open_scans(scans, replace(reading, on_bad_scan="error", within_limits=True)).source[0]
-    )
+    reading = replace(reading, on_bad_scan="error", within_limits=True)
+    own_size = sensor is None and read_range_image(scans.file) is not None
+    image = torch.from_numpy(open_scans(scans, reading, own_size=own_size).source[0])
     return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])

@@ -24,6 +24,7 @@ from r2flow.errors import InputError, check, warn_odd
 from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.lidar.turns import SEVERAL, turns
 from r2flow.store import MANIFEST, manifest_of
 
 log = logging.getLogger(__name__)
@@ -157,7 +158,12 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Do
 
 
 def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
-    """Warn, once per folder, of scans not in one sensor's own frame; whether they are not."""
+    """Warn, once per folder, of scans not in one sensor's own frame; whether they are not.
+
+    Warns of files of several turns, too.
+    """
+    if any(turns(scan) > SEVERAL for scan in scans):
+        warn_odd(Path(path), "a file holds several turns of the sensor; a scan is one: split it")
     if unclear := is_unclear(scans):
         warn_odd(
             Path(path),

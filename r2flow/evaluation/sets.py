@@ -17,8 +17,10 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
-from r2flow.model.checkpoint import Checkpoint, checkpoints_of, weights_hash
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.paths import checkpoints_of
 from r2flow.model.sampling import draw
+from r2flow.model.saving import weights_hash
 from r2flow.models import MODELS
 from r2flow.noise import generator, standard_normal
 

@@ -124,7 +124,8 @@ class Generator(nn.Module):
         """Generate x_1 in model space, (B, C, H, W), with evaluations and convergence per scan.
 
         Args:
-            noise: (B, *noise_shape).
+            noise: (B, *noise_shape), of any floating type; float64 noise of a model with a velocity
+                gives float64 scans, else they have the type of the weights.
             sampler: Sampler; None: the default.
             draws: Noise of stochastic samplers: `draws.step(shape, j)` at step j = 1, 2, ...
             precision: `bf16-mixed` runs the network's matrix products in bfloat16; states and steps
@@ -139,8 +140,10 @@ class Generator(nn.Module):
             )
         if draws is None and how.draws:
             raise InputError(f"sampler {how.name} is stochastic: give draws.")
-        dtype = torch.promote_types(noise.dtype, next(self.parameters(), noise).dtype)
-        x = wide(noise.to(self.device, dtype))  # float64 for weights of 64-true runs
+        dtype = next(self.parameters(), noise).dtype  # float64 for weights of 64-true runs
+        if hasattr(self, "velocity"):  # a solver's state may have more digits than its network
+            dtype = torch.promote_types(noise.dtype, dtype)
+        x = wide(noise.to(self.device, dtype))
         if condition is not None:
             condition = {name: value.to(self.device) for name, value in condition.items()}
         noise_of_step = None

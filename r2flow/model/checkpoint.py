@@ -2,55 +2,34 @@
 execution.
 """
 
-import json
-import os
-import pickle
-import re
 import warnings
-import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
-from safetensors import safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
-from r2flow.config import check_tree, learned
 from r2flow.data.opening import describe, reading_for
 from r2flow.data.partial import PartialScan, open_partial
 from r2flow.errors import IN_MEMORY, InputError, check, naming
-from r2flow.files import reading_errors, write_file
+from r2flow.files import reading_errors
 from r2flow.generators import Generator, TransferFlow, build_generator
-from r2flow.hashing import state_hash
-from r2flow.lidar.encoding import Encoding, build_space
+from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.model.completion import complete
-from r2flow.model.published import BACKBONE, FORMATS, inert, plain
+from r2flow.model.parts import HYPER, NOTES, PREFIX, config_of
+from r2flow.model.paths import find_checkpoint, title_of
+from r2flow.model.published import FORMATS
 from r2flow.model.sampling import sample
-from r2flow.models import MODELS, find_model
+from r2flow.model.saving import save_checkpoint
+from r2flow.model.tensor_files import is_dense, read_checkpoint, read_safetensors
 from r2flow.plugins import made_with
-from r2flow.registry import did_you_mean
 from r2flow.samplers import build_sampler
-
-FOLDER = "checkpoints"
-PREFIX = "generator."  # of the generator's weights in a LightningModule
-COMPILED = "_orig_mod."  # in the names of the weights after torch.compile
-HYPER = "hyper_parameters"  # Lightning's key of a module's options
-# key of our notes in a checkpoint of Lightning, and of the JSON metadata in a .safetensors
-NOTES = "r2flow"
-MODEL = (
-    "backbone",
-    "sensor",
-    "encoding",
-    "generator",
-)  # hyper-parameters of the model, the others are the stage's
-SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors
 
 
 @dataclass(frozen=True, repr=False)
@@ -217,115 +196,6 @@ class Checkpoint:
         save_checkpoint(self, path)
 
 
-def title_of(path: Path) -> str:
-    """Name of a checkpoint's run, else of its file."""
-    path = path.resolve()
-    return path.parents[1].name if path.parent.name == FOLDER else path.stem
-
-
-def step_of(path: Path) -> int:
-    """The step in a checkpoint's file name; -1 without one."""
-    match = re.search(r"step-(\d+)", path.name)
-    return int(match.group(1)) if match else -1
-
-
-def checkpoints_of(run: str | Path) -> list[Path]:
-    """The checkpoints of a run folder, the latest first."""
-    paths = [
-        path
-        for path in Path(run, FOLDER).glob("step-*.ckpt")
-        if path.is_file() and not path.is_symlink()
-    ]
-    return sorted(paths, key=step_of, reverse=True)
-
-
-def find_checkpoint(path: str | Path) -> Path:
-    """Path of a checkpoint file, of the latest checkpoint of a run folder, or of a model's file by
-    its name.
-
-    A file or a run in the current folder takes precedence over a model of the same name.
-    """
-    name, path = str(path).rstrip("/"), Path(path).expanduser()
-    if path.is_file():
-        return path
-    checkpoints = checkpoints_of(path) or sorted(
-        path.glob("step-*.ckpt"), key=step_of, reverse=True
-    )
-    if checkpoints:
-        return checkpoints[0]
-    if name in MODELS and (path.is_dir() or not path.exists()):
-        return find_model(name)
-    problem = f"no checkpoint at {path}."
-    known = [*MODELS, *(folder.name for folder in path.parent.glob("*/"))]
-    models = ", ".join(MODELS)
-    hint = f"Give a checkpoint file, a run folder or a model ({models})."
-    hint += did_you_mean(path.name, known)
-    if path.is_dir():
-        problem = f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt)."
-        runs = sorted(
-            str(folder.parent)
-            for folder in path.glob(f"*/{FOLDER}")
-            if checkpoints_of(folder.parent)
-        )
-        hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
-    elif path.exists():  # reading a pipe would block
-        problem = f"{path} is not a regular file."
-    raise InputError(f"{problem} {hint}")
-
-
-def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> Any:
-    """Read an r2flow checkpoint, a dict, or a published one. Only tensors and plain values: a file
-    cannot run code.
-    """
-    with reading_errors(Path(path)), open(path, "rb") as file:
-        return read_torch(file, path, map_location)
-
-
-def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
-    """Read tensors and plain values from a torch file, without code execution; `InputError` for any
-    other content.
-    """
-    _refuse_unpacking(file, name)
-    try:
-        with warnings.catch_warnings(action="ignore"), inert():  # torch may warn
-            content = torch.load(file, map_location=map_location, weights_only=True)
-            if not isinstance(content, dict):
-                return content
-            content = {key: plain(value) for key, value in content.items()}
-            check_tree(content.get(HYPER) or {})
-            return content
-    except Exception as error:  # torch.load raises nearly any exception on other files
-        if isinstance(error, OSError) and error.errno is not None:
-            raise
-        code = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
-        size = file.seek(0, os.SEEK_END)
-        problem = f"is not a checkpoint, or a damaged one ({size} bytes). "
-        problem += "Give a .ckpt of r2flow or a published file."
-        if code is not None and isinstance(error, pickle.UnpicklingError):
-            problem = (
-                f"is refused: it holds objects that would run code when loaded ({code[1]}), not "
-                "only tensors and plain "
-                "values. Ask its author for a weights-only file."
-            )
-        raise InputError(f"{name} {problem}") from None
-
-
-def _refuse_unpacking(file: IO[bytes], name: object) -> None:
-    """Refuse zip archives with compressed entries (zip bombs): torch writes none."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            entries = archive.infolist()
-    except Exception:  # torch's legacy format, or damaged: torch.load tells
-        entries = []
-    packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
-    if packed or sum(entry.file_size for entry in entries) > file.seek(0, os.SEEK_END):
-        raise InputError(
-            f"{name} holds compressed tensors, which torch never writes. Ask its author for "
-            "another file."
-        )
-    file.seek(0)
-
-
 @torch.inference_mode(False)  # `mmps` needs gradients later
 def load_checkpoint(
     path: str | Path, device: str | torch.device = "cpu", averaged: bool = True
@@ -440,103 +310,6 @@ def _built(
                 bool(drawing.get("fixed")),
             )
     return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind)
-
-
-def config_of(
-    stage: Mapping[str, Any], data: Mapping[str, Any], name: str | None
-) -> dict[str, Any]:
-    """The config of a model by the hyper-parameters of its stage, of this name, and of its data.
-
-    Its keys are the hyper-parameters of `MODEL`, `sampler`, `few` and `seed`, `stage` with the
-    others, and `data`.
-    """
-    options = dict(stage)
-    config: dict[str, Any] = {key: options.pop(key) for key in (*MODEL, "sampler", "few", "seed")}
-    config["stage"] = {"name": name, **options}
-    config["data"] = {
-        key: value for key, value in data.items() if key not in ("sensor", "encoding", "seed")
-    }
-    return config
-
-
-def weights_hash(checkpoint: Checkpoint) -> str:
-    """Hash of a generator in 16 hex digits: averaged weights, sensor and encoding, independent of
-    the file format.
-    """
-    meaning = {key: checkpoint.config[key] for key in ("sensor", "encoding")}
-    state = {
-        name.removeprefix(BACKBONE): value
-        for name, value in checkpoint.generator.state_dict().items()
-    }
-    return state_hash(state, meaning)[:16]
-
-
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read the tensors and the metadata of a `.safetensors`."""
-    with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
-
-
-def read_safetensors(path: Path) -> dict[str, Any]:
-    """Read `weights`, config, step and samplers of an r2flow `.safetensors`."""
-    weights, metadata = read_tensors(path)
-    notes = json.loads(metadata.get(NOTES, "{}"))
-    if not isinstance(notes, dict) or notes.pop("digest", None) != state_hash(weights, notes):
-        raise InputError(
-            f"{path} is not a model of r2flow, or damaged: its checksum differs. Use another "
-            "checkpoint."
-        )
-    check_tree(notes["config"])
-    return notes | {"weights": weights}
-
-
-def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False) -> None:
-    """Write a generator with its config as a `.safetensors`; `half` rounds large matrices to
-    float16.
-
-    The bytes depend on the generator alone: of its config, the file stores the keys of
-    `r2flow.config.learned` and the names of plug-ins, without paths of this machine.
-    """
-    path = Path(path)
-    check(path.suffix == ".safetensors", f"{path}: a checkpoint is written as .safetensors.")
-    moved = checkpoint.sensor != build_space(checkpoint.config).sensor
-    check(
-        not moved,
-        f"{path}: a file keeps the sensor of training alone: save the model before `through`.",
-    )
-    state, parameters = checkpoint.generator.state_dict(), checkpoint.generator.named_parameters()
-    weights = {
-        n.replace(COMPILED, ""): value.detach().cpu().contiguous().clone()
-        for n, value in state.items()
-    }
-    if half:
-        large = [
-            n.replace(COMPILED, "")
-            for n, value in parameters
-            if value.ndim > 1 and value.numel() > SMALL
-        ]
-        weights |= {n: weights[n].half() for n in large}
-        finite = all(weights[n].isfinite().all() for n in large)
-        check(
-            finite, f"{path}: weights beyond 65504 do not fit into float16: save them without half."
-        )
-    plugins = [Path(name).name for name in checkpoint.config.get("plugins") or ()]
-    config = learned(checkpoint.config) | ({"plugins": plugins} if plugins else {})
-    notes = {"config": config, "step": checkpoint.step, **checkpoint.generator.drawing()}
-    # Under one key, since the order of several metadata keys is not fixed.
-    write_file(
-        path,
-        save(
-            weights, metadata={NOTES: json.dumps({**notes, "digest": state_hash(weights, notes)})}
-        ),
-    )
-
-
-def is_dense(value: object) -> bool:
-    """Whether a value is a dense real tensor."""
-    if not isinstance(value, Tensor) or value.layout != torch.strided:
-        return False
-    return not (value.is_meta or value.is_quantized or value.is_complex())
 
 
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:

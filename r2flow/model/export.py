@@ -25,7 +25,8 @@ from r2flow.files import write_file
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.projection import unproject
-from r2flow.model.checkpoint import Checkpoint, weights_hash
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.saving import weights_hash
 from r2flow.noise import Draws
 from r2flow.registry import Registry
 

@@ -12,7 +12,8 @@ from r2flow.errors import InputError
 from r2flow.generators import GENERATORS
 from r2flow.lidar.encoding import encoding_options
 from r2flow.lidar.sensors import sensor_options
-from r2flow.model.checkpoint import Checkpoint, load_checkpoint, weights_hash
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
+from r2flow.model.saving import weights_hash
 from r2flow.models import name_of
 from r2flow.registry import options_of
 

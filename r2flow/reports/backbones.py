@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from r2flow.backbones import Backbone, build_backbone, configurations
@@ -31,8 +32,22 @@ OPERATIONS: dict[
     Any, Callable[..., int]
 ] = {  # two operations a multiply-accumulate, as the counter of torch
     ATEN.native_group_norm: lambda x, weight, *_, **__: 2 * math.prod(x) * (5 if weight else 4),
-    ATEN.scaled_dot_product_attention.default: lambda *_, **__: 0,
 }
+
+
+class _FusedAttention(TorchDispatchMode):
+    """Leaves the products of `scaled_dot_product_attention` out: an empty result of its shape.
+
+    The counter's mapping does not do: torch 2.15 decomposes the operation before it looks there.
+    """
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        if func is ATEN.scaled_dot_product_attention.default:
+            query, _, value = args[:3]
+            return query.new_empty(*query.shape[:-1], value.shape[-1])
+        return func(*args, **(kwargs or {}))
 
 
 def count_parameters(model: nn.Module) -> int:
@@ -87,6 +102,7 @@ def count_macs(model: Backbone) -> int:
         with (
             torch.inference_mode(),
             FlopCounterMode(display=False, custom_mapping=OPERATIONS) as counter,
+            _FusedAttention(),  # within the counter, so that it comes first
         ):
             torch.func.functional_call(
                 model, on_meta, (torch.empty(1, device="meta"), x), tie_weights=False

@@ -18,8 +18,10 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import write_scan
 from r2flow.lidar.region import Region
-from r2flow.model.checkpoint import Checkpoint, title_of, weights_hash
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.paths import title_of
 from r2flow.model.sampling import draw, warn_unsolved
+from r2flow.model.saving import weights_hash
 from r2flow.progress import Bar, track
 from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 from r2flow.reports.view import Panel, most_images, write_viewer

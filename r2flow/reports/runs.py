@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import NamedTuple
 
 from r2flow.errors import InputError, naming
-from r2flow.model.checkpoint import checkpoints_of, step_of
+from r2flow.model.paths import checkpoints_of, step_of
 from r2flow.plugins import made_with
 from r2flow.reports.backbones import cost
 from r2flow.reports.tables import Row, short_names
@@ -55,7 +55,8 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     runs = []
     for path, label in zip(folders, short_names(folders), strict=True):
         config = read_config(path) or {}
-        if not {"stage", "backbone", "data", "sensor", "encoding"} <= config.keys():
+        whole = {"stage", "backbone", "data", "sensor", "encoding"} <= config.keys()
+        if not whole or "batch_size" not in config["data"]:
             raise InputError(f"{path / CONFIG} is not the config of a run.")
         keys = ("sensor", "encoding", "backbone", "generator")
         architecture = json.dumps([config.get(key) for key in keys], sort_keys=True)

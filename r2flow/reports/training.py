@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from r2flow.model.checkpoint import checkpoints_of, load_checkpoint
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.paths import checkpoints_of
 from r2flow.reports.outputs import what_next, write_samples
 from r2flow.reports.pages import Plot, lines_figure
 from r2flow.reports.pictures import save_figure

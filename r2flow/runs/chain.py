@@ -11,8 +11,8 @@ from typing import Any
 
 from r2flow.config import flatten, key_of, override, rule
 from r2flow.errors import InputError, naming
-from r2flow.model.checkpoint import FOLDER
 from r2flow.model.lineage import Parent
+from r2flow.model.paths import FOLDER
 from r2flow.runs.composing import compose
 from r2flow.signals import LATER, Stopped
 from r2flow.stages import STAGES
@@ -41,34 +41,11 @@ def links_of(
         )
     links: list[Link] = []
     for name, difference in chain.items():
-        if not (
-            isinstance(difference, Mapping)
-            and isinstance(name, str)
-            and re.fullmatch(r"[\w-][\w.-]*", name)
-        ):
-            raise InputError(
-                f"chain.{name}: a link is a name ('1', not 1) and groups of keys; found "
-                f"{difference!r}."
-            )
-        settings = dict(difference)
-        named = settings.pop("parent", None)
-        parent = None if named is None else str(named)  # a name may be a number
-        own: list[str] = []
-        for key, value in flatten(settings):
-            if (key, value) != ("experiment", None):
-                own.append(
-                    override("stage" if key == "stage.name" else key, value)
-                )  # a choice, with its own options
-        if any(key_of(text) == "plugins" for text in own):
-            raise InputError(
-                f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE."
-            )
-        begins = dict(flatten(difference)).keys() & {
-            "experiment",
-            "parent",
-            "stage.parent",
-        }  # a mistyped link does not
-        if parent not in (None, *(link.name for link in links)) or (links and not begins):
+        parent, own = _own(name, difference)
+        earlier = [link.name for link in links]
+        # A mistyped link has neither.
+        begins = dict(flatten(difference)).keys() & {"experiment", "parent", "stage.parent"}
+        if parent not in (None, *earlier) or (links and not begins):
             raise InputError(
                 f"chain.{name} starts from {parent or 'nothing'}; give parent=EARLIER or an "
                 "experiment."
@@ -77,11 +54,8 @@ def links_of(
             own.append(override("stage.parent", str(Path(folder, parent))))
         # Overrides given for this link alone come last: they replace the link's own keys.
         prefix = f"chain.{name}."
-        alone = [
-            text.lstrip("+").removeprefix(prefix)
-            for text in given
-            if text.lstrip("+").startswith(prefix)
-        ]
+        alone = [text.lstrip("+") for text in given]
+        alone = [text.removeprefix(prefix) for text in alone if text.startswith(prefix)]
         alone = [text for text in alone if not text.startswith("parent=")]
         with naming(f"chain.{name}"):
             config = compose([*own, *alone], configs)
@@ -89,15 +63,35 @@ def links_of(
         concerning = ("all", "pairs" if on_pairs else "scans")
         overrides = [text for text in given if rule(key_of(text)).links in concerning] + alone
         sets = [text for text in (*own, *overrides) if key_of(text) == "data"]
-        if sets and not re.fullmatch(
-            "data='?simulated'?", sets[-1]
-        ):  # other scans have no scenes, or their own
+        # Other scans have no scenes, or their own.
+        if sets and not re.fullmatch("data='?simulated'?", sets[-1]):
             own = [text for text in own if key_of(text) != "data.scenes"]
         run_dir = Path(folder, name)
         links.append(
             Link(name, run_dir, (*own, *overrides, override("run_dir", str(run_dir))), parent)
         )
     return links
+
+
+def _own(name: Any, difference: Any) -> tuple[str | None, list[str]]:
+    """The parent's name and the overrides of a link of the config."""
+    named = isinstance(name, str) and re.fullmatch(r"[\w-][\w.-]*", name)
+    if not (isinstance(difference, Mapping) and named):
+        raise InputError(
+            f"chain.{name}: a link is a name ('1', not 1) and groups of keys; found {difference!r}."
+        )
+    settings = dict(difference)
+    parent = settings.pop("parent", None)
+    own: list[str] = []
+    for key, value in flatten(settings):
+        if (key, value) != ("experiment", None):
+            # A choice, with its own options.
+            own.append(override("stage" if key == "stage.name" else key, value))
+    if any(key_of(text) == "plugins" for text in own):
+        raise InputError(
+            f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE."
+        )
+    return None if parent is None else str(parent), own
 
 
 def train_links(links: Sequence[Link], folders: Sequence[str] = ()) -> int:

@@ -1,6 +1,7 @@
 """Composition of configs: Hydra on `conf/`, with a choice for each entry of a registry."""
 
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -158,9 +159,16 @@ def choices(group: str) -> list[str]:
         return choices(group)
 
 
-OmegaConf.register_new_resolver(
-    "choices", lambda group: ", ".join(choices(group)), replace=True
-)  # for --help
+def register_resolver(name: str, resolver: Callable[[str], str]) -> None:
+    """Make `${name:ARGUMENT}` known to configs.
+
+    omegaconf 2.4 warns that its function has a new name, which in 2.3 is that of another.
+    """
+    with warnings.catch_warnings(action="ignore"):
+        OmegaConf.register_new_resolver(name, resolver, replace=True)
+
+
+register_resolver("choices", lambda group: ", ".join(choices(group)))  # for --help
 
 
 def as_hydra_takes(overrides: Sequence[str]) -> list[str]:

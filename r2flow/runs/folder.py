@@ -14,7 +14,9 @@ from filelock import FileLock, Timeout
 from r2flow.config import at_most_three, check_tree, differences, flatten, rule
 from r2flow.errors import InputError, check
 from r2flow.files import write_file
-from r2flow.model.checkpoint import FOLDER, HYPER, NOTES, checkpoints_of, read_checkpoint, step_of
+from r2flow.model.parts import HYPER, NOTES
+from r2flow.model.paths import FOLDER, checkpoints_of, step_of
+from r2flow.model.tensor_files import read_checkpoint
 
 log = logging.getLogger(__name__)
 
@@ -46,13 +48,30 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
         yield
 
 
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _text(config: Mapping[str, Any]) -> str:
+    """A config as YAML without aliases, from `---` to `...`, which shows that it is whole."""
+    return yaml.dump(
+        dict(config), Dumper=_Dumper, sort_keys=False, explicit_start=True, explicit_end=True
+    )
+
+
 def read_config(run: str | Path) -> dict[str, Any] | None:
-    """The config of a run folder, or None."""
+    """The config of a run folder, or None; `InputError` if the file is cut or damaged."""
     path = Path(run, CONFIG)
     if not path.is_file():
         return None
     try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if text.startswith("---") and text.split()[-1] != "...":
+            raise ValueError("it is cut")
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise ValueError("it has aliases, which can stand for any size")
+        config = yaml.safe_load(text) or {}
         check_tree(config)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
         raise InputError(
@@ -100,7 +119,7 @@ def open_run(run: str | Path, config: Mapping[str, Any], locked: bool = True) ->
     if locked and (
         old != dict(config) or not Path(run, CONFIG).is_file()
     ):  # free keys may have changed
-        write_file(Path(run, CONFIG), yaml.safe_dump(dict(config), sort_keys=False))
+        write_file(Path(run, CONFIG), _text(config))
     return last
 
 

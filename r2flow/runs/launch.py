@@ -20,7 +20,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from r2flow.config import key_of, override
 from r2flow.errors import InputError
@@ -32,6 +32,7 @@ from r2flow.runs.composing import (
     as_hydra_takes,
     in_one_line,
     plain,
+    register_resolver,
     with_choices,
 )
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, handling_signals, run_process
@@ -173,9 +174,7 @@ def _run_hydra(
         sys.argv = [original[0], *parsed.flags, *parsed.overrides]
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(job)()
 
-    OmegaConf.register_new_resolver(
-        "job_folder", partial(job_folder, parsed.overrides), replace=True
-    )
+    register_resolver("job_folder", partial(job_folder, parsed.overrides))
     try:
         with_choices(composed)
     finally:

@@ -91,7 +91,11 @@ class Adaptive(ODESampler):
 
 @dataclass(frozen=True)
 class TorchDiffEq(ODESampler):
-    """A solver of the package torchdiffeq."""
+    """A solver of the package torchdiffeq, which ends at t_1 (`step_t` of its options).
+
+    `fehlberg2` and `adaptive_heun` gain nothing from that: their error is that of the steps before.
+    `fehlberg2` estimates it as h (k_3 - k_1) / 512, and errs by tens of tolerances.
+    """
 
     method: str = "dopri5"  # name in torchdiffeq
     tolerance: Positive = 1e-5  # of an adaptive method

@@ -20,8 +20,10 @@ from r2flow.generators import Generator, build_generator
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics import METRICS
-from r2flow.model.checkpoint import COMPILED, MODEL, NOTES, check_weights, step_of
+from r2flow.model.checkpoint import check_weights
 from r2flow.model.lineage import Parent, find_parent, model_options, plain
+from r2flow.model.parts import COMPILED, MODEL, NOTES
+from r2flow.model.paths import step_of
 from r2flow.model.sampling import draw
 from r2flow.noise import seed_torch
 from r2flow.plugins import loaded_plugins

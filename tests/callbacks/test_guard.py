@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 from r2flow import noise
 from r2flow.data.loader import Permutations, RunSampler
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import checkpoints_of
+from r2flow.model.paths import checkpoints_of
 from tests.conftest import quiet_trainer, refused
 
 NAN, INF = float("nan"), float("inf")

@@ -47,8 +47,8 @@ def test_a_scene_whose_velocity_becomes_nan_is_flagged_and_the_others_are_right(
     assert solution.converged.tolist() == [True, True, False, True]
     assert solution.x.isfinite().all()
     error = (solution.x - batch.solution(X_0, 1.0)).abs().amax(1)[[0, 1, 3]].max()
-    # torchdiffeq takes its last step beyond t = 1 and interpolates back.
-    assert error < {"euler": 5e-2, "torchdiffeq:dopri5": 5e-3}.get(method, 1e-3)
+    # torchdiffeq takes longer steps, whose error estimate is too small here.
+    assert error < {"euler": 5e-2, "torchdiffeq:dopri5": 2e-3}.get(method, 1e-3)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -100,6 +100,42 @@ def test_nothing_is_evaluated_outside_the_interval(method, t_0, t_1, dtype):
     assert solution.converged.all()
 
 
+THEIRS = ["dopri8", "dopri5", "bosh3", "fehlberg2", "adaptive_heun"]
+
+
+@pytest.mark.parametrize("method", THEIRS)
+@pytest.mark.parametrize(("t_0", "t_1"), [(0.0, 1.0), (1.0, 0.0), (0.2, 0.7)])
+@pytest.mark.parametrize("speed", [0.0, 1e-4, 3.0])
+def test_torchdiffeq_stays_in_the_interval_and_ends_at_its_end(method, t_0, t_1, speed):
+    asked = []
+
+    def velocity(t, x):
+        asked.append(float(t))
+        return torch.full_like(x, speed)
+
+    found = solve(velocity, torch.ones(2, 3), t_0, t_1, "torchdiffeq:" + method, tolerance=1e-4)
+    assert torch.allclose(found.x, torch.tensor(1 + speed * (t_1 - t_0)), atol=1e-6)
+    ends = sorted(torch.tensor([t_0, t_1]).tolist())
+    assert ends[0] <= min(asked)
+    assert max(asked) <= ends[1]
+
+
+@pytest.mark.parametrize("method", ["dopri8", "dopri5", "bosh3"])
+def test_torchdiffeq_keeps_to_its_tolerance(method):
+    """x' = -3 x + sin 5 t: x = (3 sin 5 t - 5 cos 5 t) / 34 + C exp(-3 t)."""
+
+    def exact(x_0, t):
+        return (3 * math.sin(5 * t) - 5 * math.cos(5 * t)) / 34 + (x_0 + 5 / 34) * math.exp(-3 * t)
+
+    def velocity(t, x):
+        return -3 * x + torch.sin(5 * t)
+
+    x_0 = torch.ones(1, 1, dtype=torch.float64)
+    for tolerance in (1e-4, 1e-6, 1e-8):
+        found = solve(velocity, x_0, method="torchdiffeq:" + method, tolerance=tolerance)
+        assert abs(found.x.item() - exact(1.0, 1.0)) < tolerance
+
+
 def test_stiff_scenes_are_flagged_and_smooth_ones_are_not():
     stiff, smooth = (
         [StiffLinear(10.0**k) for k in (2, 4, 6)],
@@ -154,6 +190,32 @@ def test_no_pulse_longer_than_0_16_of_the_interval_is_missed(width):
         found = solve(pulses, x_0, method="dopri5", tolerance=tolerance)
         assert (found.converged & ~found.stiff).all()
         assert in_tolerances(found, pulses.solution(x_0, 1.0), tolerance).max() < 10
+
+
+@pytest.mark.parametrize("width", [0.05, 0.08, 0.1])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-4])
+def test_no_pulse_that_any_step_saw_is_stepped_over(width, tolerance):
+    """v is 0 outside of a pulse of integral 1 and height 2 / width; seen: any evaluation above 1."""
+    seen = torch.zeros(80, dtype=torch.float64)
+
+    class Pulses:
+        def __init__(self, scenes):
+            self.scenes = scenes
+            self.at = width / 2 + (1 - width) * scenes / 79
+
+        def select(self, scenes):
+            return Pulses(self.scenes[scenes])
+
+        def __call__(self, t, x):
+            z = (t - self.at) / width
+            v = torch.where(z.abs() < 0.5, 1 + torch.cos(2 * math.pi * z), 0) / width
+            seen[self.scenes] = torch.maximum(seen[self.scenes], v)
+            return v[:, None] + 0 * x
+
+    x_0 = torch.zeros(80, 1, dtype=torch.float64)
+    found = solve(Pulses(torch.arange(80)), x_0, method="dopri5", tolerance=tolerance)
+    assert (seen > 1).sum() > 20
+    assert (found.x[seen > 1] - 1).abs().max() < 0.05
 
 
 def test_a_velocity_that_does_not_depend_on_x_is_not_stiff():

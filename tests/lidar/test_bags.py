@@ -1,20 +1,24 @@
-"""Recordings of ROS, written by rosbags' own writers, hold the points that were written."""
+"""Recordings of ROS, written by rosbags' and mcap's own writers, hold the points that were written."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from r2flow.errors import InputError
-from r2flow.lidar.bags import read_bag
+from r2flow.lidar.bags import cloud_points, read_bag
 from r2flow.lidar.scan_files import read_points
 from tests.lidar.conftest import assert_points
 
-rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed")
+pytest.importorskip("rosbags", reason="rosbags is not installed")
+pytest.importorskip("mcap", reason="mcap is not installed")
 
-from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
-from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
-from rosbags.typesys import Stores, get_typestore  # noqa: E402
+from mcap.writer import CompressionType, IndexType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 DRAW = np.random.default_rng(1)
 CLOUDS = [
@@ -69,15 +73,18 @@ def record(
     topics: tuple[str, ...] = ("/points",),
     kind: str = "cloud",
     stamps: tuple[int, ...] = (1, 2, 3),
+    compress: bool = False,
 ) -> Path:
     """A recording of the three clouds in each topic, the last without header.stamp; the file that a
-    user would name.
+    user would name. `compress`: each message by itself.
     """
     one = storage == "bag"
     store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
     writer = (
         Writer1(path) if one else Writer(path, version=8, storage_plugin=StoragePlugin[storage])
     )
+    if compress:
+        writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
     name = "sensor_msgs/msg/PointCloud2" if kind == "cloud" else "std_msgs/msg/String"
     with writer:
         for topic in topics:
@@ -143,15 +150,149 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
     lone.write_bytes(record(tmp_path / "bag", "SQLITE3").read_bytes())
     other = tmp_path / "other.bag"
     other.write_bytes(b"#ROSBAG V2.0\n" + bytes(400))
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "drive.mcap.zstd").write_bytes(b"\x28\xb5\x2f\xfd")
     for path, words in (
-        (whole, "by --topic: it has none"),
-        (cut, "not a readable .mcap file"),
+        (whole, "/points (std_msgs/String, encoding cdr)"),
+        (cut, f"mcap recover {cut} -o whole.mcap"),
         (other, "not a readable .bag file"),
-        (tmp_path / "missing.mcap", "does not exist"),
-        (lone.parent, "metadata file"),
+        (tmp_path / "missing.mcap", "No such file"),
+        (tmp_path / "empty", "metadata file"),
+        (tmp_path / "drive.mcap.zstd", "unpack a compressed file first"),
     ):
         assert words in r2flow("unpack", path, "--out", tmp_path / "out").refusal
     assert not (tmp_path / "out").exists()
-    assert len(list(read_bag(lone))) == 3  # a part of a recording is read by itself
+    for part in (lone, lone.parent):  # a part of a recording is read by itself
+        assert len(list(read_bag(part))) == 3
     with pytest.raises(InputError, match="by --topic: /points"):
         list(read_bag(tmp_path / "drive", "/rear"))
+
+
+def write_mcap(
+    path: Path,
+    kind: str = "sensor_msgs/msg/PointCloud2",
+    encoding: str = "cdr",
+    profile: str = "ros2",
+    **options: Any,
+) -> Path:
+    """The three clouds as messages of a kind and encoding, which may be wrong."""
+    ros1 = encoding == "ros1"
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, **options)
+        writer.start(profile)
+        schema = writer.register_schema(kind, "", b"")
+        channel = writer.register_channel("/points", encoding, schema)
+        for number, xyz in enumerate(CLOUDS):
+            cloud = message(store, xyz, time=(number + 1, 5))
+            data = serialize(cloud, "sensor_msgs/msg/PointCloud2")
+            writer.add_message(channel, number, bytes(data), number)
+        writer.finish()
+    return path
+
+
+def assert_clouds(path: Path) -> None:
+    found = list(read_bag(path))
+    for (_, points), xyz in zip(found, CLOUDS, strict=True):
+        assert_points(points, xyz, *fields(len(xyz)))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"index_types": IndexType.CHUNK},
+        {"index_types": IndexType.NONE},
+        {"use_chunking": False},
+        {"repeat_channels": False},
+        {"repeat_schemas": False},
+        {"repeat_channels": False, "repeat_schemas": False, "use_statistics": False},
+        {"chunk_size": 1, "compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE, "profile": ""},
+        {"kind": "sensor_msgs/PointCloud2", "encoding": "ros1", "profile": "ros1"},
+    ],
+    ids=lambda options: ",".join(map(str, options)),
+)
+def test_every_intact_mcap_is_read(tmp_path: Path, options: dict):
+    """Profile, summary, indexes and chunks are optional in the format."""
+    assert_clouds(write_mcap(tmp_path / "a.mcap", **options))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"kind": "foxglove.PointCloud", "encoding": "protobuf"}, "package mcap-protobuf-support"),
+        ({"kind": "foxglove.PointCloud", "encoding": "json"}, "encoding json.*package mcap,"),
+        ({"kind": "foxglove_msgs/msg/PointCloud"}, "encoding cdr.*package mcap-ros2-support"),
+        (
+            {"kind": "point_cloud_interfaces/msg/CompressedPointCloud2"},
+            "point_cloud_transport republish",
+        ),
+        ({"kind": "velodyne_msgs/msg/VelodyneScan"}, "VelodyneScan, encoding cdr"),
+    ],
+)
+def test_other_clouds_are_one_line_with_their_encoding_and_a_tool(tmp_path, options, words):
+    path = write_mcap(tmp_path / "a.mcap", **options)
+    with pytest.raises(InputError, match=f"holds no sensor_msgs/PointCloud2.*{words}") as caught:
+        list(read_bag(path))
+    assert "damaged" not in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
+def test_a_recording_that_was_cut_off_names_mcap_recover(tmp_path: Path, share: float):
+    whole = write_mcap(tmp_path / "whole.mcap", chunk_size=1).read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole[: int(share * len(whole)) - 1])
+    with pytest.raises(InputError, match=f"cut off.*mcap recover {path}"):
+        list(read_bag(path))
+
+
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
+def test_a_folder_is_read_by_the_ending_of_its_files(tmp_path: Path, storage: str):
+    """`ros2 bag reindex` may leave the storage identifier empty; a crash leaves no metadata."""
+    file = record(tmp_path / "drive", storage)
+    metadata = tmp_path / "drive" / "metadata.yaml"
+    text = metadata.read_text()
+    assert f"storage_identifier: {storage.lower()}" in text
+    metadata.write_text(text.replace(f"identifier: {storage.lower()}", 'identifier: ""'))
+    assert_clouds(tmp_path / "drive")
+    metadata.unlink()
+    for number in range(9):  # the parts of a long recording
+        file.with_stem(f"drive_{number + 2}").write_bytes(file.read_bytes())
+    assert len(list(read_bag(tmp_path / "drive"))) == 30
+
+
+def test_messages_that_were_compressed_one_by_one(tmp_path: Path):
+    assert_clouds(record(tmp_path / "drive", "SQLITE3", compress=True))
+
+
+@pytest.mark.parametrize("row_step", [0, 20, 20 * 24, 40 * 24])
+def test_a_cloud_without_padding_needs_no_row_step(row_step: int):
+    """Drivers fill in 0, the width, what is right, or the size of all rows."""
+    cloud = message(get_typestore(Stores.ROS2_HUMBLE), CLOUDS[0])
+    assert (cloud.width, cloud.row_step) == (20, 20 * 24)
+    cloud.row_step = row_step
+    assert_points(cloud_points(Path("a.db3"), cloud), CLOUDS[0], *fields(40))
+
+
+def test_rows_that_overlap_are_refused():
+    cloud = message(get_typestore(Stores.ROS2_HUMBLE), CLOUDS[0], extra=8)
+    cloud.row_step = 20
+    with pytest.raises(InputError, match="row_step 20 is below width x point_step, 480"):
+        cloud_points(Path("a.db3"), cloud)
+
+
+def test_fields_of_a_recording_are_renamed(r2flow, tmp_path: Path, monkeypatch):
+    """Autoware's channel is the ring; an unknown field of reflectance is named."""
+    names = {"intensity": "signal", "ring": "channel"}
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    cloud = message(store, CLOUDS[0])
+    for field in cloud.fields:
+        field.name = names.get(field.name, field.name)
+    assert_points(cloud_points(tmp_path, cloud), CLOUDS[0], None, fields(40)[1])
+    assert_points(cloud_points(tmp_path, cloud, ["signal=reflectance"]), CLOUDS[0], *fields(40))
+    file = record(tmp_path / "drive", "MCAP")
+    out = tmp_path / "scans"
+    assert r2flow("unpack", file, "--columns", "ring=reflectance", "--out", out)[0] == 0
+    first = read_points(sorted(out.iterdir())[0])
+    assert_points(first, CLOUDS[0], fields(40)[1])

@@ -96,6 +96,99 @@ def test_files_that_name_their_columns_take_no_others(tmp_path: Path):
         read_points(tmp_path / "a.csv", ("x", "y", "z", "intensity"))
 
 
+def write_named(path: Path, strength: str) -> None:
+    """A table of named columns: x, y, z, the ring as `channel`, and `strength`, INTENSITY."""
+    table = np.column_stack([XYZ, RING, INTENSITY])
+    header = f"x,y,z,channel,{strength}"
+    np.savetxt(path, table, "%.6g", ",", header=header, comments="")
+
+
+@pytest.mark.parametrize("name", ["intensities", "Signal", "scalar_amplitude"])
+def test_a_field_that_may_be_the_reflectance_is_named_and_renamed(tmp_path, caplog, name):
+    path = tmp_path / f"{name}.csv"
+    write_named(path, name)
+    same(read_points(path), RING, intensity=None)
+    assert f"not used: {name}. --columns {name}=reflectance" in caplog.text
+    caplog.clear()
+    for role in ("reflectance", "Intensity"):
+        same(read_points(path, [f"{name.lower()}={role}"]), RING)
+    assert read_points(path, [f"{name}=i", "channel=_"]).ring is None
+    assert not caplog.records
+
+
+def test_a_rename_precedes_the_usual_names(tmp_path):
+    path = tmp_path / "a.npy"
+    names = ("x", "y", "z", "intensity", "strength", "ring", "beam")
+    table = np.zeros(500, [(name, "f4") for name in names])
+    for name, column in zip(
+        ("x", "y", "z", "strength", "beam"), (*XYZ.T, INTENSITY, RING), strict=True
+    ):
+        table[name] = column
+    table["intensity"] = 9
+    np.save(path, table)
+    same(read_points(path), 0 * RING, intensity=np.full(500, 9))
+    same(read_points(path, ("strength=reflectance", "beam=ring")), RING)
+    for wrong, words in (
+        (["power=reflectance"], "no field power; it has: x, y, z, intensity, strength"),
+        (["strength=power"], "columns rename fields to x, y, z, reflectance, ring"),
+        (["strength"], "columns must name x, y and z"),
+        (["x", "y", "z"], "rename some, as --columns intensities=reflectance"),
+    ):
+        with pytest.raises(InputError, match=words):
+            read_points(path, wrong)
+    TABLE.astype("<f4").tofile(tmp_path / "a.bin")
+    np.savetxt(tmp_path / "a.txt", TABLE)
+    for name in ("a.bin", "a.txt"):
+        with pytest.raises(InputError, match="does not name its columns: name all"):
+            read_points(tmp_path / name, ["i=reflectance"])
+
+
+def test_fields_of_arrow_and_las_are_renamed(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    laspy = pytest.importorskip("laspy", reason="laspy is not installed")
+    from pyarrow import feather
+
+    x, y, z = F4.T.copy()
+    feather.write_feather(
+        pyarrow.table({"x": x, "y": y, "z": z, "signal": INTENSITY}), tmp_path / "a.feather"
+    )
+    same(read_points(tmp_path / "a.feather", ["signal=reflectance"]))
+    cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    cloud.x, cloud.y, cloud.z = XYZ.T
+    cloud.add_extra_dim(laspy.ExtraBytesParams(name="Amplitude", type=np.float32))
+    cloud["Amplitude"] = INTENSITY
+    cloud.write(tmp_path / "a.las")
+    points = read_points(tmp_path / "a.las", ["amplitude=reflectance"])
+    np.testing.assert_array_equal(points.reflectance, INTENSITY)
+
+
+def test_ousters_table_of_a_scan(tmp_path):
+    """As ouster-cli of ouster-sdk 1.0.1 writes it, of one and of two returns; the first is read."""
+    head = (
+        "frame num: 7\nTIMESTAMP (ns), ROW, DESTAGGERED IMAGE COLUMN, MEASUREMENT_ID, RANGE (mm), "
+    )
+    head += "REFLECTIVITY (%), X1 (m), Y1 (m), Z1 (m)"
+    n = np.arange(500)
+    table = np.column_stack([n + 10**12, RING, n, n, 1000 * n, INTENSITY, XYZ])
+    for more, width in ((", X2 (m), Y2 (m), Z2 (m)", 3), ("", 0)):
+        np.savetxt(
+            tmp_path / "a.csv",
+            np.column_stack([table, XYZ[:, :width] + 1]),
+            ["%d"] * 6 + ["%.4f"] * (3 + width),
+            delimiter=",",
+            header=head + more,
+        )
+        same(read_points(tmp_path / "a.csv"), RING)
+
+
+def test_arrays_of_images_in_another_order_say_which_is_read(tmp_path):
+    path = tmp_path / "a.npy"
+    for shape in ((16, 64, 2), (16, 64, 3), (16, 64)):
+        np.save(path, np.ones(shape, np.float32))
+        with pytest.raises(InputError, match=r"Range images are floats \(2, H, W\)"):
+            read_points(path)
+
+
 def test_arrays_with_named_fields(tmp_path: Path):
     fields = np.zeros(
         500, [("x", "f4"), ("y", "f4"), ("z", "f8"), ("ring", "u1"), ("intensity", "u2")]
@@ -106,7 +199,10 @@ def test_arrays_with_named_fields(tmp_path: Path):
         fields[name] = column
     np.save(tmp_path / "a.npy", fields)
     same(read_points(tmp_path / "a.npy"), RING)
-    for array, words in ((np.array([object()]), "objects"), (F4[None], r"array \(1, 500, 3\)")):
+    for array, words in (
+        (np.array([object()]), "objects"),
+        (F4[None], r"\(1, 500, 3\), not points"),
+    ):
         np.save(tmp_path / "a.npy", array)
         with pytest.raises(InputError, match=words):
             read_points(tmp_path / "a.npy")

@@ -63,6 +63,26 @@ def test_pcd_without_count_and_points_lines_and_without_reflectance(tmp_path):
     expect_rows(read_points(saved(tmp_path, "a.pcd", text)), reflectance=None)
 
 
+def test_pcd_headers_of_old_drivers(tmp_path):
+    """Fields that store nothing, a size in POINTS alone, and the key COLUMNS."""
+    head = "FIELDS x y z _ intensity\nSIZE 4 4 4 1 4\nTYPE F F F U F\nCOUNT 1 1 1 0 1\n"
+    head += "WIDTH 0\nHEIGHT 0\nPOINTS 3\n"
+    rows = np.array([row[:4] for row in ROWS], "<f4")
+    text = "".join(f"{x} {y} {z} {i}\n" for x, y, z, i in rows)
+    for start in (head, head.replace("FIELDS", "COLUMNS")):
+        expect_rows(read_points(saved(tmp_path, "a.pcd", f"{start}DATA ascii\n{text}")))
+        binary = f"{start}DATA binary\n".encode() + rows.tobytes()
+        expect_rows(read_points(saved(tmp_path, "a.pcd", binary)))
+
+
+def test_a_channel_is_a_ring(tmp_path):
+    """Autoware's XYZIRC."""
+    head = pcd_header("x y z intensity return_type channel", "4 4 4 1 1 2", "F F F U U U", "binary")
+    rows = [struct.pack("<3fBBH", x, y, z, int(2 * i), 1, ring) for x, y, z, i, ring in ROWS]
+    points = read_points(saved(tmp_path, "a.pcd", head.encode() + b"".join(rows)))
+    expect_rows(points, reflectance=[1, 0, 2], ring=RING)
+
+
 PLY_ASCII = """ply
 format ascii 1.0
 comment by hand

@@ -222,7 +222,12 @@ def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", ["a: 1", "{stage: {name: rectify}, backbone: {name: hdit}, data: {}}"]
+    "content",
+    [
+        "a: 1",
+        "{stage: {name: rectify}, backbone: {name: hdit}, data: {}}",
+        "{stage: {name: rectify}, backbone: {name: hdit}, data: {}, sensor: {}, encoding: {}}",
+    ],
 )
 def test_a_folder_that_is_no_run_is_named(tmp_path, content):
     (tmp_path / "thing").mkdir()

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.model.checkpoint import load_checkpoint, weights_hash
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.saving import weights_hash
 from r2flow.reports.paper import PaperRun, role_of, same_architecture, scans_figure, table_i
 from r2flow.reports.printed import COLUMNS, TABLE_II
 from tests.conftest import CONFIG, write_run

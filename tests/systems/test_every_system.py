@@ -13,7 +13,9 @@ import pytest
 import torch
 
 from r2flow.generators import build_generator
-from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.paths import checkpoints_of
+from r2flow.model.tensor_files import read_checkpoint
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import refused
@@ -65,6 +67,8 @@ def test_a_scan_is_a_function_of_its_number_alone(name: str):
     assert many.evaluations.tolist() == [evaluations] * 3
     assert sampler.evaluations(generator) == evaluations
     # as in 64-true runs
+    wide = generator(one.start(generator.noise_shape).double(), draws=one, sampler=sampler)
+    torch.testing.assert_close(wide.x.float(), alone.x, rtol=0, atol=1e-4)
     double = generator.double()(one.start(generator.noise_shape), draws=one, sampler=sampler)
     torch.testing.assert_close(double.x.float(), alone.x, rtol=0, atol=1e-4)
 

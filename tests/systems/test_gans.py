@@ -18,7 +18,8 @@ from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import SENSORS
-from r2flow.model.checkpoint import load_checkpoint, read_checkpoint
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.tensor_files import read_checkpoint
 from r2flow.reports.training import read_curves
 from r2flow.systems.gan import dcgan, style_discriminator, style_gan
 from r2flow.systems.gan.augment import (

@@ -10,7 +10,10 @@ import torch
 import yaml
 
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.paths import checkpoints_of
+from r2flow.model.saving import weights_hash
+from r2flow.model.tensor_files import read_checkpoint
 from r2flow.reports.compare import report_chain
 from r2flow.runs.chain import links_of
 from r2flow.runs.composing import compose

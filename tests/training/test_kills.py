@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.model.checkpoint import checkpoints_of
+from r2flow.model.paths import checkpoints_of
 from tests.conftest import folder_of
 from tests.killing import is_gone, wait_until
 from tests.training.conftest import COMMAND, let_go, start, tiny

@@ -11,7 +11,8 @@ import pytest
 from r2flow import plugins
 from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
+from r2flow.model.saving import save_checkpoint
 from r2flow.plugins import load_plugins, made_with, take_plugins
 from r2flow.registry import Registry
 from r2flow.reports.compare import read_runs

@@ -21,7 +21,8 @@ from lightning.pytorch.utilities import rank_zero_only
 from r2flow.callbacks.stopping import slurm_job
 
 from r2flow.errors import InputError
-from r2flow.model.checkpoint import checkpoints_of, read_checkpoint
+from r2flow.model.paths import checkpoints_of
+from r2flow.model.tensor_files import read_checkpoint
 from r2flow.signals import LATER
 from r2flow.training import build, compose
 from tests.training.conftest import TINY, Run, hold_at, start, tiny, wait_for

@@ -20,7 +20,9 @@ from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import Sensor, write_sensor
-from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, step_of
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.paths import checkpoints_of, step_of
+from r2flow.model.tensor_files import read_checkpoint
 from r2flow.reports.outputs import what_next
 from r2flow.reports.training import read_curves
 from r2flow.runs.folder import read_config

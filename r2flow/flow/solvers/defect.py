@@ -5,7 +5,8 @@ stages, dopri5's error estimate can be 200 times smaller than the error; a pulse
 is missed entirely. Therefore the velocity is compared with the slope of the step's interpolant at
 additional times (Enright, A new error control for initial value solvers, 1989): if two evaluations
 are more than `_UNSEEN` apart, or if one gap between two stages has most of the velocity's change.
-Bisection locates a jump; the step before the jump ends at it.
+Bisection locates a jump; the step before the jump ends at it. The time at which a rejected step saw
+most is compared again in the accepted step that passes it.
 """
 
 import math
@@ -35,6 +36,7 @@ _REJECTED = (40.0, 1e5)
 _EVEN = 0.25  # share of a change in the other half of its bracket; a jump has less
 # Growth of a change while its bracket shrinks: constant for a jump, unbounded for a pole.
 _POLE = 4.0
+_GROSS = 10.0  # a bisected step that its error estimate accepts: in largest defects
 _CROSSING = 0.2  # largest error of crossing a jump, in tolerances
 
 
@@ -78,14 +80,16 @@ def _probes(method: EmbeddedMethod, share: float) -> list[float]:
 @torch.no_grad()
 def inspect(control: StepController, tried: Tried, good: ndarray) -> ndarray:
     """Which good steps remain so, (B,) bool; tells the controller where the others must end."""
-    control.roughness = tried.changes(weighted(tried.method.third_difference, tried.k))[0]
+    method = tried.method
+    control.roughness = tried.changes(weighted(method.third_difference, tried.k))[0]
     suspect = control.rougher(*_BISECTED) | control.rougher(*_FROM_REST)
     suspect &= good | (control.troubled == REMEMBERED) | control.rougher(*_REJECTED)
     compared = control.rougher(*_COMPARED)
     planned = {}
-    for place in good.nonzero()[0]:
+    for place in good.nonzero()[0].tolist():
         once = [0.5 + _OFF_CENTRE] if compared[place] else []
-        planned[place] = _probes(tried.method, control.h[place] / control.length) or once
+        usual = _probes(method, control.h[place] / control.length) or once
+        planned[place] = usual + control.remembered(place)
     held = good.copy()
     found: dict[int, dict[float, Tensor]] = {}  # v at the probe that shows a change, by its time
     for turn in count():
@@ -97,14 +101,38 @@ def inspect(control: StepController, tried: Tried, good: ndarray) -> ndarray:
         step = tried.of(places)
         state, slope = step.at(theta)
         v = _velocity(control, places, theta, state)
-        agrees = step.changes(v - slope)[0] <= tried.method.defect
+        agrees = step.changes(v - slope)[0] <= method.defect
         held[places] = agrees
         for row in (~agrees).nonzero()[0]:
             found[places[row]] = {theta[row].item(): v[row : row + 1]}
     for place in (suspect | (good & ~held)).nonzero()[0]:
         step = tried.of(np.array([place]))
-        held[place] = _locate(control, step, place, found.get(place, {}), held[place])
+        held[place] = _locate(control, step, place, found.setdefault(place, {}), held[place])
+    for place in (~held).nonzero()[0].tolist():
+        control.remember(place, _oddest(tried.of(np.array([place])), found.get(place, {})))
     return held
+
+
+def _detrended(step: Tried, also: dict[float, Tensor]) -> tuple[dict[float, Tensor], Tensor]:
+    """A scene's velocities at its stages and `also` without their smooth trend, by increasing share
+    of the step, and the trend: per element, the median slope over the gaps between stages.
+    """
+    stages = {theta: step.k[i] for theta, i in step.method.distinct.items()}
+    slopes = [(stages[right] - stages[left]) / (right - left) for left, right in pairwise(stages)]
+    trend = torch.stack(slopes).median(0).values
+    points = sorted((stages | also).items())
+    return {theta: value - theta * trend for theta, value in points}, trend
+
+
+def _oddest(step: Tried, also: dict[float, Tensor]) -> float:
+    """The first share of a scene's step with at least a quarter of the largest change of v from its
+    start; 0 if v is not finite.
+
+    Later stages may differ more, since their states depend on the first.
+    """
+    points, _ = _detrended(step, also)
+    changes = step.changes(*(value - points[0.0] for value in points.values()))[:, 0]
+    return list(points)[(changes >= changes.max() / 4).argmax()]
 
 
 def _locate(
@@ -113,28 +141,26 @@ def _locate(
     """Bisect a scene's step until a jump is located or excluded; whether the step remains `held`.
 
     The bracket begins as the first pair of neighbouring values (stages and `also`) with at least
-    half of the largest change of v. v counts without its smooth trend, the median slope over the
-    gaps between stages, per element.
+    half of the largest change of v without its trend. New values are added to `also`.
     """
-    stages = {theta: step.k[i] for theta, i in step.method.distinct.items()}
-    points = sorted((stages | also).items())
-    slopes = [
-        (after - before) / (right - left) for (left, before), (right, after) in pairwise(points)
-    ]
-    trend = torch.stack(slopes).median(0).values
-    values = [value - theta * trend for theta, value in points]
+    points, trend = _detrended(step, also)
+    thetas = list(points)
+    values = list(points.values())
     changes = step.changes(*(after - before for before, after in pairwise(values)))[:, 0]
     first = int((changes >= changes.max() / 2).argmax())
-    left = points[first][0]
-    right = points[first + 1][0]
+    left = thetas[first]
+    right = thetas[first + 1]
     before = values[first]
     after = values[first + 1]
     change = changes[first]  # norm of h (after - before), in tolerances
     most = 0.0  # largest change of any half so far
     while True:
         middle = np.array([(left + right) / 2])
-        state, _ = step.at(middle)
-        value = _velocity(control, np.array([place]), middle, state) - trend * middle.item()
+        state, slope = step.at(middle)
+        v = _velocity(control, np.array([place]), middle, state)
+        also[middle.item()] = v
+        held = held and bool(step.changes(v - slope)[0, 0] <= _GROSS * step.method.defect)
+        value = v - trend * middle.item()
         halves = step.changes(value - before, after - value)[:, 0]
         larger = halves.max()
         most = max(most, larger)

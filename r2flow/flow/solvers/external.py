@@ -48,9 +48,9 @@ class TorchDiffEqMethod:
 
     def solve(self, v: Evaluations, x: Tensor, times: Tensor) -> Solution:
         """Solve scenes one after another: torchdiffeq's error norm of a whole batch would hide a
-        hard scene.
+        hard scene. It computes in float64, since its interpolant at the end cancels.
 
-        An adaptive method uses only the first and last time.
+        An adaptive method uses only the first and last time, and ends at the last one.
         """
         import torchdiffeq
 
@@ -58,11 +58,13 @@ class TorchDiffEqMethod:
         if self.adapts:
             # From the state's type, since the velocity has not been evaluated yet.
             tolerance = attainable(v.limits, v.coarsest(x))
-            options = {}
+            # Without it, the last step passes the end, and the state there is interpolated.
+            options: dict[str, Any] = {"step_t": grid[-1:]}
         else:
             tolerance = v.limits.tolerance
             options = {"grid_constructor": lambda field, start, span: grid}
-        scenes = [_Scene(v, start, self.adapts) for start in x.split(1)]
+        ends = sorted(times[[0, -1]].tolist())
+        scenes = [_Scene(v, start, self.adapts, ends) for start in x.split(1)]
         v.converged[:] = finite(x).cpu()
         for i in v.converged.nonzero()[0]:
             scene = scenes[i]
@@ -70,7 +72,7 @@ class TorchDiffEqMethod:
             try:
                 *_, end = torchdiffeq.odeint(
                     scene,
-                    scene.last,
+                    scene.last.double(),
                     grid[[0, -1]],
                     rtol=tolerance,
                     atol=tolerance,
@@ -88,18 +90,23 @@ class TorchDiffEqMethod:
 class _Scene:
     """One scene's velocity, and the steps that torchdiffeq reports."""
 
-    def __init__(self, v: Evaluations, x: Tensor, adapts: bool) -> None:
+    def __init__(self, v: Evaluations, x: Tensor, adapts: bool, ends: list[float]) -> None:
         self._v = v
+        self._ends = ends
+        self._dtype = x.dtype
         self.last = x
         self._velocity = v.of_one if adapts else v
         if adapts:  # torchdiffeq warns about callbacks that a method does not call
             self.callback_reject_step = self._reject
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        return self._velocity(t, x)
+        # The probe for the first step's length may lie beyond the end.
+        v = self._velocity(t.to(self._dtype).clamp(*self._ends), x.to(self._dtype))
+        return v.to(x)
 
     def keep(self, x: Tensor) -> bool:
         """Keep a state if it is finite."""
+        x = x.to(self._dtype)
         good = bool(x.isfinite().all())
         if good:
             self.last = x

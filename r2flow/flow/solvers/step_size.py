@@ -50,6 +50,9 @@ class StepController:
         # (`resume`). Steps end at both ends of the bracket.
         self.begin, self.end = np.full((2, n), np.inf)
         self.arrived = np.zeros(n, bool)
+        # Lengths at which rejected steps saw most, a tuple for each scene.
+        self.memories = np.empty(n, object)
+        self.memories.fill(())
         # Third differences: of this step, and of the last one over h^4.
         self.roughness, self.rough = np.full((2, n), np.nan)
 
@@ -113,6 +116,15 @@ class StepController:
     def shorten(self, place: int, share: float) -> None:
         """Reject a scene's step; retry with about this share of its length."""
         self.factor[place] = min(max(share, SHRINK), 0.7)
+
+    def remember(self, place: int, share: float) -> None:
+        """Note a time of a scene's rejected step."""
+        self.memories[place] += (self.reached[place] + share * self.h[place],)
+
+    def remembered(self, place: int) -> list[float]:
+        """The noted times within a scene's step, in shares of it."""
+        thetas = (np.array(self.memories[place]) - self.reached[place]) / self.h[place]
+        return thetas[(thetas > 0) & (thetas < 1)].tolist()
 
     def stop_at(self, place: int, left: float, right: float) -> None:
         """Note a jump of a scene's velocity between two shares of its step."""

@@ -1,4 +1,4 @@
-"""Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY, NPY, tables and LAS.
+"""Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY, NPY, tables, LAS and published samples.
 
 All are read; .bin, PCD, PLY and NPY are written.
 
@@ -14,30 +14,37 @@ from numpy import ndarray
 
 from r2flow.errors import InputError, warn_odd
 from r2flow.files import atomic_write, reading
-from r2flow.lidar.scan_files import clouds, tables
-from r2flow.lidar.scan_files.points import FARTHEST, Points, check_columns, column_points
+from r2flow.lidar.scan_files import clouds, samples, tables
+from r2flow.lidar.scan_files.points import (
+    FARTHEST,
+    Points,
+    check_columns,
+    column_points,
+    renamed,
+    warn_of_unused,
+)
 from r2flow.lidar.scan_files.points import NoPointsError as NoPointsError
 
 _ROWS = (".pcd.bin", ".bin")  # rows of float32; the one that ends with the other first
-_READERS = clouds.READERS | tables.READERS
+_READERS = clouds.READERS | tables.READERS | samples.READERS
 # Endings of formats that are not read, with advice on conversion.
 ELSEWHERE = {
     (".mcap", ".db3", ".bag"): ("holds many scans: r2flow unpack {path} --out FOLDER writes them"),
-    (".pcap", ".pcapng"): (
+    (".pcap", ".pcapng", ".osf"): (
         "holds packets, which the maker's tool turns into scans (Ouster: ouster-cli source {path} "
-        "save scan.ply; Velodyne: VeloView, Save As CSV; Hesai, RoboSense: their ROS driver and "
-        "r2flow unpack)"
+        "save scan.csv, a file a scan; Velodyne: VeloView, Save As CSV; Hesai, RoboSense: their "
+        "ROS driver and r2flow unpack)"
     ),
     (".laz", ".e57", ".pts", ".ptx", ".rcp", ".fls"): "is read by CloudCompare, which saves .ply",
     (".npz", ".h5", ".hdf5", ".zarr", ".mat", ".pkl", ".tfrecord"): (
         "holds arrays: write x, y, z, intensity of each scan by numpy.save"
     ),
     (".lvx", ".lvx2", ".lvx3"): "is of a Livox, which has no beams; r2flow needs a spinning LiDAR",
-    (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar"): "is compressed: unpack it",
+    (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".tar"): "is compressed: unpack it",
 }
 WRITTEN = (".bin", ".pcd", ".ply", ".npy")
 SCAN_ENDINGS = (*_ROWS, *_READERS)
-LOOSE_ENDINGS = (".csv", ".txt")  # also used for other files than scans
+LOOSE_ENDINGS = (".csv", ".txt", ".pth")  # also used for other files than scans
 FIRM_ENDINGS = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
 
 FARTHEST_RAY = 400.0  # metres; no spinning LiDAR measures farther
@@ -49,13 +56,15 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
 
     The ending is the format. .bin: KITTI's float32 rows x y z reflectance. .pcd.bin: nuScenes' x y
     z intensity ring. .pcd, .ply, .las, .feather, .parquet: fields x y z and, where present,
-    intensity (or reflectance, reflectivity, remission, i) and ring, of any type. .npy: (N, 3) or
-    (N, 4), or named fields. .csv, .xyz, .txt: three or four columns, or columns named in the first
-    line. LAS, Arrow tables and compressed PCDs need the extra `formats`.
+    intensity (or reflectance, reflectivity, remission, i) and ring (or channel), of any type.
+    .npy: (N, 3) or (N, 4), or named fields. .csv, .xyz, .txt: three or four columns, or columns
+    named in the first line. .pth: the samples of the published R2Flow code. LAS, Arrow tables and
+    compressed PCDs need the extra `formats`.
 
     Args:
         columns: Names of the columns of a .bin, .npy or text file without names: x, y, z and, where
-            present, intensity and ring; others are ignored. None: the default of the format.
+            present, intensity and ring; others are ignored. None: the default of the format. Of
+            a file with names: fields to rename, as `intensities=reflectance`, `_` to ignore one.
 
     Returns:
         xyz float32 (N, 3) in metres, reflectance float32 (N,) as stored or None, ring uint16 (N,)
@@ -81,14 +90,17 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
         columns = ("x", "y", "z", "intensity", "ring")
     raw = ending in _ROWS
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
-        names = None
         if raw:
-            arrays = tables.read_rows(path, columns)
+            stored, arrays = None, tables.read_rows(path, columns)
         else:
-            names, arrays = _READERS[ending](path)
-        if names and columns:
-            raise InputError("it names its columns: leave --columns (data.reading.columns) out.")
-        points = column_points(names or tables.usual_names(len(arrays), columns), arrays, raw)
+            stored, arrays = _READERS[ending](path)
+        if stored:
+            names = renamed(stored, columns)
+        else:
+            names = list(tables.usual_names(len(arrays), columns))
+        points = column_points(names, arrays, raw)
+        if stored:
+            warn_of_unused(path, names, arrays, points)
     if points.dropped:
         kind = f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped"
         warn_odd(path, kind, points.dropped)
@@ -104,14 +116,19 @@ def points_beside(path: Path) -> Path:
 
 
 def read_range_image(path: str | Path) -> ndarray | None:
-    """The range image in a .npy of floats (2 or 1, H, W), float32; None for any other array.
+    """The range image in a .npy of floats (2 or 1, H, W), or in a sample of the published code,
+    float32; None for any other array.
 
     Values that are not finite become 0, a ray without return; so do, with a warning, ranges that no
     LiDAR measures.
     """
-    if Path(path).suffix.lower() != ".npy":
+    if Path(path).suffix.lower() == ".pth":
+        with reading(Path(path), LARGEST_FILE, "sample"):
+            array = samples.read_image(Path(path))
+    elif Path(path).suffix.lower() == ".npy":
+        array = read_numbers(path)
+    else:
         return None
-    array = read_numbers(path)
     if array.ndim != 3 or array.dtype.kind != "f" or not array.size:
         return None
     channels, rows, columns = array.shape

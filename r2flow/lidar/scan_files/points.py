@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
+from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, warn_odd
 
 # No LiDAR measures 10 km or less than a millimetre. Nearly all floats read in the wrong byte order
 # or width are beyond these limits, because their exponent changes.
@@ -15,12 +16,14 @@ FARTHEST = 1e4
 NEAREST = 1e-3
 # The first name in the file is used: Ouster writes both an intensity and a calibrated reflectivity.
 ROLES: Mapping[str, tuple[str, ...]] = {
-    "x": ("x", "points_m_xyz:0", "points:0"),  # VeloView's
-    "y": ("y", "points_m_xyz:1", "points:1"),
-    "z": ("z", "points_m_xyz:2", "points:2"),
+    "x": ("x", "points_m_xyz:0", "points:0", "x1"),  # VeloView's, and Ouster's first return
+    "y": ("y", "points_m_xyz:1", "points:1", "y1"),
+    "z": ("z", "points_m_xyz:2", "points:2", "z1"),
     "reflectance": ("intensity", "reflectance", "reflectivity", "remission", "i"),
-    "ring": ("ring", "laser_number", "laser_id"),  # Argoverse's and VeloView's
+    # Argoverse's, VeloView's and Autoware's
+    "ring": ("ring", "laser_number", "laser_id", "channel"),
 }
+_ROLE_OF = {alias: role for role, aliases in ROLES.items() for alias in aliases}
 
 
 class NoPointsError(InputError):
@@ -64,9 +67,34 @@ def check_xyz(xyz: ndarray) -> None:
         raise InputError(f"xyz must have the shape (N, 3), as points[:, :3]; found {xyz.shape}.")
 
 
+def role_of(name: str) -> str | None:
+    """What a field of this name is, a key of `ROLES`; None if it is nothing of these.
+
+    Names are compared without case and without CloudCompare's prefix `scalar_`.
+    """
+    return _ROLE_OF.get(_plain(name))
+
+
+def _plain(name: str) -> str:
+    return name.lower().removeprefix("scalar_")
+
+
+def is_renaming(columns: Sequence[str] | None) -> bool:
+    """Whether columns rename fields, as `intensities=reflectance`, instead of naming all."""
+    return any("=" in str(name) for name in columns or ())
+
+
 def check_columns(columns: Sequence[str] | None) -> None:
-    """Refuse names of columns without exactly one x, y and z."""
+    """Refuse names of columns without exactly one x, y and z, and renames to no known role."""
     names = [str(name).lower() for name in columns or "xyz"]
+    if is_renaming(columns):
+        pairs = [name.rpartition("=") for name in names]
+        if any(not field or (role != "_" and not role_of(role)) for field, _, role in pairs):
+            raise InputError(
+                "columns rename fields to x, y, z, reflectance, ring or, if unused, _, as "
+                f"intensities=reflectance,channel=_; found {','.join(names)[:80]}."
+            )
+        return
     for role, aliases in ROLES.items():
         count = sum(name in aliases for name in names)
         if count > 1 or (count == 0 and role in "xyz"):
@@ -76,20 +104,43 @@ def check_columns(columns: Sequence[str] | None) -> None:
             )
 
 
-def find_roles(names: Sequence[str]) -> dict[str, list[int]]:
-    """Indices of the candidate columns of x, y, z, reflectance and ring, in order of preference.
+def renamed(names: Sequence[str], columns: Sequence[str] | None) -> list[str]:
+    """The names of a file's fields after its user's renames, which precede the usual names.
 
-    Names are compared without case and without CloudCompare's prefix `scalar_`.
+    Raises:
+        InputError: The file lacks such a field, or `columns` are no renames.
     """
-    lower = [name.lower().removeprefix("scalar_") for name in names]
+    if not columns:
+        return list(names)
+    if not is_renaming(columns):
+        raise InputError(
+            "it names its columns: leave --columns (data.reading.columns) out, or rename some, as "
+            "--columns intensities=reflectance."
+        )
+    pairs = [str(name).rpartition("=") for name in columns]
+    given = {_plain(field.strip()): role.strip() for field, _, role in pairs}
+    plain = [_plain(name) for name in names]
+    missing = [field for field in given if field not in plain]
+    if missing:
+        raise InputError(f"it has no field {', '.join(missing)}; it has: {_listed(names)}.")
+    taken = {role_of(role) for role in given.values()} - {None}
+    return [given.get(name, "_" if role_of(name) in taken else name) for name in plain]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " ".join(", ".join(names)[:120].split()) or "none"
+
+
+def find_roles(names: Sequence[str]) -> dict[str, list[int]]:
+    """Indices of the candidate columns of x, y, z, reflectance and ring, in order of preference."""
+    lower = [_plain(name) for name in names]
     roles = {
         role: [lower.index(alias) for alias in aliases if alias in lower]
         for role, aliases in ROLES.items()
     }
     missing = [role for role in "xyz" if not roles[role]]
     if missing:
-        listed = " ".join(", ".join(names)[:120].split())
-        raise InputError(f"it has no field {', '.join(missing)}; it has: {listed or 'none'}.")
+        raise InputError(f"it has no field {', '.join(missing)}; it has: {_listed(names)}.")
     return roles
 
 
@@ -160,6 +211,26 @@ def _check_values(size: ndarray, reflectance: ndarray | None, finite: ndarray, r
             "negative or integer reflectance. Is it damaged, not in metres, big-endian, or of "
             "other columns (--columns)?"
         )
+
+
+def warn_of_unused(
+    path: Path, names: Sequence[str], columns: Sequence[ndarray], points: Points
+) -> None:
+    """Warn, once per folder, of fields that may be the reflectance that a scan lacks."""
+    if points.reflectance is not None and points.reflectance.any():
+        return
+    unused = [
+        name
+        for name, column in zip(names, columns, strict=True)
+        if name.strip("_") and not role_of(name) and column.ndim == 1 and column.dtype.kind in "fiu"
+    ]
+    if unused:
+        listed = ", ".join(unused)[:120]
+        kind = (
+            f"it has no reflectance, and these fields are not used: {listed}. "
+            f"--columns {unused[0]}=reflectance (of r2flow.read columns) takes one"
+        )
+        warn_odd(path, kind)
 
 
 def _ring_numbers(ring: ndarray) -> ndarray:

@@ -10,15 +10,16 @@ from numpy import ndarray
 
 from r2flow.errors import InputError, require
 from r2flow.lidar.scan_files.clouds import Table
-from r2flow.lidar.scan_files.points import ROLES, find_roles
+from r2flow.lidar.scan_files.points import is_renaming, role_of
 
 _NUMBER = re.compile(r"(^|[;,\s])[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)
+WIDEST = 32  # columns of points; a wider array is an image
 _UNIT = re.compile(r"\s*[\[(](?!([cmk]m|ft)\b).*")  # other units than metres stay: not a known name
 
 
 def read_rows(path: Path, columns: Sequence[str] | None) -> list[ndarray]:
     """Rows of little-endian float32: as many as `columns`, or 4 of KITTI."""
-    width = len(columns or "xyzi")
+    width = len(usual_names(len(columns or "xyzi"), columns))
     rest = path.stat().st_size % (4 * width)
     if rest:
         raise InputError(
@@ -45,9 +46,11 @@ def read_npy(path: Path) -> Table:
     array = read_array(path)
     if array.dtype.names is not None:
         return list(array.dtype.names), [array[name] for name in array.dtype.names]
-    if array.ndim != 2:
+    if array.ndim != 2 or array.shape[1] > WIDEST:
         raise InputError(
-            f"it holds an array {array.shape}, not points: these are (N, 3) or (N, 4)."
+            f"it holds an array {array.dtype} {array.shape}, not points: these are (N, 3) or "
+            "(N, 4). Range images are floats (2, H, W), range in metres and reflectance, or "
+            "(1, H, W)."
         )
     return None, list(array.T)
 
@@ -71,6 +74,8 @@ def read_text(path: Path) -> Table:
     separator = next((mark for mark in ";\t," if mark in rows[-1]), None)
     words = head.lstrip("#/ ").split(separator)  # CloudCompare writes names after //, NumPy after #
     names = [_UNIT.sub("", word.strip()) for word in words]
+    if "X1" in names:  # by ouster-cli
+        names = ["ring" if name == "ROW" else name for name in names]
     try:
         table = np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2)
     except ValueError:
@@ -79,17 +84,11 @@ def read_text(path: Path) -> Table:
         # Slower; empty values, as of rays without return, and words become NaN.
         table = np.genfromtxt(rows, delimiter=separator, comments=None, ndmin=2)  # type: ignore[call-overload]
     width = table.shape[1]
-    if in_comment and (len(words) != width or not _named(names)):
+    if in_comment and (len(words) != width or not any(map(role_of, names))):
         return None, list(table.T)
     if len(words) < width and not np.isnan(table[:, -1]).all():
         raise InputError("rows are longer than the names.")
     return names, list(table.T)
-
-
-def _named(names: Sequence[str]) -> list[str]:
-    """The names that are columns of points."""
-    roles = {alias for aliases in ROLES.values() for alias in aliases}
-    return [name for name in names if name.lower().removeprefix("scalar_") in roles]
 
 
 def read_arrow(path: Path) -> Table:
@@ -98,11 +97,11 @@ def read_arrow(path: Path) -> Table:
     from pyarrow import dataset
 
     stored = dataset.dataset(path, format=path.suffix.lower().removeprefix("."))
-    find_roles(stored.schema.names)
     rows = stored.count_rows()
-    if 8 * rows > 100 * path.stat().st_size + (1 << 20):  # run-length encoded values take no bytes
+    values = 8 * rows * len(stored.schema.names)
+    if values > 100 * path.stat().st_size + (1 << 20):  # run-length encoded values take no bytes
         raise InputError(f"it declares {rows:,} rows, far more than its size. Is it damaged?")
-    table = stored.to_table(columns=_named(stored.schema.names))
+    table = stored.to_table()
     table.validate(full=True)
     return table.column_names, [column.to_numpy() for column in table.columns]
 
@@ -149,6 +148,8 @@ def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
 
     They are `columns`, else x, y, z and, for four columns, reflectance.
     """
+    if is_renaming(columns):
+        raise InputError("it does not name its columns: name all, as --columns x,y,z,intensity.")
     names = columns or ("x", "y", "z", "reflectance")[: max(width, 3)]
     if len(names) != width:
         raise InputError(

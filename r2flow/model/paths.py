@@ -1,0 +1,66 @@
+"""Where checkpoints lie: in run folders, in files, among the models that come with the package."""
+
+import re
+from pathlib import Path
+
+from r2flow.errors import InputError
+from r2flow.models import MODELS, find_model
+from r2flow.registry import did_you_mean
+
+FOLDER = "checkpoints"
+
+
+def title_of(path: Path) -> str:
+    """Name of a checkpoint's run, else of its file."""
+    path = path.resolve()
+    return path.parents[1].name if path.parent.name == FOLDER else path.stem
+
+
+def step_of(path: Path) -> int:
+    """The step in a checkpoint's file name; -1 without one."""
+    match = re.search(r"step-(\d+)", path.name)
+    return int(match.group(1)) if match else -1
+
+
+def checkpoints_of(run: str | Path) -> list[Path]:
+    """The checkpoints of a run folder, the latest first."""
+    paths = [
+        path
+        for path in Path(run, FOLDER).glob("step-*.ckpt")
+        if path.is_file() and not path.is_symlink()
+    ]
+    return sorted(paths, key=step_of, reverse=True)
+
+
+def find_checkpoint(path: str | Path) -> Path:
+    """Path of a checkpoint file, of the latest checkpoint of a run folder, or of a model's file by
+    its name.
+
+    A file or a run in the current folder takes precedence over a model of the same name.
+    """
+    name, path = str(path).rstrip("/"), Path(path).expanduser()
+    if path.is_file():
+        return path
+    checkpoints = checkpoints_of(path) or sorted(
+        path.glob("step-*.ckpt"), key=step_of, reverse=True
+    )
+    if checkpoints:
+        return checkpoints[0]
+    if name in MODELS and (path.is_dir() or not path.exists()):
+        return find_model(name)
+    problem = f"no checkpoint at {path}."
+    known = [*MODELS, *(folder.name for folder in path.parent.glob("*/"))]
+    models = ", ".join(MODELS)
+    hint = f"Give a checkpoint file, a run folder or a model ({models})."
+    hint += did_you_mean(path.name, known)
+    if path.is_dir():
+        problem = f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt)."
+        runs = sorted(
+            str(folder.parent)
+            for folder in path.glob(f"*/{FOLDER}")
+            if checkpoints_of(folder.parent)
+        )
+        hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
+    elif path.exists():  # reading a pipe would block
+        problem = f"{path} is not a regular file."
+    raise InputError(f"{problem} {hint}")
