@@ -31,7 +31,8 @@ from r2flow.flow.straightness import straightness
 from r2flow.generators import Flow, as_flow
 from r2flow.metrics import METRICS
 from r2flow.metrics.things import LINES
-from r2flow.model.checkpoint import Checkpoint, load_checkpoint, weights_hash
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
+from r2flow.model.saving import weights_hash
 from r2flow.noise import Draws
 from r2flow.reports.backbones import cost
 from r2flow.reports.pages import Page, Plot, lines_figure

@@ -29,7 +29,8 @@ from r2flow.data.options import SIMULATED
 from r2flow.errors import InputError, naming
 from r2flow.files import read_json, write_file
 from r2flow.generators import as_flow
-from r2flow.model.checkpoint import find_checkpoint, read_checkpoint
+from r2flow.model.paths import find_checkpoint
+from r2flow.model.tensor_files import read_checkpoint
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended
 from r2flow.runs.launch import job_folder
