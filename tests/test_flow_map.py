@@ -346,24 +346,3 @@ def test_a_map_is_drawn_on_the_grid_that_it_learned():
     found = stage(jumps={"grid": "power:3"}).generator
     assert found.sampler == build_sampler("jump", steps=4, grid="power:3")
     assert found.choose(steps=2) == build_sampler("jump", steps=2, grid="power:3")
-
-
-def test_the_losses_of_a_twin_s_own_draws(monkeypatch):
-    """With constant u(z, 0, 1) = a, u(x, t, t) = c and u(x, t, -t) = b they are (b - a)^2 and
-    (c - b)^2: a moves along c - b, b towards a, and c stays.
-    """
-    constants = torch.tensor([0.5, -1.0, 2.0], requires_grad=True)
-
-    def u(t, x, s, condition=None):
-        choice = torch.where(s < 0, 1, torch.where(s > t, 0, 2))
-        return constants[choice].view(-1, 1, 1, 1).expand_as(x)
-
-    learned = Twin(generator=flow_map(), twin=0.1).train()
-    monkeypatch.setattr(LearnFlowMap, "regression_loss", lambda *_: torch.zeros(()))
-    monkeypatch.setattr(learned.generator, "mean_velocity", u)
-    batch = batch_of(u=torch.tensor([0.1, 0.4, 0.6, 0.9]))
-    loss = learned.regression_loss(batch, batch["u"])
-    loss.backward()
-    assert loss.item() == pytest.approx(0.1 * (1.5**2 + 3.0**2), rel=1e-5)
-    torch.testing.assert_close(constants.grad, 0.1 * torch.tensor([-6.0, -3.0, 0.0]))
-    assert not learned.eval().regression_loss(batch, batch["u"])

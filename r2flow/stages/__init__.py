@@ -5,9 +5,8 @@ from r2flow.stages.base import Stage
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Distill, Rectify, Reflow
 from r2flow.stages.transfer import Transfer
-from r2flow.stages.twin import Twin
 
-__all__ = ["STAGES", "Distill", "LearnFlowMap", "Rectify", "Reflow", "Stage", "Transfer", "Twin"]
+__all__ = ["STAGES", "Distill", "LearnFlowMap", "Rectify", "Reflow", "Stage", "Transfer"]
 
 STAGES: Registry[type[Stage]] = Registry(
     "stage",
@@ -15,7 +14,6 @@ STAGES: Registry[type[Stage]] = Registry(
     reflow=Reflow,
     distill=Distill,
     flow_map=LearnFlowMap,
-    twin=Twin,
     transfer=Transfer,
     diffusion=lazy("r2flow.systems.diffusion.stage:LearnDiffusion"),
     gan=lazy("r2flow.systems.gan.stage:LearnGan"),
