@@ -130,6 +130,12 @@ def test_things_are_judged_by_their_distance_from_the_real_value():
     }
 
 
+def test_a_setting_without_a_figure_is_left_out_of_its_comparison():
+    found = {**groups(a=[1.0, 2.0], b=[1.5, 1.6]), "distilled": [{"bend": 0.0}]}
+    assert [row["verdict"] for row in table_rows(found)] == ["no difference", ""]
+    assert "distilled" not in conclusion(found, "distance in 1")
+
+
 def test_no_difference_is_said_in_words():
     (row,) = table_rows(groups(a=[1.0, 2.0], b=[1.5, 1.6]))
     assert row["verdict"] == "no difference"

@@ -20,7 +20,6 @@ from r2flow.samplers import build_sampler
 from r2flow.stages import STAGES
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Reflow
-from r2flow.stages.twin import Twin
 from tests.fields import CONFIG, Field
 from tests.test_sampling import network
 

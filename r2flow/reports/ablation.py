@@ -155,7 +155,8 @@ def table_rows(groups: Groups) -> list[Row]:
     rows = []
     for title in measures(groups):
         level = best(groups, title)
-        same = len(level) == len(groups)
+        measured = [runs for runs in groups.values() if any(title in run for run in runs)]
+        same = len(level) == len(measured) > 1
         row: Row = {"figure": title}
         for name, runs in groups.items():
             mark = ""
@@ -205,9 +206,9 @@ def _cell(values: Sequence[float]) -> str:
 
 def conclusion(groups: Groups, title: str) -> str:
     """All combinations in the order of a figure, and those that are best, in two sentences."""
-    means = {name: spread(errors(runs, title))[0] for name, runs in groups.items()}
-    order = sorted(means, key=lambda name: means[name])
-    listed = "; ".join(f"{name} {shown(means[name])}" for name in order)
+    means = [(spread(errors(runs, title))[0], name) for name, runs in groups.items()]
+    order = sorted(pair for pair in means if not math.isnan(pair[0]))
+    listed = "; ".join(f"{name} {shown(mean)}" for mean, name in order)
     level = best(groups, title)
     verdict = "One seed: no verdict"
     if level:
