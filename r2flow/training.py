@@ -77,7 +77,7 @@ def fit(run: Run) -> Result:
         with quiet():
             run.data.setup()
             run.config["scans"] = run.data.fingerprint()
-            log.info("training on %s", run.config["scans"].partition(",")[0])
+            log.info("training on %s", run.data.summary())
             if first and not run.folder.exists():
                 check_folder(run.folder)
                 run.data.read()  # a bad scan leaves no folder

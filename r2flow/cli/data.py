@@ -156,18 +156,23 @@ def sensor(
     nearest, distance = nearest_sensor(beams.elevations)
     scale = mine.reflectance_scale
     height = f"{mine.height:.2f} m above the ground"
+    reflectance = "none: encoding.reflectance=false"
+    if scale:
+        stored = [one.reflectance for one in points if one.reflectance is not None]
+        beyond = sum(int((values > 1.001 * scale).sum()) for values in stored)
+        reflectance = f"reflectance_scale={scale:g}"
+        if beyond:
+            reflectance += f"; {beyond:,} points beyond are clipped"
     rows = {
         "beams": f"{len(degrees)}: {beams.order}",
         "elevations": f"{degrees[0]:+.2f} to {degrees[-1]:+.2f} degrees; "
-        f"points lie {off:.2f} from their beams",
+        f"points lie {off[0]:.2f} from their beams, 95 % of them within {off[1]:.2f}",
         "nearest sensor": f"{nearest}, its beams {distance:.2f} degrees off" if nearest else "none",
         "resolution": f"{steps:,.0f} steps a turn; images of {mine.columns} columns",
         "range seen": f"{mine.min_range:g} to {mine.max_range:g} m; "
         "raise min_range if the vehicle is visible",
         "height": height if ground else f"not found, {mine.height:g} m assumed",
-        "reflectance": f"reflectance_scale={scale:g}"
-        if scale
-        else "none: encoding.reflectance=false",
+        "reflectance": reflectance,
     }
     print_table(list(rows.items()), ("", ""))
     warn_of_frame(paths[0], points)

@@ -69,6 +69,9 @@ def sample(
     model: Annotated[
         str | None, Argument(help="A model, a run folder or a checkpoint file.")
     ] = None,
+    checkpoint: Annotated[
+        str | None, Option("--checkpoint", "-c", help="The model, as `complete` takes it.")
+    ] = None,
     precision: PrecisionOption = "32-true",
     format: Annotated[
         str | None, Option(help="Formats, of ply,bin,npy. Default: all possible.")
@@ -85,6 +88,9 @@ def sample(
     from r2flow.reports.outputs import write_samples
 
     check_folder(out)
+    if model and checkpoint:
+        raise InputError(f"give one model, {model} or -c {checkpoint}.")
+    model = model or checkpoint
     if model is None:
         _print_model(DEFAULT)
     loaded = load_checkpoint(model or find_model(DEFAULT), device=choose_device(draw.device))
@@ -188,7 +194,10 @@ class PartialOptions:
     ] = None
     to: Annotated[
         str | None,
-        Option(help="Sensor of the completed scans, name or YAML file. Default: the model's."),
+        Option(
+            help="Sensor of the completed scans, name or YAML file. Default: the model's; of "
+            "densify, their own view where it sees more."
+        ),
     ] = None
     size: SizeOption = None
     mask: Annotated[
@@ -218,12 +227,18 @@ class PartialOptions:
         """
         from r2flow.lidar.sensors import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
+        from r2flow.models import DENSIFY
 
         loaded = load_checkpoint(model, choose_device(device))
         if self.to or self.size:
             loaded = loaded.through(named_sensor(self.to or loaded.sensor, self.size))
         return loaded.open_partial(
-            what, self.source, scale=self.reflectance_scale, most=self.scans, columns=self.columns
+            what,
+            self.source,
+            keep_beams=model == DENSIFY and not (self.to or self.size),
+            scale=self.reflectance_scale,
+            most=self.scans,
+            columns=self.columns,
         )
 
 

@@ -37,8 +37,10 @@ if TYPE_CHECKING:
 def _finish(page: "Page", out: Path, parts: int) -> None:
     """Write a page; print its first parts and the paths of its files."""
     from r2flow.reports.pages import write_page
+    from r2flow.reports.tables import print_markdown
 
-    print("\n\n".join(page.text[:parts]), "", *write_page(page, out), sep="\n")
+    print_markdown("\n\n".join(page.text[:parts]))
+    print("", *write_page(page, out), sep="\n")
 
 
 @report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")

@@ -36,7 +36,7 @@ _SAMPLED = 1000  # default number of scans per sampled model
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """What is measured, of which scans, and where it is written."""
+    """Metrics, the number of scans they compare, and the files of results."""
 
     metrics: Annotated[
         str | None,

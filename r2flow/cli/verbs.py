@@ -81,6 +81,18 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
         message = f"{text.splitlines()[0].rstrip('.')}. {cures[0]}"
     except USAGE_ERROR as error:
         text = one_line(error.format_message()).rstrip(".") or "no verb given"
+        text += _verb_of_model(text)
         message = f"{text}{'' if text.endswith('?') else '.'} See --help."
     print(f"error: {message}", file=sys.stderr)
     return 2
+
+
+def _verb_of_model(text: str) -> str:
+    """Advice for a model's name in the place of a verb."""
+    from r2flow.models import DENSIFY, MODELS
+
+    for name in MODELS:
+        if f"command '{name}'" in text:
+            verb = f"complete SCANS -c {name}" if name == DENSIFY else f"sample -c {name}"
+            return f": it is a model. Did you mean 'r2flow {verb} --out FOLDER'?"
+    return ""

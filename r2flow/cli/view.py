@@ -43,13 +43,20 @@ def show(
         Literal["png", "pdf", "npy"],
         Option(help="png, pdf: pictures; npy: range images, (2, H, W)."),
     ] = "png",
+    fixed: Annotated[
+        bool,
+        Option(
+            "--fixed",
+            help="One scale for all pictures, that of a street. Default: each scan's own.",
+        ),
+    ] = False,
 ) -> None:
     """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write
     range images.
     """
     from r2flow.data.opening import describe
     from r2flow.files import save_array
-    from r2flow.reports.pictures import save_figure, scan_figure
+    from r2flow.reports.pictures import STREET, save_figure, scan_figure
     from r2flow.reports.view.panels import scan_panels, share_scale
 
     if format == "npy" and out.resolve() in {
@@ -67,7 +74,8 @@ def show(
         if format == "npy":
             save_array(path, panel.images[0])
         else:
-            save_figure(scan_figure(panel.images[0], panel.rays, panel.caption), path)
+            view = STREET if fixed else None
+            save_figure(scan_figure(panel.images[0], panel.rays, panel.caption, view), path)
         print(path)
 
 

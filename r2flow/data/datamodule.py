@@ -33,7 +33,6 @@ from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding, encoding_options
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
-from r2flow.progress import track
 from r2flow.registry import check_options, construct
 from r2flow.signals import init_loader_worker
 
@@ -296,6 +295,18 @@ class ScanDataModule(L.LightningDataModule):
             texts.append(f"{len(self.opened[0])} of {len(self.names)} scans, {digest}")
         return "; ".join(texts)
 
+    def summary(self) -> str:
+        """What is trained on, as '117 folder scans and 1800 simulated scans, 213 held out'."""
+        if self.pairs is not None:
+            return f"{self.pairs.num} pairs"
+        assert isinstance(self.training_source, Mixture)
+        counts = [
+            f"{len(part)} {named.options.name} scans"
+            for named, part in zip(self.described_sets, self.training_source.parts, strict=True)
+        ]
+        held = len(self.names) - len(self.training_source)
+        return f"{' and '.join(counts)}, {held} held out"
+
     def _kept(self, source: Mixture, what: str) -> Mixture:
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = [*source.parts]
@@ -306,15 +317,7 @@ class ScanDataModule(L.LightningDataModule):
         ):
             return source
         for i, first in firsts.items():
-            images = np.empty((len(parts[i]), *first.shape), np.float32)
-            for number in track(range(len(images)), f"reading {what}", least=16):
-                image = parts[i][number]
-                if image.shape != first.shape:  # of one channel, it would fill both
-                    raise InputError(
-                        f"{parts[i].names[number]}: an image of {first.shape}, found {image.shape}."
-                    )
-                images[number] = image
-            parts[i] = InMemory(images, parts[i].names)
+            parts[i] = InMemory(parts[i].read_all(what, first.shape), parts[i].names)
         return Mixture(parts)
 
     @property

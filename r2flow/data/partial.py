@@ -1,6 +1,7 @@
 """Scans of any sensor as partially measured images of a model's sensor, for `r2flow complete`."""
 
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -57,6 +58,7 @@ class PartialScan:
     content: Callable[[], bytes]
     path: Path | None = None  # its file; None if it has no file
     image: bool = True  # whether it is a range image or points; completions have the same form
+    whole: Sensor | None = None  # one that sees all its beams; None: the model's does
 
     def identity(self) -> str:
         """Hash of the content, which distinguishes scans of the same name."""
@@ -124,6 +126,7 @@ def _files(
     folder = described.options.folder
     spec = described.label
     source = source or (stored.sensor if stored else None)
+    whole = None
     images = {
         path for path in paths if path.suffix.lower() == ".npy" and read_numbers(path).ndim == 3
     }
@@ -176,17 +179,19 @@ def _files(
         if not as_own:
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             lines += _described(spec, replace(fired, name=name), target, turns=True)
+            whole = _seeing_all(source or fired, target)
         if not (scale or stored) and full != usual and (of_sensor or full not in SURE):
             warn_odd(points[0], DIVIDED % full)
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
+        whole = _seeing_all(source, target)
 
     def opened(path: Path) -> PartialScan:
         ending = scan_ending(path.name) or path.suffix
         below = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
         name = str(below)[: len(str(below)) - len(ending)]
         read = partial(read_image if path in images else by_points, path)
-        return PartialScan(name, ending, read, path.read_bytes, path, path in images)
+        return PartialScan(name, ending, read, path.read_bytes, path, path in images, whole)
 
     return [opened(path) for path in paths], lines
 
@@ -212,6 +217,18 @@ def _images(
 
     lines = [] if stored.sensor.same_image(target) else _described(spec, stored.sensor, target)
     return [opened(number) for number in spread(len(scans), most or len(scans))], lines
+
+
+def _seeing_all(source: Sensor, target: Sensor) -> Sensor | None:
+    """A sensor with at least the target's rows and with its columns and ranges that sees all beams
+    of the source; None if the target does.
+    """
+    if (rows_of(source.elevations, target) >= 0).all():
+        return None
+    beams = len(source.elevations)
+    rows = max(target.shape[0], math.ceil(beams / 16) * 16)  # networks halve them four times
+    sensor = source.resized(rows, target.columns)
+    return replace(sensor, min_range=target.min_range, max_range=target.max_range)
 
 
 def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -> list[str]:

@@ -19,14 +19,15 @@ from r2flow.store import manifest_of
 
 AUTO = "auto"
 FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
+DARKEST = 0.01  # likewise of the median; that of bytes is 0.03 or more
 DIVIDED = (
     "reflectance is divided by %g; --reflectance-scale (of r2flow.read reflectance_scale) "
     "names another value"
 )
 DARK = (
-    "reflectance stays below a tenth of full reflectance: give its value as --reflectance-scale, "
-    "in training as "
-    "data.reading.reflectance_scale; r2flow sensor estimates it"
+    "reflectance stays below a tenth of full reflectance, or half of it below a hundredth: give "
+    "its value as --reflectance-scale, in training as data.reading.reflectance_scale; "
+    "r2flow sensor estimates it"
 )
 
 
@@ -156,24 +157,24 @@ def scaled_reflectance(
     """
     if points.reflectance is None:
         raise _no_reflectance(path)
-    least, highest = (
-        float(points.reflectance.min(initial=0)),
-        float(points.reflectance.max(initial=0)),
-    )
+    stored = points.reflectance
+    highest = float(stored.max(initial=0))
+    seen = stored[stored > 0]
     scale = estimated_scale(path, [points]) if scale is None else scale
-    if scale in FULL_REFLECTANCE[1:] and highest <= 1 and (points.reflectance % 1).any():
+    fractions = len(seen) and np.mean(seen > 1) <= OUTLIERS and (seen % 1).any()
+    if scale in FULL_REFLECTANCE[1:] and fractions:
         warn_odd(
             Path(path), f"reflectance is not divided by {scale:g}: its values are fractions of 1"
         )
         scale = 1.0
-    if 0 < highest < FAINT * scale:
+    if len(seen) and (highest < FAINT * scale or np.median(seen) < DARKEST * scale):
         warn_odd(Path(path), DARK)
-    check(
-        not strict or least >= 0,
-        f"{path}: reflectance must not be negative, found {least:g}; correct the file.",
-    )
-    scaled = points.reflectance / np.float32(scale)
-    if strict and np.count_nonzero(scaled > 1.001) > OUTLIERS * len(scaled):
+    if strict and stored.min(initial=0) < 0:
+        raise InputError(
+            f"{path}: reflectance must not be negative, found {stored.min():g}; correct the file."
+        )
+    beyond = int(np.count_nonzero(stored > 1.001 * scale))
+    if strict and beyond > OUTLIERS * len(stored):
         full = max(full_reflectance([points]) or 0, 255)
         raise InputError(
             f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
@@ -181,7 +182,9 @@ def scaled_reflectance(
             f"data.reading.reflectance_scale={full:g}, that of "
             f"its part of data.parts, or --reflectance-scale {full:g}."
         )
-    return scaled.clip(0, 1)
+    if beyond:
+        warn_odd(Path(path), f"reflectance beyond {scale:g} is clipped", beyond)
+    return (stored / np.float32(scale)).clip(0, 1)
 
 
 def read_image(path: Path, reading: Reading) -> np.ndarray:

@@ -21,16 +21,19 @@ from torch import Tensor
 from r2flow import simulator
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.errors import InputError, check, warn_odd
+from r2flow.files import cache_folder
 from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.turns import SEVERAL, turns
-from r2flow.store import MANIFEST, manifest_of
+from r2flow.progress import track
+from r2flow.store import MANIFEST, Damaged, Store, checksum, manifest_of
 
 log = logging.getLogger(__name__)
 
 Read = TypeVar("Read")
 
+WORTH_KEEPING = 32  # simulated scans: fewer are simulated again
 LOOKED_AT = 3  # number of scans whose beams are compared with the sensor's
 
 
@@ -41,6 +44,7 @@ class ScanSource(ABC):
     Subclasses must implement the four abstract methods; the others are optional.
     """
 
+    doing = "reading"  #: what reading does, for progress bars
     slow = False  #: whether reading an image is slow, so that images are kept in memory if they fit
     #: whether a network draws the images on access: only in this process, each image once if
     #: possible
@@ -72,6 +76,16 @@ class ScanSource(ABC):
     def batch(self, indices: Sequence[int]) -> Tensor:
         """Several scans at once, (B, 2 or 1, H, W)."""
         return torch.from_numpy(np.stack([self[index] for index in indices]))
+
+    def read_all(self, what: str, shape: tuple[int, ...]) -> np.ndarray:
+        """All images, which must have the shape; `what` they are, for the progress bar."""
+        images = np.empty((len(self), *shape), np.float32)
+        for number in track(range(len(images)), f"{self.doing} {what}", least=16):
+            image = self[number]
+            if image.shape != shape:  # of one channel, it would fill both
+                raise InputError(f"{self.names[number]}: an image of {shape}, found {image.shape}.")
+            images[number] = image
+        return images
 
     def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """An image, and the measured x, y, z of its pixels' points in metres, (3, H, W) float32, 0
@@ -325,7 +339,7 @@ class MadeScans(ScanSource):
 class SimulatedScans(MadeScans):
     """Simulated scenes of one seed."""
 
-    slow, word = True, "scene"
+    slow, word, doing = True, "scene", "simulating"
 
     def __init__(
         self, sensor: Sensor, seed: int, numbers: Sequence[int], reflectance: bool
@@ -350,6 +364,22 @@ class SimulatedScans(MadeScans):
             "simulator": simulator.REVISION,
             "sensor": self.sensor.described(),
         }
+
+    def read_all(self, what: str, shape: tuple[int, ...]) -> np.ndarray:
+        """All images; many are kept in the user's cache, so that they are simulated once."""
+        if len(self) < WORTH_KEEPING:
+            return super().read_all(what, shape)
+        identity = self.identity()
+        folder = cache_folder("R2FLOW_CACHE")
+        store = Store(folder, f"simulated-{checksum(identity)[:16]}", identity)
+        try:
+            return store.read(0)[0]["images"]
+        except (FileNotFoundError, Damaged):
+            images = super().read_all(what, shape)
+        with suppress(OSError):  # a full disk, a home that is read-only
+            store.write(0, {"images": images})
+            log.info("the simulated scans are kept in %s (%.0f MB)", folder, images.nbytes / 1e6)
+        return images
 
     @property
     def contents(self) -> str:  # type: ignore[override]

@@ -12,6 +12,9 @@ from scipy.ndimage import median
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.unfolding import (
+    FEWEST,
+    MOST,
+    TIGHT,
     elevations_of,
     few_firings,
     median_of_seen,
@@ -19,8 +22,6 @@ from r2flow.lidar.unfolding import (
     scatter_of,
 )
 
-FEWEST, MOST = 4, 256  # limits of the number of beams
-TIGHT = 0.1  # scatter (`scatter_of`) below which each column is one laser
 BANDWIDTHS = np.geomspace(0.015, 2.0, 50)  # degrees
 BIN = 0.005  # degrees
 FAINT = 0.02  # share of the median peak's height below which a peak is not a beam
@@ -94,13 +95,16 @@ def _beams_of_files(files: Sequence[Points]) -> Beams:
             laser //= 2
         return _beams_of_lasers(together, [laser], FIRINGS)
     peaks = _beams_of_elevations(together)
-    rings = [_rings_from_bottom(file, e) for file, e in zip(files, elevations, strict=True)]
-    if all(map(len, rings)):
+    stored = [rings_from_order(file.xyz) for file in files]
+    rings = [ring for ring in stored if ring is not None]
+    if len(rings) == len(files):
         beams = _beams_of_lasers(together, rings, RING_AFTER_RING)
+        apart = -np.diff(beams.elevations).max() >= SAME
         # A ring with few returns may be merged with the next; elevation peaks separate them.
-        if peaks is None or len(peaks.elevations) <= len(beams.elevations):
+        if apart and (peaks is None or len(peaks.elevations) <= len(beams.elevations)):
             return beams
-        return replace(peaks, order=RING_AFTER_RING)
+        if peaks is not None:
+            return replace(peaks, order=RING_AFTER_RING)
     if peaks is not None:
         return peaks
     if all(map(_is_scattered, files)):
@@ -171,31 +175,10 @@ def _lasers_of_firings(elevations: list[ndarray]) -> int | None:
     return next((count for count, distance in distances.items() if distance <= most), None)
 
 
-def _rings_from_bottom(scan: Points, elevation: ndarray) -> ndarray:
-    """Ring of each point, -1 for none, of a file stored ring after ring, (N,); else an empty array.
-
-    Rings are counted from the bottom, since those that see only sky are missing at the top.
-    """
-    ring = rings_from_order(scan.xyz)
-    count = ring.max(initial=-1) + 1
-    returned = ring >= 0
-    if FEWEST <= count <= MOST:
-        middles = median(elevation, ring, np.arange(count))
-        seen = elevation[returned]
-        spread = np.median(abs(seen - middles[ring[returned]]))
-        falls = np.mean(np.diff(middles) < 0)
-        if spread <= TIGHT * np.median(abs(seen - np.median(seen))):
-            if falls <= 0.1:
-                return ring
-            if falls >= 0.9:
-                return np.where(returned, count - 1 - ring, -1)
-    return ring[:0]
-
-
 def _beams_of_elevations(elevation: ndarray) -> Beams | None:
     """Beams as peaks of the density of elevations, or None.
 
-    The bandwidth is that where the number of peaks is most stable.
+    The bandwidth is the finest at which the number of peaks is stable.
     """
     from scipy.signal import find_peaks  # half a second
 
@@ -216,11 +199,11 @@ def _beams_of_elevations(elevation: ndarray) -> Beams | None:
         usual = np.median(heights[heights > 0.01 * heights.max()])
         peaks_of.append(edges[peaks[heights > FAINT * usual]] + BIN / 2)
     runs = [[*run] for count, run in groupby(peaks_of, len) if FEWEST <= count <= MOST]
-    runs.append([])
-    longest = max(reversed(runs), key=len)
-    if len(longest) < STABLE:
+    # The finest: wider ones merge weak beams with strong neighbours.
+    stable = next((run for run in runs if len(run) >= STABLE), None)
+    if stable is None:
         return None
-    peaks = longest[(len(longest) - 1) // 2][::-1]
+    peaks = stable[(len(stable) - 1) // 2][::-1]
     row = np.searchsorted(-(peaks[:-1] + peaks[1:]) / 2, -np.nan_to_num(elevation))
     row[~returned] = -1
     elevations = peaks.astype(elevation.dtype)

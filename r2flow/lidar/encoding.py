@@ -116,7 +116,7 @@ class Encoding:
             `inverse_depth` (DUSty's), or `metric`.
         reflectance: Whether reflectance is a channel, in addition to range.
         limits: `closed`: ranges equal to the sensor's limits are returns. `open`, as in R2DM: they
-            are not, and ranges outside the limits are encoded as dropped rays.
+            are not.
         levels: Decoded reflectance is rounded to n / levels, as the sensor reports it; None: it is
             not rounded.
     """
@@ -167,21 +167,20 @@ class Encoding:
         """Map range in metres and reflectance in [0, 1] to model space.
 
         Shapes are (..., 2 or 1, H, W) and (..., channels, H, W).
-        A dropped ray, range 0, becomes exactly -1, or nearly under `shifted_log`; values are
-        clipped to [-1, 1].
+        A range outside the limits is a dropped ray, which becomes exactly -1 in both channels, or
+        nearly under `shifted_log`; values are clipped to [-1, 1].
         """
         r = image[..., :1, :, :]
+        returned = self._is_return(r)
+        y = self.format.forward(torch.where(returned, r, 0.0))
         if self.limits == "open":
-            y = self.format.forward(r * self._is_return(r))
             # 2 y - 1 rounds y below 1/2, to the least y of a return or below it: keep these.
             kept = self._is_return(self.format.inverse(y))
             rounded = self._is_return(self.format.inverse((2 * y - 1 + 1) / 2))
             y = torch.where(kept & ~rounded, y + 2**-24, y)
-        else:
-            y = self.format.forward(r)
         if self.reflectance:
             assert image.shape[-3] > 1, "the model has a reflectance channel and the scan has none"
-            y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)
+            y = torch.cat([y, torch.where(returned, image[..., 1:2, :, :], 0.0)], dim=-3)
         return (2 * y - 1).clamp(-1, 1)
 
     def decode(self, x: Tensor) -> Tensor:

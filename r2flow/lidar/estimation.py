@@ -21,7 +21,8 @@ COLUMNS = 64  # image widths are multiples of it, so that every backbone can hal
 FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full reflectance
 # Bytes up to 100 may be of 255: above it are retroreflectors alone.
 SURE = FULL_REFLECTANCE[:1] + FULL_REFLECTANCE[2:]
-OUTLIERS = 1e-4  # share of values that may exceed one of them
+OUTLIERS = 0.05  # share of values beyond full reflectance, which are clipped
+STRAY = 1e-4  # the same, of values up to 4 times as large, as of a larger scale
 IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
 OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
 # Share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16.
@@ -42,7 +43,7 @@ class Estimate(NamedTuple):
     sensor: Sensor
     beams: Beams
     steps: float  # azimuth steps per full turn, not rounded
-    off: float  # median distance of the points from their beams in degrees
+    off: tuple[float, float]  # median and 95th percentile of the points' distance from their beams
     ground: bool  # whether the height above it was found
 
 
@@ -222,7 +223,8 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         beams.firing,
         full_reflectance(scans),
     )
-    return Estimate(sensor, beams, steps, float(np.median(beams.off(scans))), ground is not None)
+    middle, most = np.quantile(beams.off(scans), [0.5, 0.95])
+    return Estimate(sensor, beams, steps, (float(middle), float(most)), ground is not None)
 
 
 def _height(xyz: ndarray) -> float | None:
@@ -270,22 +272,34 @@ def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[ndarray]) -> float:
 def full_reflectance(scans: Iterable[Points], usual: float | None = None) -> float | None:
     """Estimate the value of full reflectance; None if no file has reflectance, or only 0.
 
-    It is `usual`, if given, unless more than 1 % of the values exceed it; else 1 if at most one in
-    10,000 exceeds 1, or the first common value that none exceeds, or the highest value, rounded up,
-    if that is below a tenth of it.
+    Up to 5 % of the values may be outliers: Waymo's fractions of 1 reach 40,000. It is `usual`, if
+    given and beyond the others; else 1 of fractions; else the first common value beyond the others;
+    or the highest of them, rounded up, if that is below a tenth of it.
     """
     stored = [scan.reflectance for scan in scans if scan.reflectance is not None]
     values = np.concatenate([np.zeros(0), *stored])
-    highest = float(values.max(initial=0))
-    if highest <= 0:
+    values = values[values > 0]
+    if not len(values):
         return None
-    if usual and np.mean(values > usual) <= 0.01:
+    if usual and np.mean(values > usual) <= OUTLIERS:
         return usual
-    # Bytes above 100 are retroreflectors, and as few as outliers above 1.
-    common = [full for full in FULL_REFLECTANCE if highest <= full * 1.001]
-    if np.mean(values > 1.001) <= OUTLIERS:
-        common = [1.0]
-    if common and highest >= 0.1 * common[0]:  # else the values would fill less than a tenth
-        return common[0]
+    bulk = np.quantile(values, 1 - OUTLIERS)
+    full = next((full for full in FULL_REFLECTANCE if _is_full(full, values)), math.inf)
+    inside = values[values <= full * 1.001].max()
+    # Of bytes a few retroreflectors are bright; counts of photons may be saturated.
+    if (bulk if full > 256 else inside) >= 0.1 * full:  # else the values would fill less than that
+        return full
+    highest = inside if inside <= 10 * bulk else bulk
     rounded = float(f"{highest:.1g}")
     return rounded if rounded >= highest else float(f"{highest * 1.05:.2g}")
+
+
+def _is_full(full: float, values: ndarray) -> bool:
+    """Whether a common value is full reflectance of values above 0, (N,), but for outliers."""
+    beyond = values > full * 1.001
+    if full == 1:
+        fractions = np.mean(values % 1 > 0) > 0.5
+        return bool(beyond.mean() <= OUTLIERS and (fractions or not beyond.any()))
+    # Bytes above 100 are retroreflectors, and as few as outliers.
+    stray = np.mean(beyond & (values <= 4 * full))
+    return bool(beyond.mean() <= OUTLIERS and stray <= (STRAY if full > 100 else 0))

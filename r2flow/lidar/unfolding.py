@@ -1,12 +1,20 @@
 """Scan unfolding: the row of a point is the laser that fired it, not that of its elevation."""
 
+from math import pi
+
 import numpy as np
 from numpy import ndarray
+from scipy import ndimage
 
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention, Sensor
 
-SURE = 0.9  # minimum share of neighbouring lasers whose elevations decrease in that order
+NOISE = 0.1  # degrees by which a laser may lie above that of the row before it in any case
+FEW = 5  # returns below which the median elevation of a ring is not known
+FEWEST, MOST = 4, 256  # limits of the number of beams
+TIGHT = 0.1  # scatter below which points of one beam are together
+_BACK = 1 / 12  # of a turn, by which azimuths fall back at a new ring; at most half its width
+_NEARBY = 1 / 36  # of a turn: neighbouring points are nearer
 _CURE = "Use the spherical projection, which finds rows by elevation."
 
 
@@ -35,37 +43,90 @@ def unfolded_rows(
     if firings is not None:
         return firings
     order = rings_from_order(xyz)
-    rings = int(order.max(initial=-1)) + 1
+    if order is None:
+        raise InputError(
+            "the scan has no ring numbers and is stored neither ring after ring nor in whole "
+            f"firings of {rows}, the lasers of sensor '{sensor.name}'. {_CURE}"
+        )
+    rings = int(order.max()) + 1
     if not rows / 2 <= rings <= rows + 1:
         raise InputError(
-            f"the scan unfolds into {rings} rings, but sensor '{sensor.name}' has {rows}: it has "
-            "no ring numbers and is stored neither ring after ring nor in whole firings of "
-            f"{rows}. {_CURE}"
+            f"the scan unfolds into {rings} rings, but sensor '{sensor.name}' has {rows}. {_CURE}"
         )
-    x, y, _ = xyz[order >= 0].T
-    turn = np.flatnonzero(np.diff(y < 0))
-    jump = abs(np.diff(elevations_of(xyz[order >= 0]))[turn])
-    ahead = x[turn] > 0
-    medians = [np.nanmedian(np.append(jump[side], 0)) for side in (ahead, ~ahead)]
-    if medians[0] < medians[1] / 3:  # real scans: 1.2 times as far at least
-        raise InputError(
-            "elevations jump behind and not ahead: rings must be stored from azimuth 0 on. " + _CURE
-        )
-    return order - rings + rows
+    return np.where(order < 0, -1, rows - 1 - order)
 
 
-def rings_from_order(xyz: ndarray) -> ndarray:
-    """Ring of every point from the order of storage, (N,) int64, 0 for the first ring stored.
+def rings_from_order(xyz: ndarray) -> ndarray | None:
+    """Ring of every point of a scan stored ring after ring, (N,) int64; None for other scans.
 
-    In a scan stored ring after ring, azimuth increases from 0; a new ring starts where it passes
-    from the 4th to the 1st quadrant. Points at the origin are rays without return (-1).
+    Rings may begin at any azimuth, turn either way, and follow each other upwards or downwards.
+    They are counted from the lowest, because rings that see only sky are missing at the top. Points
+    at the origin are rays without return (-1).
     """
     returned = np.flatnonzero(xyz[:, :2].any(axis=1))
-    ring = np.full(len(xyz), -1, dtype=int)
-    starts = _starts(xyz[returned])
-    starts[:1] = True
-    ring[returned] = np.cumsum(starts) - 1
+    if len(returned) < 2:
+        return None
+    seen = xyz[returned]
+    elevation = elevations_of(seen)
+    turn = np.arctan2(seen[:, 1], seen[:, 0]) / np.float32(2 * pi)
+    step = np.diff(turn)
+    if np.sign(step - np.rint(step)).sum() < 0:  # clockwise, or y to the right
+        turn = -turn
+    turn = (turn - turn[-1] + _NEARBY) % 1
+    every = max(len(turn) // 5000, 1)
+    few = elevation[::every]
+    # The cut is between the last point and the first.
+    places = _NEARBY + (turn[0] - _NEARBY) * np.linspace(0, 1, 19)[1:-1]
+    cut = min(places, key=lambda cut: _scatter_of_rings(turn[::every], few, cut))
+    ring = _cut_at(turn[::every], cut)
+    count = ring[-1] + 1
+    if not FEWEST <= count <= MOST:
+        return None
+    middles = ndimage.median(few, ring, np.arange(count))
+    rise = np.diff(middles)
+    spread = np.median(abs(few - middles[ring]))
+    downwards = np.mean(rise < 0)
+    if spread > TIGHT * np.median(abs(few - np.median(few))) or 0.1 < downwards < 0.9:
+        return None
+    found = _cut_at(turn, _exact_cut(turn, elevation, cut, rise))
+    ring = np.full(len(xyz), -1)
+    ring[returned] = found[-1] - found if downwards > 0.5 else found
     return ring
+
+
+def _exact_cut(turn: ndarray, elevation: ndarray, cut: float, rise: ndarray) -> float:
+    """The place that lies between two neighbouring points a ring apart in most turns, else `cut`.
+
+    Azimuths are in turns; `rise` is the distance from each ring to the next in degrees.
+    """
+    step = np.diff(turn)
+    step -= np.rint(step)
+    edge = (step > 0) & (step < _NEARBY) & (np.diff(elevation) / np.median(rise) > 0.5)
+    begin = turn[:-1][edge]
+    ends = np.concatenate([begin, begin + step[edge]])
+    order = ends.argsort()
+    depth = np.cumsum(np.where(order < len(begin), 1, -1))
+    if depth.max(initial=0) <= len(rise) / 2:  # a file may begin and end within a ring
+        depth[ends[order] > turn[0]] = 0
+    if depth.max(initial=0) <= len(rise) / 4:
+        return cut
+    deepest = depth.argmax()
+    return float(ends[order[deepest : deepest + 2]].mean())
+
+
+def _cut_at(turn: ndarray, cut: float) -> ndarray:
+    """Rings of azimuths in turns, (N,) int64: a new one where they fall back past `cut`."""
+    phase = (turn - cut) % 1
+    # Within a ring azimuths of near points fall back by up to 10 degrees in KITTI's scans.
+    back = min(np.ptp(phase) / 2, _BACK)
+    return np.cumsum(np.diff(phase, prepend=phase[0]) < -back)
+
+
+def _scatter_of_rings(turn: ndarray, elevation: ndarray, cut: float) -> float:
+    """Mean distance in degrees of the points from the median elevations of their rings."""
+    ring = _cut_at(turn, cut)
+    middles = ndimage.median(elevation, ring, np.arange(ring[-1] + 1))
+    return float(abs(elevation - middles[ring]).mean())
 
 
 def _starts(xyz: ndarray) -> ndarray:
@@ -81,42 +142,49 @@ def _starts(xyz: ndarray) -> ndarray:
 def _rows_from_field(xyz: ndarray, ring: ndarray, sensor: Sensor) -> ndarray:
     """Rows from a file's ring numbers, (N,) int64.
 
-    They count from 0 or 1, from the top, the bottom or by laser.
+    They count from 0 or 1, from the top, the bottom or by laser; or they have gaps, as those of
+    every fourth beam, and elevations decide.
     """
     rows = sensor.shape[0]
-    first = 0
     highest = int(ring.max(initial=0))
-    if ring.min(initial=highest) > 0 and highest <= rows:
+    elevation = _median_elevations(xyz, ring, max(highest + 1, rows + 1))
+    numbers = np.flatnonzero(np.bincount(ring))
+    first = 0
+    if numbers[0] > 0 and highest <= rows:
         # Elevations decide if neither the first nor the last ring has a return.
-        means = _mean_elevations(xyz, ring, rows + 1)
         from_0, from_1 = (
-            _misfit(part, best_order(part, sensor)[0], sensor) for part in (means[:-1], means[1:])
+            _misfit(part, best_order(part, sensor)[0], sensor)
+            for part in (elevation[:rows], elevation[1 : rows + 1])
         )
         first = int(highest == rows or from_1 < from_0 / 2)
-    ring = ring - first
     last = highest - first
-    if not rows / 2 <= last + 1 <= rows:
+    if last >= rows >= len(numbers):
+        order = abs(elevation[:, None] - np.asarray(sensor.elevations)).argmin(axis=1)
+        known = np.isfinite(elevation)
+        fits = len(set(order[known])) == known.sum()
+    elif rows / 2 <= last + 1 <= rows:
+        order, fits = best_order(elevation[first : first + rows], sensor)
+    else:
         raise InputError(
             f"the scan has ring numbers up to {last}, but sensor '{sensor.name}' has {rows} rows. "
             f"Is it this sensor's? {_CURE}"
         )
-    order, share = best_order(_mean_elevations(xyz, ring, rows), sensor)
-    if share < SURE:
+    if not fits:
         raise InputError(
             "the scan's ring numbers follow neither the elevations of its points nor the firing "
             f"order of sensor '{sensor.name}'. Give the sensor its `firing`. {_CURE}"
         )
-    return order[ring]
+    return order[ring - first]
 
 
-def _mean_elevations(xyz: ndarray, ring: ndarray, rows: int) -> ndarray:
-    """Mean elevation of each ring in degrees, (H,); NaN for rings without returns."""
+def _median_elevations(xyz: ndarray, ring: ndarray, rings: int) -> ndarray:
+    """Median elevation of each ring in degrees, (rings,); NaN for rings with few returns."""
     elevation = elevations_of(xyz)
     seen = np.isfinite(elevation)
-    count = np.bincount(ring[seen], minlength=rows)
-    total = np.bincount(ring[seen], elevation[seen], minlength=rows)
-    with np.errstate(invalid="ignore"):
-        return total / count
+    many = np.flatnonzero(np.bincount(ring[seen], minlength=rings) >= FEW)
+    middles = np.full(rings, np.nan)
+    middles[many] = ndimage.median(elevation[seen], ring[seen], many)
+    return middles
 
 
 def _misfit(elevation: ndarray, order: ndarray, sensor: Sensor) -> float:
@@ -135,8 +203,8 @@ def _rows_from_firings(xyz: ndarray, sensor: Sensor) -> ndarray | None:
     table = few_firings(xyz.reshape(firings, rows, 3))
     elevation = elevations_of(table.reshape(-1, 3)).reshape(-1, rows)
     middle, scatter = scatter_of(elevation)
-    order, share = best_order(middle, sensor)
-    return np.tile(order, firings) if scatter < 0.25 and share >= SURE else None
+    order, fits = best_order(middle, sensor)
+    return np.tile(order, firings) if scatter < 0.25 and fits else None
 
 
 def few_firings(firings: ndarray) -> ndarray:
@@ -175,14 +243,14 @@ def median_of_seen(values: ndarray) -> ndarray:
     return np.where(seen > 0, middle, np.nan)
 
 
-def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, float]:
+def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, bool]:
     """Row of each laser, (H,) int64, in the order that best fits their elevations.
 
     Candidates are top-down, bottom-up and the sensor's firing order.
 
     Returns:
-        The order, and the quality of its fit: the share of neighbouring lasers with decreasing
-        elevations. Ties go to the order with the smaller distance to the rows.
+        The order, and whether it fits: no laser lies above that of the row before it by more than
+        half the distance of the rows. Ties go to the order with the smaller distance to the rows.
     """
     top_down = np.arange(len(elevation))
     orders = [top_down, top_down[::-1]]
@@ -190,9 +258,10 @@ def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, float]:
         orders.append(np.asarray(sensor.firing))
     fits = []
     for order in orders:
-        falling = elevation[np.argsort(order)]
-        steps = np.diff(falling[np.isfinite(falling)])
-        share = float((steps < 0).mean()) if len(steps) else 1.0
-        fits.append((share, -_misfit(elevation, order, sensor)))
+        by_row = elevation[np.argsort(order)]
+        seen = np.isfinite(by_row)
+        apart = -np.diff(np.asarray(sensor.elevations)[seen])
+        wrong = np.diff(by_row[seen]) > np.maximum(apart / 2, NOISE)
+        fits.append((-int(wrong.sum()), -_misfit(elevation, order, sensor)))
     best = fits.index(max(fits))
-    return orders[best].astype(int), fits[best][0]
+    return orders[best].astype(int), fits[best][0] == 0

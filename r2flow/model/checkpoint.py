@@ -141,26 +141,32 @@ class Checkpoint:
         )
 
     def open_partial(
-        self, specs: Sequence[str], sensor: Sensor | str | None = None, **how: Any
+        self,
+        specs: Sequence[str],
+        sensor: Sensor | str | None = None,
+        columns: Sequence[str] | None = None,
+        keep_beams: bool = False,
+        **how: Any,
     ) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
         """This model for the sensor of scans to complete, the scans, and remarks; see
         `r2flow.data.partial`.
+
+        With `keep_beams`, a transfer flow takes the view of the scans if they are of one sensor
+        that sees past its own.
         """
-        reading = reading_for([], self, columns=how.pop("columns", None))
-        scans, remarks = open_partial(
-            specs, reading, None if sensor is None else named_sensor(sensor), **how
-        )
-        if (
-            not remarks
-            or not isinstance(self.generator, TransferFlow)
-            or all(map(self._coarser, specs))
-        ):
+        named = None if sensor is None else named_sensor(sensor)
+        scans, remarks = open_partial(specs, reading_for([], self, columns=columns), named, **how)
+        transfers = isinstance(self.generator, TransferFlow)
+        views = {scan.whole for scan in scans}
+        if keep_beams and transfers and len(views) == 1 and (view := views.pop()):
+            model, scans, remarks = self.through(view).open_partial(specs, sensor, columns, **how)
+            size = "x".join(map(str, view.shape))
+            remarks.append(f"completed in their own view, as {size}, which keeps all their beams")
+            return model, scans, remarks
+        if not remarks or not transfers or all(map(self._coarser, specs)):
             return self, scans, remarks
-        return (
-            self.through(self.sensor, numbered=False),
-            scans,
-            remarks,
-        )  # another sensor fills other rows
+        # Another sensor fills other rows.
+        return self.through(self.sensor, numbered=False), scans, remarks
 
     def _coarser(self, spec: str) -> bool:
         """Whether r2flow wrote some scans as images of this sensor in another size."""

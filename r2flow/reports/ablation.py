@@ -40,8 +40,7 @@ from r2flow.reports.tables import Row, shown, table
 
 TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of the error of x_1
 BATCH = 8
-PATHS = 8  # scans of the bend, in as many Euler steps as `_STEPS`
-_STEPS = 16
+PATHS = 8  # scans of the bend
 # Kinds of figures in the order of the table; those of `COSTS` are not judged. An untrained flow is
 # straight, too.
 JUDGED = ("distance", *LINES, "error of x_1")
@@ -56,9 +55,7 @@ RULE = (
 Groups = Mapping[str, Sequence[Row]]  # figures of each seed's run, by combination
 
 
-def measure_run(
-    run: Path, real: ScanSet, evaluations: Sequence[int], device: str, repeats: int = 5
-) -> Row:
+def measure_run(run: Path, real: ScanSet, evaluations: Sequence[int], device: str) -> Row:
     """Figures of a run by their titles; they are stored in its folder and read from there.
 
     Every run has the same held-out scans and the same noise.
@@ -70,7 +67,7 @@ def measure_run(
         stored = read_json(path)
         if stored["recipe"] == recipe:
             return stored["figures"]
-    costs = cost(checkpoint.config, repeats, device)
+    costs = cost(checkpoint.config, 5, device)
     figures: Row = {
         "parameters, millions": costs["parameters"] / 1e6,
         "GMAC": costs["gmac"],
@@ -97,7 +94,7 @@ def _of_velocity(checkpoint: Checkpoint, real: ScanSet, device: str) -> Row:
     rms = (squares / len(real)).sqrt().tolist()
     errors = {f"error of x_1, t = {t}": value for t, value in zip(TIMES, rms, strict=True)}
     noise = Draws(0, range(PATHS)).start(flow.noise_shape).to(device)
-    bend = straightness(flow.velocity, noise, _STEPS).s_normalised.mean().item()
+    bend = straightness(flow.velocity, noise, steps=16).s_normalised.mean().item()
     return {**errors, "bend": bend}
 
 
@@ -215,7 +212,7 @@ def conclusion(groups: Groups, title: str) -> str:
         verdict = f"Best: {level[0]}"
     if len(level) > 1:
         verdict += f"; no difference: {'; '.join(level[1:])}"
-    return f"{title[0].upper()}{title[1:]} evaluations: {listed}. {verdict}."
+    return f"{title.capitalize()} evaluations: {listed}. {verdict}."
 
 
 def print_ablation(groups: Groups, page: Page) -> None:

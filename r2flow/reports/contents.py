@@ -41,11 +41,9 @@ def print_known() -> None:
     """List the models, and the feature networks with their distances and sources."""
     print_table([(name, model.about) for name, model in MODELS.items()], ("model", "samples"))
     print()
-    rows = [
-        (name, FIELD_NAMES[name].upper(), kept(name) or "no", page)
-        for name, page in SOURCES.items()
-    ]
-    print_table(rows, ("network", "distance", "installed", "published file"))
+    rows = [(name, FIELD_NAMES[name].upper(), kept(name) or "no") for name in SOURCES]
+    print_table(rows, ("network", "distance", "installed"))
+    print("", "Published files:", *SOURCES.values(), sep="\n")
     print(
         f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Install one: r2flow info --add NAME "
         "FILE"

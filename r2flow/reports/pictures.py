@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps, rc_context
@@ -21,16 +21,44 @@ from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
 
 _WIDTH = 7.16  # inches: two columns of an IEEE paper
-_VIEW = 50.0  # metres shown to each side in the bird's-eye view
-HEIGHTS = (-2.8, 3.0)  # metres over which height is coloured, sensor frame
-RANGES = (2.0, 80.0)  # metres over which range is coloured, on a logarithmic scale
-_EYE = np.array([-16.0, 0.0, 9.0])  # camera of the perspective, metres
+# Camera of the perspective over a street, in units of the view's reach.
+_EYE = np.array([-0.32, 0.0, 0.18])
+_ROOM = 15.0  # metres of reach up to which the camera stands behind a room, four times as far
 # Its axes as columns: right, up, ahead; pitched down by 18 degrees.
 _AXES = np.array([[0, 0.3090, 0.9511], [-1, 0, 0], [0, 0.9511, -0.3090]])
 
 
-def scan_figure(image: np.ndarray, rays: Tensor, title: str = "") -> Figure:
-    """Draw one scan, (2 or 1, H, W): its images above, bird's-eye view and perspective below."""
+class View(NamedTuple):
+    """Metres that colours and views span."""
+
+    ranges: tuple[float, float]  # coloured on a logarithmic scale
+    heights: tuple[float, float]  # coloured, sensor frame
+    reach: float  # shown to each side of the sensor in the bird's-eye view
+
+
+STREET = View((2.0, 80.0), (-2.8, 3.0), 50.0)
+
+
+def view_of(*scans: tuple[np.ndarray, Tensor]) -> View:
+    """View of nearly all points of scans, pairs of image and rays; `STREET` if there are none."""
+    xyz = np.concatenate([image_to_points(*scan)[0] for scan in scans])
+    if not len(xyz):
+        return STREET
+    near, far = np.percentile(np.linalg.norm(xyz, axis=1), (2, 98)).tolist()
+    low, high = np.percentile(xyz[:, 2], (2, 95)).tolist()
+    reach = float(np.percentile(np.abs(xyz[:, :2]).max(axis=1), 96))
+    # The margins keep colours apart that have hardly different values.
+    return View((0.9 * near, 1.1 * far), (low - 0.5, high + 0.5), max(1.1 * reach, 1.0))
+
+
+def scan_figure(
+    image: np.ndarray, rays: Tensor, title: str = "", view: View | None = None
+) -> Figure:
+    """Draw one scan, (2 or 1, H, W): its images above, bird's-eye view and perspective below.
+
+    `view`: default: that of the scan (`view_of`); `STREET` for all scans makes pictures comparable.
+    """
+    view = view or view_of((image, rays))
     figure = Figure((_WIDTH, 4.6), facecolor="white")
     grid = figure.add_gridspec(
         len(image) + 1,
@@ -44,10 +72,10 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "") -> Figure:
         top=0.89,
         bottom=0.01,
     )
-    _draw_image([figure.add_subplot(grid[row, :]) for row in range(len(image))], image)
+    _draw_image([figure.add_subplot(grid[row, :]) for row in range(len(image))], image, view)
     xyz, _ = image_to_points(image, rays)
-    _draw_birds_eye(figure.add_subplot(grid[-1, 0]), xyz)
-    _draw_perspective(figure.add_subplot(grid[-1, 1]), xyz)
+    _draw_birds_eye(figure.add_subplot(grid[-1, 0]), xyz, view)
+    _draw_perspective(figure.add_subplot(grid[-1, 1]), xyz, view)
     returned = image[0] > 0
     size = " x ".join(map(str, returned.shape))
     about = f"{title}   {size}, {returned.sum():,} returns ({returned.mean():.0%})".strip()
@@ -61,11 +89,12 @@ def contact_sheet(
     titles: Sequence[str] = (),
     unmeasured: np.ndarray | None = None,
 ) -> Figure:
-    """Draw several scans, one per row: images on the left, bird's-eye view and perspective on the
-    right.
+    """Draw several scans in their common view, one per row: images on the left, bird's-eye view and
+    perspective on the right.
 
     Rays of the first scan that were not measured, (H, W) bool, are grey.
     """
+    view = view_of(*((image, rays) for image in images))
     height = 1.2 * len(images) + 0.18
     figure = Figure((_WIDTH, height), facecolor="white")
     grid = figure.add_gridspec(
@@ -83,10 +112,10 @@ def contact_sheet(
         label = row == 0
         cells = grid[row, 0].subgridspec(len(image), 1, hspace=0.25)
         strips = [figure.add_subplot(cells[channel]) for channel in range(len(image))]
-        _draw_image(strips, image, label)
+        _draw_image(strips, image, view, label)
         xyz, _ = image_to_points(image, rays)
-        _draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, label)
-        _draw_perspective(figure.add_subplot(grid[row, 2]), xyz, label)
+        _draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, view, label)
+        _draw_perspective(figure.add_subplot(grid[row, 2]), xyz, view, label)
         if label and unmeasured is not None:
             grey = np.where(unmeasured[..., None], (0.6, 0.6, 0.6, 1), 0)
             for axes in strips:
@@ -104,11 +133,11 @@ def contact_sheet(
     return figure
 
 
-def _draw_image(strips: Sequence[Any], image: np.ndarray, label: bool = True) -> None:
+def _draw_image(strips: Sequence[Any], image: np.ndarray, view: View, label: bool = True) -> None:
     """Draw range on a logarithmic scale and the root of reflectance, dropped rays black."""
     dropped = image[0] <= 0
-    nearest, farthest = np.log(RANGES)
-    ticks: dict[float, float] = {2: nearest, 10: np.log(10), 80: farthest}
+    near, far = view.ranges
+    ticks = {r: float(np.log(r)) for r in (near, np.sqrt(near * far), far)}
     _draw_values(
         strips[0], dropped, np.log(np.maximum(image[0], 1e-3)), "range", ticks, "range, m", label
     )
@@ -155,30 +184,35 @@ def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
     return {label: (f"class {label}", to_hex(hues(label * 0.618034 % 1))) for label in ordered}
 
 
-def _draw_birds_eye(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
+def _draw_birds_eye(axes: Any, xyz: np.ndarray, view: View, label: bool = True) -> None:
     """Draw points from above, driving direction upwards, coloured by height."""
-    x, y, z = xyz[(np.abs(xyz[:, :2]) < _VIEW).all(axis=1)].T
-    _draw_points(axes, -y, x, z, np.clip(6_000 / max(len(x), 1), 0.2, 1.0))
-    axes.set(xlim=(-_VIEW, _VIEW), ylim=(-_VIEW, _VIEW), aspect="equal")
+    reach = view.reach
+    x, y, z = xyz[(np.abs(xyz[:, :2]) < reach).all(axis=1)].T
+    _draw_points(axes, -y, x, z, np.clip(6_000 / max(len(x), 1), 0.2, 1.0), view)
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes.plot(0, 0, marker="^", color="black", ms=3)
-    _frame(axes, f"bird's-eye view, {2 * _VIEW:.0f} m", label)
+    _frame(axes, f"bird's-eye view, {2 * reach:.0f} m", label)
 
 
-def _draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
+def _draw_perspective(axes: Any, xyz: np.ndarray, view: View, label: bool = True) -> None:
     """Draw points by a pinhole camera behind and above the sensor, coloured by height."""
-    seen = np.column_stack([(xyz - _EYE) @ _AXES, xyz[:, 2]])
-    seen = seen[seen[:, 2] > 3]
+    eye = _EYE * (1 if view.reach > _ROOM else 4)
+    seen = np.column_stack([(xyz / view.reach - eye) @ _AXES, xyz[:, 2]])
+    seen = seen[seen[:, 2] > 0.06]
     x, y, depth, z = seen[np.argsort(-seen[:, 2])].T
-    size = np.clip(7 / depth, 0.2, 0.8) * np.sqrt(30_000 / max(len(xyz), 1))
-    dots = _draw_points(axes, x / depth, y / depth, z, size)
+    size = np.clip(0.14 / depth, 0.3, 0.8) * np.sqrt(30_000 / max(len(xyz), 1))
+    dots = _draw_points(axes, x / depth, y / depth, z, size, view)
     axes.set(xlim=(-0.95, 0.95), ylim=(-0.62, 0.48), aspect="equal")
     _frame(axes, "perspective, colour: height, m", label)
     if label:
-        _add_bar(axes, dots, {z: z for z in (-2, 0, 2)})
+        low, high = view.heights
+        _add_bar(axes, dots, {z: z for z in (low, (low + high) / 2, high)})
 
 
-def _draw_points(axes: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, size: Any) -> Any:
-    low, high = HEIGHTS
+def _draw_points(
+    axes: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, size: Any, view: View
+) -> Any:
+    low, high = view.heights
     return axes.scatter(x, y, c=z, s=size, cmap="turbo", vmin=low, vmax=high, lw=0, rasterized=True)
 
 
@@ -239,6 +273,6 @@ def _frame(axes: Any, title: str, label: bool, background: str = "white") -> Non
 
 def _add_bar(axes: Any, drawn: Any, ticks: dict[float, float]) -> None:
     bar = axes.figure.colorbar(drawn, cax=axes.inset_axes((1.012, 0, 0.014, 1)))
-    bar.set_ticks([*ticks.values()], labels=[f"{tick:g}" for tick in ticks])
+    bar.set_ticks([*ticks.values()], labels=[f"{tick:z.{int(abs(tick) < 10)}f}" for tick in ticks])
     bar.outline.set_linewidth(0.5)
     bar.ax.tick_params(labelsize=6, length=2, width=0.5, pad=1)

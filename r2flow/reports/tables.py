@@ -4,8 +4,13 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from r2flow.errors import one_line
 
@@ -25,22 +30,36 @@ def table(rows: Rows, columns: Columns) -> str:
 
 
 def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
-    """Print rows as a table: numbers right-aligned, no heading line if all headings are ""."""
+    """Print rows as a table: numbers right-aligned, no heading line if all headings are "".
+
+    A terminal's table has its width; elsewhere, as in a log, lines are as long as their cells.
+    """
     lines = _as_text(rows, columns)
-    first = 1
-    if not any(lines[0]):
-        lines = lines[1:]
-        first = 0
-    padded = []
-    for column in zip(*lines, strict=True):
-        numeric = all(map(_NUMBER.match, column[first:]))
-        pad = str.rjust if numeric else str.ljust
-        width = max(map(len, column))
-        padded.append([pad(cell, width) for cell in column])
+    grid = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=any(lines[0]))
+    for heading, *cells in zip(*lines, strict=True):
+        numeric = all(map(_NUMBER.match, cells))
+        grid.add_column(Text(heading), justify="right" if numeric else "left", overflow="fold")
+    for line in lines[1:]:
+        grid.add_row(*map(Text, line))
     if title:
         print(title)
-    for line in zip(*padded, strict=True):
-        print("  ".join(line).rstrip())
+    console = Console()
+    if not console.is_terminal:
+        console.width = 10**6
+    with console.capture() as captured:
+        console.print(grid)
+    for printed in captured.get().splitlines():
+        print(printed.rstrip())
+
+
+def print_markdown(text: str) -> None:
+    """Print a text with tables of `table`, which `print_table` prints."""
+    for is_table, lines in groupby(text.splitlines(), lambda line: line.startswith("| ")):
+        if is_table:
+            cells = [[c.replace("\\|", "|") for c in line[2:-2].split(" | ")] for line in lines]
+            print_table(cells[2:], cells[0])
+        else:
+            print(*lines, sep="\n")
 
 
 def shown(value: Any) -> str:

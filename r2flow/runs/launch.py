@@ -228,6 +228,12 @@ def _chain(settings: dict[str, Any], given: Sequence[str], folders: Sequence[str
 
         runs = {link.name: link.run_dir for link in links}
         report_chain(runs, out, _report_device(settings["trainer"]))
+        if settings["preview"]:
+            picture = folder / "preview" / "samples.png"
+            print(
+                f"Flows trained this briefly draw blurred scans; {picture} shows those of "
+                f"{settings['preview']}, after long training."
+            )
     return 0
 
 

@@ -43,6 +43,7 @@ def test_each_part_of_a_mixture_holds_out_a_block_of_its_own(tmp_path: Path):
     data = mixed(tmp_path, validation={"share": 0.25})
     assert numbers(data.training_source) == [0, 1, 2, 3, 4, 5, 20, 21, 22]
     assert numbers(data.validation_source) == [6, 7, 23]
+    assert data.summary() == "6 folder scans and 3 odometry scans, 3 held out"
 
 
 def test_weights_are_shares_and_without_them_every_scan_counts_once(tmp_path: Path):

@@ -1,11 +1,13 @@
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from r2flow import simulator
 from r2flow.data.reading import Reading, read_image
-from r2flow.data.sources import InMemory, ScanFiles, holdout_block
+from r2flow.data.sources import InMemory, ScanFiles, SimulatedScans, holdout_block
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -83,3 +85,23 @@ def test_whole_drives_are_held_out_where_they_come_within_half_of_the_share():
     assert held(0.1, [0, 98]) == 10
     assert held(0.0, [0, 99]) == 0
     assert (held(0.9, [0, 10]), held(0.7, [0])) == (90, 70)  # never all
+
+
+def test_many_simulated_scans_are_kept_on_the_disk(tmp_path, monkeypatch):
+    monkeypatch.setenv("R2FLOW_CACHE", str(tmp_path))
+    monkeypatch.setattr("r2flow.data.sources.WORTH_KEEPING", 3)
+    sensor = SENSORS["hdl64e"].resized(8, 16)
+    scans = SimulatedScans(sensor, 5, range(7, 10), reflectance=True)
+    shape = (2, 8, 16)
+    simulated = scans.read_all("scans", shape)
+    assert np.array_equal(simulated, np.stack([scans[number] for number in range(3)]))
+    monkeypatch.setattr(simulator, "simulate", Mock(side_effect=AssertionError))
+    assert np.array_equal(scans.read_all("scans", shape), simulated)
+    with pytest.raises(AssertionError):
+        SimulatedScans(sensor, 6, range(7, 10), reflectance=True).read_all("scans", shape)
+    (kept,) = tmp_path.iterdir()
+    whole = bytearray(kept.read_bytes())
+    whole[-9] ^= 1
+    kept.write_bytes(whole)
+    with pytest.raises(AssertionError):  # a flipped bit: simulated again
+        scans.read_all("scans", shape)

@@ -79,6 +79,48 @@ def test_a_sensor_is_found_again(name, how):
     assert found.beams.firing == (sensor.firing if how == FIRINGS else None)
 
 
+@pytest.mark.parametrize("start", [-60.0, 133.7])
+@pytest.mark.parametrize("y", [1, -1])  # axes with y to the left, and to the right
+@pytest.mark.parametrize("rows", [4, 32, 128])
+def test_rings_may_begin_at_any_azimuth_and_turn_either_way(start, y, rows):
+    sensor = Sensor("tall", tuple(np.linspace(12, -25, rows).tolist()), columns=360)
+    image = street(sensor, 0)[0]
+    azimuth = np.radians(start + np.arange(360))
+    e = np.radians(sensor.elevations)[:, None]
+    direction = [
+        np.cos(e) * np.cos(azimuth),
+        y * np.cos(e) * np.sin(azimuth),
+        np.sin(e) + 0 * azimuth,
+    ]
+    xyz = (image * np.stack(direction)).transpose(1, 2, 0)[image > 0].astype(np.float32)
+    beams = find_beams(Points(xyz))
+    assert beams.order == RING_AFTER_RING
+    np.testing.assert_allclose(beams.elevations, sensor.elevations, atol=1e-3)
+    np.testing.assert_array_equal(beams.of_point[0], np.nonzero(image)[0])
+
+
+def test_beams_of_one_elevation_are_no_rings():
+    """Each ring is stored as two halves of a turn, apart: 32 rings, but 16 beams."""
+    image = street(SENSORS["vlp16"].resized(columns=192), 0)
+    xyz, _ = image_to_points(image, SENSORS["vlp16"].resized(columns=192).rays())
+    ring = find_beams(Points(xyz)).of_point[0]
+    twice = np.concatenate([xyz[ring == row // 2] for row in range(32)])
+    found = find_beams(Points(twice))
+    np.testing.assert_allclose(found.elevations, SENSORS["vlp16"].elevations, atol=1e-3)
+
+
+def test_the_distance_of_most_points_is_told():
+    """One point in ten a degree off its beam: the median does not tell it."""
+    points = scan(MINE, RINGS)
+    off = np.random.default_rng(0).random(len(points.xyz)) < 0.1
+    distance = np.linalg.norm(points.xyz, axis=1)
+    e = np.arcsin(points.xyz[:, 2] / distance) + np.radians(off)
+    azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+    moved = distance * [np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)]
+    found = estimate_sensor([Points(moved.T.astype(np.float32), None, points.ring)])
+    assert found.off == (pytest.approx(0, abs=1e-3), pytest.approx(1, abs=1e-3))
+
+
 @pytest.mark.parametrize("share", [0.3, 0.0])  # of the rays with two returns
 def test_two_returns_of_each_ray_are_of_one_beam(share):
     points = scan(SENSORS["vlp16"].resized(columns=192), FIRINGS)
@@ -117,8 +159,11 @@ def test_ring_numbers_by_laser_give_the_firing_order(first):
         (np.linspace(0, 3000, 50), 3000),
         (np.linspace(0, 7000, 50), 65535),
         (np.linspace(0, 0.0115, 50), 0.012),
-        (np.append(np.linspace(0, 1, 29997), [1.5] * 3), 1),  # one in 10,000 is an outlier
-        (np.append(np.linspace(0, 1, 29997), [1.5] * 4), 2),
+        (np.append(np.full(960, 0.3), np.linspace(1.5, 4e4, 40)), 1),  # as Waymo's
+        (np.append(np.linspace(0, 1, 960), [2e4] * 100), 65535),  # too many for outliers
+        (np.append(np.tile(np.arange(256), 9), [4e4, 65535]), 255),
+        (np.append(np.tile(np.arange(2001), 9), [65535] * 9), 2000),  # saturated counts
+        (np.append(np.linspace(0, 0.0115, 999), [2e4]), 0.012),
         (np.zeros(5), None),
     ],
 )
@@ -133,6 +178,16 @@ def test_the_scale_of_reflectance_is_estimated(values, scale):
     assert scaled_reflectance(
         "a.bin", Points(np.ones((3, 3)), np.float32([0, 0.5, 1])), 255
     ).tolist() == [0, 0.5, 1]
+
+
+@pytest.mark.parametrize(("scale", "dark"), [(1, False), (65535, True)])
+def test_outliers_of_reflectance_are_clipped_with_a_warning(tmp_path, caplog, scale, dark):
+    values = np.append(np.full(997, 0.3), [2e4] * 3).astype(np.float32)
+    points = Points(np.ones((1000, 3), np.float32), values + (0 if scale == 1 else 1))
+    scaled = scaled_reflectance(tmp_path / "a.bin", points, scale)
+    np.testing.assert_allclose(scaled, (points.reflectance / scale).clip(0, 1), rtol=1e-6)
+    assert ("reflectance beyond 1 is clipped (3 points" in caplog.text) == (scale == 1)
+    assert ("half of it below a hundredth" in caplog.text) == dark
 
 
 def test_range_limits_include_all_but_stray_returns():
@@ -435,6 +490,18 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
         InputError, match="lie on no beams"
     ):  # the number of one of its lasers is no ring
         find_beams(Points(scan.xyz, ring=np.arange(len(scan.xyz)) % 6))
+
+
+def test_weak_beams_between_strong_ones_are_found_by_elevation():
+    """76 beams, the strongest with a hundred times the returns of the weakest."""
+    draw = np.random.default_rng(2)
+    true = 5 - np.cumsum(draw.uniform(0.1, 0.9, 76))
+    count = np.round(600 * np.exp(draw.normal(0, 1, 76))).astype(int)
+    e = np.radians([draw.normal(beam, 0.03) for beam in np.repeat(true, count)])
+    azimuth = draw.uniform(-np.pi, np.pi, len(e))
+    xyz = 10 * np.transpose([np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)])
+    found = find_beams(Points(draw.permutation(xyz).astype(np.float32)))
+    np.testing.assert_allclose(found.elevations, true, atol=0.05)
 
 
 def test_rings_of_one_elevation_have_a_row_each():

@@ -47,6 +47,19 @@ def test_encode_then_decode_is_exact_to_a_millimetre_or_to_float32(sensor, forma
         assert (decoded[1] - image[1]).abs().max() < 1e-6
 
 
+@pytest.mark.parametrize("format", list(FORMATS))
+@pytest.mark.parametrize("limits", ["closed", "open"])
+def test_ranges_beyond_the_sensor_are_no_returns(format, limits):
+    encoding = Encoding(HDL64E, format, limits=limits)
+    beyond = torch.tensor([1e-38, 0.3, 1.4, 81, 160, 1e30, 20])
+    image = torch.stack([beyond, torch.full_like(beyond, 0.5)])[:, None]
+    x = encoding.encode(image)
+    no_return = encoding.encode(torch.zeros(2, 1, 1))
+    torch.testing.assert_close(x[..., :6], no_return.expand(2, 1, 6), rtol=0, atol=0)
+    expected = torch.tensor([[0, 0, 0, 0, 0, 0, 20], [0, 0, 0, 0, 0, 0, 0.5]])[:, None]
+    torch.testing.assert_close(encoding.decode(x), expected, rtol=1e-4, atol=0)
+
+
 def test_logscale_is_the_paper_s():
     encoding = Encoding(HDL64E)
     image = torch.zeros(2, *HDL64E.shape)

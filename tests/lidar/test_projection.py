@@ -1,5 +1,6 @@
 import math
 import re
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +10,7 @@ from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.beams import find_beams
-from r2flow.lidar.estimation import steps_of_a_turn
+from r2flow.lidar.estimation import estimate_sensor, steps_of_a_turn
 from r2flow.lidar.projection import image_to_points, project, project_indices
 from r2flow.lidar.scan_files import Points, read_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -226,13 +227,47 @@ def test_scans_whose_lasers_cannot_be_found_and_unknown_projections_are_refused_
         assert "\n" not in str(error.value)
 
 
-def test_rings_stored_from_behind_on_are_refused():
+def test_two_exchanged_rings_are_refused():
+    sensor = SENSORS["hdl32e"].resized(columns=48)
+    xyz, _ = image_to_points(np.full((1, 32, 48), 9, np.float32), sensor)
+    ring = np.repeat(np.arange(32), 48)
+    assert (project(xyz, None, sensor, "unfolding", ring=ring)[0] > 0).all()
+    for pair in ((0, 1), (17, 18), (3, 20)):
+        exchanged = np.arange(32)
+        exchanged[[*pair]] = pair[::-1]
+        with pytest.raises(InputError, match="follow neither the elevations"):
+            project(xyz, None, sensor, "unfolding", ring=exchanged[ring])
+
+
+@pytest.mark.parametrize(
+    "number", [lambda row: 4 * row, lambda row: 61 - 4 * row, lambda row: row**2]
+)
+def test_ring_numbers_with_gaps_unfold_to_their_own_sensor(number):
     sensor = SENSORS["vlp16"].resized(columns=48)
-    xyz, _ = image_to_points(np.full((1, 16, 48), 9, np.float32), sensor)
-    assert (project(xyz, None, sensor, "unfolding")[0] > 0).all()
-    from_behind = np.roll(xyz.reshape(16, 48, 3), 24, axis=1).reshape(-1, 3)
-    with pytest.raises(InputError, match="from azimuth 0 on"):
-        project(from_behind, None, sensor, "unfolding")
+    image = np.full((1, 16, 48), 9, np.float32)
+    xyz, _ = image_to_points(image, sensor)
+    ring = number(np.repeat(np.arange(16), 48))
+    mine = estimate_sensor([Points(xyz, None, ring.astype(np.uint16))]).sensor
+    seen = ring != number(2)  # a beam without return
+    found = project(xyz[seen], None, replace(mine, columns=48), "unfolding", ring=ring[seen])[0]
+    image[0, 2] = 0
+    np.testing.assert_allclose(found, image[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("start", [0, 24, 31])
+@pytest.mark.parametrize("clockwise", [False, True])
+@pytest.mark.parametrize("upwards", [False, True])
+def test_rings_unfold_from_any_azimuth_in_either_direction(start, clockwise, upwards):
+    sensor = SENSORS["vlp16"].resized(columns=48)
+    image = np.full((1, 16, 48), 9, np.float32)
+    image[0, :3, 10:44] = 0  # the upper rings see sky
+    image[0, 2, 20] = 9
+    order = np.roll(np.arange(48)[:: 1 if clockwise else -1], start)
+    e, a = sensor.rays().double().numpy()[:, :: -1 if upwards else 1, order]
+    xyz = 9 * np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
+    kept = image[0, :: -1 if upwards else 1][:, order] > 0
+    found = project(xyz[kept], None, sensor, "unfolding")[0]
+    np.testing.assert_allclose(found, image[0], rtol=1e-6)
 
 
 def test_lost_rays_of_whole_firings_may_be_nan(tmp_path):

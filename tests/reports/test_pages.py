@@ -1,5 +1,6 @@
 import json
 import math
+import re
 import struct
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 import r2flow
 from r2flow.reports.pages import STYLES, Page, blank_figure, command, write_page
-from r2flow.reports.tables import print_table, shown, table
+from r2flow.reports.tables import print_markdown, print_table, shown, table
 
 ROWS = [
     {"solver": "euler", "evaluations": 4, "error": 0.5},
@@ -114,3 +115,18 @@ def test_a_long_value_cuts_no_key_and_pads_no_line(capsys):
         f"a.key.of.some.length  {'x' * 3000}",
         "another               1",
     ]
+
+
+@pytest.mark.parametrize(
+    "draw", [print_table, lambda rows, columns: print_markdown(table(rows, columns))]
+)
+def test_a_terminal_shows_wide_tables_in_its_width(capsys, monkeypatch, draw):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # counts as a terminal
+    monkeypatch.setenv("COLUMNS", "60")
+    draw([("a long value in words " * 9, 1.5, "b" * 70 + " | c")], ("name", "RMS", "code"))
+    plain = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out)
+    assert max(map(len, plain.splitlines())) <= 60
+    assert plain.count("value") == 9
+    assert plain.count("b") == 70
+    assert " | c" in plain
+    assert "---" not in plain

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure, scan_figure
+from r2flow.reports.pictures import STREET, contact_sheet, figure_pixels, save_figure, scan_figure
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 E, A = SENSOR.rays().numpy()
@@ -47,8 +47,9 @@ def test_a_picture_is_as_wide_as_a_page_and_white(tmp_path, caplog):
     assert b"/Type3" not in pdf
 
 
-def test_near_and_far_look_different_and_dropped_rays_are_black():
-    half = np.where(A > 0, 4.0, 60.0)
+@pytest.mark.parametrize(("near", "far"), [(4.0, 60.0), (1.0, 3.0)])  # of a street, of a room
+def test_near_and_far_look_different_and_dropped_rays_are_black(near, far):
+    half = np.where(A > 0, near, far)
     half[:, 24:40] = 0
     strip = figure_pixels(scan_figure(image(half), SENSOR.rays()))
     row = strip[int(strip.shape[0] * 0.12)].astype(int)  # through the range strip
@@ -58,8 +59,9 @@ def test_near_and_far_look_different_and_dropped_rays_are_black():
     assert right[2] > right[0]  # far is cold
 
 
-def test_a_wall_on_the_left_is_drawn_on_the_left():
-    wall = np.where((A > 1.2) & (A < 1.9), 20.0, 0.0)
+@pytest.mark.parametrize("distance", [20.0, 2.0])
+def test_a_wall_on_the_left_is_drawn_on_the_left(distance):
+    wall = np.where((A > 1.2) & (A < 1.9), distance, 0.0)
     pixels = figure_pixels(figure := scan_figure(image(wall), SENSOR.rays()))
     (axes,) = (axes for axes in figure.axes if axes.get_title("left").startswith("bird's-eye"))
     box, (height, width) = axes.get_position(), pixels.shape[:2]
@@ -73,3 +75,12 @@ def test_a_wall_on_the_left_is_drawn_on_the_left():
     middle = drawn.shape[1] // 2
     assert drawn[:, : middle - 20].sum() > 50
     assert drawn[:, middle + 20 :].sum() == 0
+
+
+def test_the_fixed_view_is_the_same_for_a_room_and_a_street():
+    titles = set()
+    for distance in (2.0, 20.0):
+        scan = image(np.full_like(E, distance))
+        figure = scan_figure(scan, SENSOR.rays(), view=STREET)
+        titles.add(tuple(axes.get_title("left") for axes in figure.axes))
+    assert len(titles) == 1

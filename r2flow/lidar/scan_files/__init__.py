@@ -86,12 +86,13 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
             if path.name.lower().endswith(other):
                 advice = conversion.format(path=path)
         raise InputError(f"{path} {advice}.")
-    if ending == ".pcd.bin" and columns is None:
-        columns = ("x", "y", "z", "intensity", "ring")
     raw = ending in _ROWS
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
         if raw:
-            stored, arrays = None, tables.read_rows(path, columns)
+            stored = None
+            arrays = tables.read_rows(path, columns)
+            if columns is None and ending == ".pcd.bin":
+                columns = ("x", "y", "z", "intensity", "ring")
         else:
             stored, arrays = _READERS[ending](path)
         if stored:

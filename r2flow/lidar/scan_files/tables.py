@@ -11,6 +11,7 @@ from numpy import ndarray
 from r2flow.errors import InputError, require
 from r2flow.lidar.scan_files.clouds import Table
 from r2flow.lidar.scan_files.points import is_renaming, role_of
+from r2flow.lidar.scan_files.widths import fits_width, fitting_widths
 
 _NUMBER = re.compile(r"(^|[;,\s])[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)
 WIDEST = 32  # columns of points; a wider array is an image
@@ -18,17 +19,33 @@ _UNIT = re.compile(r"\s*[\[(](?!([cmk]m|ft)\b).*")  # other units than metres st
 
 
 def read_rows(path: Path, columns: Sequence[str] | None) -> list[ndarray]:
-    """Rows of little-endian float32: as many as `columns`, or 4 of KITTI."""
-    width = len(usual_names(len(columns or "xyzi"), columns))
-    rest = path.stat().st_size % (4 * width)
-    if rest:
-        raise InputError(
-            f"it is not made of rows of {width} float32: {rest} bytes are left. Is it cut short, "
-            "or of other columns (--columns x,y,z,intensity,ring)?"
-        )
+    """Rows of little-endian float32: as many as `columns`, or nuScenes' 5 or KITTI's 4.
+
+    Raises:
+        InputError: The file is not made of such rows, or without `columns` of others.
+    """
+    width = 5 if path.name.lower().endswith(".pcd.bin") else 4
+    if columns is not None:
+        width = len(usual_names(len(columns), columns))
+    size = path.stat().st_size
     values = np.fromfile(path, "<f4")
     if values[:1].tobytes() == np.lib.format.MAGIC_PREFIX[:4]:
         raise InputError("it is a .npy file: rename it.")
+    whole = size % (4 * width) == 0
+    if whole and (columns or fits_width(values, width)):
+        return list(values.reshape(-1, width).T)
+    fitting = fitting_widths(values)
+    if len(fitting) == 1 and fitting != [width]:
+        names = ["x", "y", "z", "intensity", *"_" * WIDEST][: fitting[0]]
+        raise InputError(
+            f"it is made of rows of {fitting[0]} float32, not {width}: name all by --columns "
+            f"{','.join(names)} (_ for what is not used)."
+        )
+    if not whole:
+        raise InputError(
+            f"it is not made of rows of {width} float32: {size % (4 * width)} bytes are left. Is "
+            "it cut short, or of other columns (--columns x,y,z,intensity,ring)?"
+        )
     return list(values.reshape(-1, width).T)
 
 

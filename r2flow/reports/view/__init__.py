@@ -24,7 +24,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError, printable
 from r2flow.files import write_file
-from r2flow.reports.pictures import HEIGHTS, RANGES, class_colours, colours
+from r2flow.reports.pictures import class_colours, colours, view_of
 
 MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB
 _STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at most 2 mm
@@ -102,14 +102,15 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
                 "labels": panel.labels is not None,
             }
         )
+    view = view_of(*((panel.images[0], panel.rays) for panel in panels))
     table = [colours(name)(np.arange(256), bytes=True) for name in _SCALES]
     return {
         "scans": scans,
         "rays": described,
         "frames": [printable(frame) for frame in max((p.frames for p in panels), key=len)],
         "metres": step,
-        "ranges": RANGES,
-        "heights": HEIGHTS,
+        "ranges": view.ranges,
+        "heights": view.heights,
         "colours": _base64(np.stack(table).tobytes()),
         "classes": [("no class", "#808080"), *classes.values()],
         "legend": list(dict(classes.values()).items()),

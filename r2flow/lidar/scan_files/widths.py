@@ -1,0 +1,41 @@
+"""The number of floats in the rows of a file without a header."""
+
+import numpy as np
+from numpy import ndarray
+
+WIDEST = 12
+FEWEST_ROWS = 100  # for a judgement
+PAIRS = 2000  # of neighbouring rows, drawn at random, that are compared
+MOST = 0.7  # share of them within `TURNED`
+TURNED = 15.0  # degrees of azimuth: by that share, real scans of any order have 1 at most
+
+
+def fitting_widths(values: ndarray) -> list[int]:
+    """Widths from 3 to `WIDEST` of which neighbouring rows are neighbouring points, ascending.
+
+    Each is tested by itself: points stored in the order of measurement have nearly the same azimuth
+    as the next. Multiples of a smaller width that fits are left out. Points without order fit none.
+    """
+    fitting: list[int] = []
+    for width in range(3, WIDEST + 1):
+        known = any(width % smaller == 0 for smaller in fitting)
+        if not known and len(values) % width == 0 and fits_width(values, width):
+            fitting.append(width)
+    return fitting
+
+
+def fits_width(values: ndarray, width: int) -> bool:
+    """Whether neighbouring rows of a width begin with neighbouring points."""
+    rows = len(values) // width
+    if rows < FEWEST_ROWS:
+        return False
+    table = values[: rows * width].reshape(rows, width)
+    first = np.random.default_rng(0).integers(rows - 1, size=PAIRS)
+    pairs = table[first[:, None] + (0, 1), :2]
+    with np.errstate(invalid="ignore"):
+        returned = np.isfinite(pairs).all(axis=2) & pairs.any(axis=2)
+    x, y = pairs[returned.all(axis=1)].astype(float).T
+    if not x.size:
+        return False
+    turned = np.diff(np.rad2deg(np.arctan2(y, x)), axis=0)
+    return bool(np.quantile(abs((turned + 180) % 360 - 180), MOST) < TURNED)
