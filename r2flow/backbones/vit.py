@@ -21,8 +21,8 @@ class ViT(Backbone):
     Tokens are patches and `registers`, learned vectors without a place that are dropped at the end
     (Darcet et al. 2024, "Vision transformers need registers"). Queries and keys of patches are
     rotated by the ray angles, periodic in azimuth (`Rotary`), and Fourier features of the ray are
-    added to each patch. Large patches need `prediction="data"`: with noise of more dimensions than
-    a token has channels, the velocity cannot be predicted (Li and He 2025).
+    added to each patch. Patches with more values than `channels` need `prediction="data"`: their
+    noise, and with it the velocity, does not fit into a token (Li and He 2025).
 
     Args:
         channels: Width of the tokens.

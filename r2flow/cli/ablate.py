@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from r2flow.cli.app import app
-from r2flow.cli.options import SETS, DeviceOption, OutOption, parse_counts
+from r2flow.cli.options import SETS, DeviceOption, OutOption, parse_counts, several
 from r2flow.devices import choose_device
 from r2flow.errors import check_folder
 
@@ -78,7 +78,8 @@ def ablate(
     for run in track([run for runs in ablation.runs.values() for run in runs], "measuring", "runs"):
         figures[run] = training_cost(run) | measure_run(run, scans, evaluations, where)
     groups = {name: [figures[run] for run in runs] for name, runs in ablation.runs.items()}
-    about = f"{seeds} seeds; {len(scans)} held-out scans of {scans.label}, as many samples."
+    count = several(seeds, "seed")
+    about = f"{count}; {len(scans)} held-out scans of {scans.label}, as many samples."
     page = ablation_page(groups, ablation.swept, about, seeds, where)
     print_ablation(groups, page)
     print(*write_page(page, out), write_csv(page, out / "ablation.csv"), sep="\n")

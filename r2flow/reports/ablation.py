@@ -212,7 +212,7 @@ def conclusion(groups: Groups, title: str) -> str:
         verdict = f"Best: {level[0]}"
     if len(level) > 1:
         verdict += f"; no difference: {'; '.join(level[1:])}"
-    return f"{title.capitalize()} evaluations: {listed}. {verdict}."
+    return f"{title.capitalize()}: {listed}. {verdict}."
 
 
 def print_ablation(groups: Groups, page: Page) -> None:
