@@ -12,6 +12,7 @@ empty in some places and full in others.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
@@ -34,47 +35,17 @@ class Lasers:
     straight: bool  # whether laser b fires along the bin centres of image row b
 
 
-# Angles below the horizon in degrees of the lasers of an HDL-64E S2, fitted by z = z_i + s tan E_i
-# to the 64 rings of a drive's scans. Residuals: 0.001 degrees for the upper block, 0.005 for the
-# lower.
-_HDL64E_BELOW = (
-    -1.94, -1.57, -1.30, -0.87, -0.58, -0.18, 0.09, 0.45, 0.80, 1.20, 1.49, 1.83, 2.21, 2.55, 2.87,
-    3.24, 3.54, 3.94, 4.22, 4.59, 4.91, 5.25, 5.61, 5.96, 6.33, 6.68, 7.00, 7.29, 7.68, 8.06, 8.31,
-    8.71, 9.03, 9.57, 10.06, 10.47, 10.96, 11.60, 12.12, 12.56, 13.04, 13.48, 14.05, 14.60, 15.19,
-    15.66, 16.18, 16.55, 17.19, 17.73, 18.32, 18.80, 19.32, 19.74, 20.22, 20.79, 21.32, 21.94,
-    22.44, 22.86, 23.32, 23.97, 24.51, 25.00,
-)  # fmt: skip
-# Difference of each laser's reflectance from its neighbours', on the same road and walls.
-_HDL64E_GAIN = (
-    0.00, -0.04, -0.06, -0.10, -0.01, -0.04, 0.04, -0.02, 0.05, -0.04, 0.02, 0.04, 0.08, 0.03,
-    -0.01, 0.00, 0.01, 0.00, 0.04, -0.05, 0.00, -0.13, 0.00, 0.01, -0.05, -0.02, 0.00, 0.02, 0.02,
-    -0.06, 0.02, 0.03, -0.01, -0.02, 0.00, -0.11, -0.18, 0.00, 0.05, 0.04, -0.03, 0.00, -0.15, 0.00,
-    0.00, 0.00, 0.01, -0.02, -0.06, 0.03, 0.06, -0.21, 0.00, -0.06, -0.07, 0.00, 0.02, 0.04, -0.11,
-    -0.10, -0.11, -0.02, 0.02, 0.00,
-)  # fmt: skip
-
-# Error of each laser's range in metres. Upper block: summed steps between neighbouring rings on
-# upright walls; drives agree (correlation 0.96). Lower block, which rarely sees walls: distances of
-# the rings from a smooth surface through the road 4 to 11 metres away, medians over three drives,
-# which agree within a centimetre.
-_HDL64E_BIAS = (
-    0.006, -0.025, 0.024, -0.031, 0.007, -0.085, 0.051, -0.015, -0.022, 0.012, 0.046, 0.006, 0.042,
-    0.015, -0.012, -0.021, 0.036, -0.005, 0.064, -0.005, 0.003, -0.033, -0.023, -0.027, 0.022,
-    -0.022, 0.009, -0.050, 0.035, -0.006, 0.003, 0.000, 0.015, -0.004, 0.005, -0.012, 0.002, -0.025,
-    0.054, 0.027, -0.007, 0.022, -0.059, -0.059, 0.005, -0.062, -0.050, -0.060, -0.012, 0.018,
-    -0.023, -0.036, -0.002, 0.040, -0.015, 0.004, 0.004, 0.010, 0.023, 0.006, 0.003, 0.049, 0.090,
-    0.098,
-)  # fmt: skip
-
-
+_BELOW, _BIAS, _GAIN = np.loadtxt(
+    Path(__file__).with_name("hdl64e.csv"), delimiter=",", unpack=True
+)
 HDL64E = Lasers(
-    elevation=-np.deg2rad(_HDL64E_BELOW),
+    elevation=-np.deg2rad(_BELOW),
     height=np.concatenate([np.linspace(0.209, 0.198, 32), np.linspace(0.126, 0.116, 32)]),
     side=np.tile([0.026, -0.026], 32),  # neighbours are left and right of the axis
     block=np.repeat([0, 1], 32),
     phase=np.modf(0.618 * np.arange(64))[0],  # unknown; neighbours differ
-    bias=np.array(_HDL64E_BIAS, np.float32)[:, None],
-    gain=np.array(_HDL64E_GAIN, np.float32)[:, None],
+    bias=_BIAS.astype(np.float32)[:, None],
+    gain=_GAIN.astype(np.float32)[:, None],
     straight=False,
 )
 
@@ -96,11 +67,9 @@ def along_rows(sensor: Sensor) -> Lasers:
 
 def rows_of(sensor: Sensor, slope: ndarray) -> ndarray:
     """Row of each return by its apparent slope tan e; -1 outside the field of view."""
-    edges = np.tan(np.deg2rad(sensor.row_edges))[::-1].astype(
-        np.float32
-    )  # ascending, for searchsorted
+    falling = np.tan(np.deg2rad(sensor.row_edges)).astype(np.float32)
     h = len(sensor.elevations)
-    row = h - np.searchsorted(edges, slope, side="right")
+    row = h - np.searchsorted(falling[::-1], slope, side="right")
     return np.where(row < h, row, -1)
 
 
