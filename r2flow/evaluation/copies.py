@@ -51,13 +51,7 @@ def _described(
 
 
 class Nearest:
-    """Nearest scan of a training set for each scan of a set, among those compared so far.
-
-    Attributes:
-        numbers: Indices of scans with returns, (N,).
-        squared: d^2 to the nearest training scan, (N,).
-        neighbours: Index of this training scan.
-        turns: Its shift u in cells, or -1 - u if mirrored first.
+    """Distances of the scans of a set, those with returns, to the training scans compared so far.
 
     Raises:
         InputError: No scan has a return.
@@ -70,57 +64,35 @@ class Nearest:
             raise InputError(
                 f"none of the {len(scans)} scans of {scans.label} has a return to compare."
             )
-        self.scans = scans
         self.training = training
-        self.numbers = np.flatnonzero(usable.cpu().numpy())
-        self.squared = x.new_full((len(self.numbers),), torch.inf)
-        self.neighbours = torch.zeros_like(self.squared, dtype=torch.long)
-        self.turns = torch.zeros_like(self.neighbours)
         self._x = x[usable]
-        self._width = x.shape[2]
+        self._squared = self._x.new_full((len(self._x),), torch.inf)  # d^2 to the nearest, (N,)
         self._spectra = -2 * torch.fft.rfft(self._x).conj().permute(2, 0, 1).contiguous()
 
-    def approach(self, y: Tensor, first: int) -> None:
-        """Update with training scans `first`, `first + 1`, ..., (M, h, w).
-
-        A scan of NaN is never nearest.
-        """
-        m = len(y)
+    def approach(self, y: Tensor) -> None:
+        """Update with more training scans, (M, h, w); a scan of NaN is never nearest."""
+        width = y.shape[2]
         both = torch.cat([y, y.flip(-1)])
         energy = both.square().sum((1, 2)).nan_to_num(torch.inf)
         spectra = torch.fft.rfft(both.nan_to_num(0.0)).permute(2, 1, 0).contiguous()  # (K, h, 2 M)
-        columns = torch.arange(self._width, device=y.device)
-        block = max(PAIRS.get(y.device.type, 1024) // m, 1)
-        for start in range(0, len(self.numbers), block):
+        columns = torch.arange(width, device=y.device)
+        block = max(PAIRS.get(y.device.type, 1024) // len(y), 1)
+        for start in range(0, len(self._x), block):
             at = slice(start, start + block)
             # -2 c(u), (w, n, 2 M)
-            d = torch.fft.irfft(self._spectra[:, at] @ spectra, n=self._width, dim=0)
+            d = torch.fft.irfft(self._spectra[:, at] @ spectra, n=width, dim=0)
             curve, turns = d.min(0)
             place = (curve + energy).argmin(1)
-            turn = turns.gather(1, place[:, None])
-            shifted = ((turn + columns) % self._width)[:, None]
+            shifted = ((turns.gather(1, place[:, None]) + columns) % width)[:, None]
             turned = both[place].gather(2, shifted.expand(-1, y.shape[1], -1))
             # The curve of a copy has 1e-8, by rounding.
             squared = (self._x[at] - turned).square().mean((1, 2))
-            closer = squared < self.squared[at]
-            turn = torch.where(place < m, turn[:, 0], -1 - turn[:, 0])
-            self.squared[at][closer] = squared[closer]
-            self.neighbours[at][closer] = first + place[closer] % m
-            self.turns[at][closer] = turn[closer]
+            self._squared[at] = self._squared[at].fmin(squared)
 
     @property
     def distances(self) -> ndarray:
         """Distance of each scan to its nearest training scan, (N,)."""
-        return self.squared.double().sqrt().cpu().numpy()
-
-    def match(self, place: int) -> ndarray:
-        """Image of the nearest training scan of the scan at `place`, aligned with that scan."""
-        image = self.training.source[int(self.neighbours[place])]
-        turn = int(self.turns[place])
-        if turn < 0:
-            image = image[..., ::-1]
-            turn = -1 - turn
-        return np.roll(image, -round(turn * image.shape[-1] / self._width), axis=-1)
+        return self._squared.double().sqrt().cpu().numpy()
 
 
 def find_nearest(
@@ -131,11 +103,9 @@ def find_nearest(
     Reads training scans once, without storing them.
     """
     nearest = {name: Nearest(scans, training, work, device) for name, scans in sets.items()}
-    first = 0
     for y in _described(training, training, work, device, "reading training scans"):
-        for neighbours in nearest.values():
-            neighbours.approach(y, first)
-        first += len(y)
+        for one in nearest.values():
+            one.approach(y)
     return nearest
 
 
@@ -169,7 +139,7 @@ def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
         "mirrored": True,
         "training scans": len(real.training),
     }
-    sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(d)}
+    sizes = {"real": len(real.distances), "real_chosen": "all", "generated": len(d)}
     protocol = asdict(Protocol("copies", "log-range of cells", settings=settings))
     return MetricResult("copies", figures, {**protocol, "sizes": sizes}, None, remarks)
 
