@@ -157,14 +157,12 @@ class ScanMetric(Metric):
     def real_state(self) -> dict[str, Tensor]:
         """States of the real set, on the CPU and gathered from all processes, for a disk cache."""
         with self.sync_context():
-            states = self.metric_state
-            real: dict[str, Tensor] = {}
-            for name, value in states.items():
-                if name in ("counts", "sums"):
-                    real[name] = value[0].clone()
-                elif name == "real_rows":
-                    real[name] = _joined(value)
-            return {name: value.cpu() for name, value in real.items()}
+            states = {
+                name: _joined(value) if name == "real_rows" else value[0].clone()
+                for name, value in self.metric_state.items()
+                if name in ("counts", "sums", "real_rows")
+            }
+        return {name: value.cpu() for name, value in states.items()}
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
         """Load the states from `real_state`, after `reset`; only on the first process."""

@@ -135,14 +135,14 @@ def _check_inputs(
 
 def _count(scan: PartialScan, given: Partial) -> Counter[str]:
     """Rays of points with and without a return, and points that are written and left out."""
-    if scan.image:
-        return Counter()
-    used = (given.state == Ray.RETURN).sum()
-    empty = (given.state == Ray.EMPTY).sum()
-    if given.points is None:
-        return Counter(used=int(used), empty=int(empty))
-    kept = len(given.points.xyz)
-    return Counter(used=int(used), empty=int(empty), kept=kept, outside=given.points.dropped)
+    counts = Counter[str]()
+    if not scan.image:
+        counts["used"] = int((given.state == Ray.RETURN).sum())
+        counts["empty"] = int((given.state == Ray.EMPTY).sum())
+        if given.points is not None:
+            counts["kept"] = len(given.points.xyz)
+            counts["outside"] = given.points.dropped
+    return counts
 
 
 def _print_counts(checkpoint: Checkpoint, counts: Counter[str]) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from r2flow import noise
 from r2flow.errors import InputError
@@ -41,7 +42,7 @@ INTERPOLATIONS: dict[str, Rule] = {
 }
 
 
-def kept_rays(task: str, sensor: Sensor, number: int) -> np.ndarray:
+def kept_rays(task: str, sensor: Sensor, number: int) -> ndarray:
     """Rays of scan `number` that a mask keeps, (H, W) bool; depends only on both."""
     draws = noise.generator(0, "condition", number)
     kept = parse_mask(task)(np.ones(sensor.shape, dtype=bool), draws)
@@ -51,7 +52,7 @@ def kept_rays(task: str, sensor: Sensor, number: int) -> np.ndarray:
 
 
 def completion_rows(
-    truths: Sequence[np.ndarray],
+    truths: Sequence[ndarray],
     sensor: Sensor,
     ways: Mapping[str, tuple[Checkpoint, Sampler]],
     tasks: Sequence[str] = TASKS,
@@ -70,7 +71,7 @@ def completion_rows(
         masks = np.stack([kept_rays(task, sensor, number) for number in range(len(real))])
         given = real * masks[:, None]
         state = ray_states(torch.from_numpy(real), torch.from_numpy(masks))
-        answers: dict[str, np.ndarray] = {}  # (scans, answers, channels, H, W) by method
+        answers: dict[str, ndarray] = {}  # (scans, answers, channels, H, W) by method
         for name, rule in INTERPOLATIONS.items():
             filled = [interpolated(*pair, rule)[None] for pair in zip(given, masks, strict=True)]
             answers[name] = np.stack(filled)

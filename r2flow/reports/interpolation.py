@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
+from numpy import ndarray
 from torch import Tensor
 
 from r2flow.data.sources import spread
@@ -83,8 +83,8 @@ def interpolation(
 
 
 def interpolation_figure(
-    real: np.ndarray,
-    frames: np.ndarray,
+    real: ndarray,
+    frames: ndarray,
     weights: Sequence[float],
     rays: Tensor,
     names: Sequence[str],

@@ -162,23 +162,22 @@ class Handcrafted(Extractor):
 
     def _features(self, images: Tensor) -> Tensor:
         h, w = images.shape[2:]
-        found: dict[str, tuple[Tensor, Tensor]] = {}
+        found: dict[str, Tensor] = {}
         q = images[:, 1] if self.needs_reflectance else None
         for name, x, where in _statistics(images[:, 0], q):
             masked = x * where
             sums = masked.sum(-1)
             counts = where.sum(-1)
-            mean, share = _cells(sums, counts, BANDS, w)
-            found[name] = mean, share
+            mean, share = found[name] = _cells(sums, counts, BANDS, w)
             if name + SPREAD in self.scales:
                 square, _ = _cells(torch.linalg.vecdot(masked, x), counts, BANDS, w)
-                found[name + SPREAD] = (square - mean**2).clamp(min=0).sqrt(), share
+                spread = (square - mean**2).clamp(min=0).sqrt()
+                found[name + SPREAD] = torch.stack([spread, share])
             if name + BEAMS in self.scales:
                 found[name + BEAMS] = _unevenness(sums, counts)
             if name + SECTORED in self.scales:
                 found[name + SECTORED] = _cells(masked.sum(-2), where.sum(-2), SECTORS, h)
-        values = torch.cat([found[name][0] for name in self.scales], 1)
-        shares = torch.cat([found[name][1] for name in self.scales], 1)
+        values, shares = torch.cat([found[name] for name in self.scales], 2)
         centre, spread = self.table.T
         x = (values - centre) / spread * (shares / (shares + FEW))
         return FAR_OUT * torch.asinh(x / FAR_OUT)
@@ -191,16 +190,16 @@ class HandcraftedRange(Handcrafted):
     needs_reflectance = False
 
 
-def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> tuple[Tensor, Tensor]:
-    """Means over equal parts of rows or columns, (B, cells), and the shares counted.
+def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> Tensor:
+    """Means over equal parts of rows or columns, and the shares counted, (2, B, cells).
 
     From sums and counts, (B, n).
     """
     n = F.adaptive_avg_pool1d(count, cells)
-    return F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays
+    return torch.stack([F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays])
 
 
-def _unevenness(total: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+def _unevenness(total: Tensor, count: Tensor) -> Tensor:
     """|x(h - 1) - 2 x(h) + x(h + 1)| of row means x, as in `_cells`, where all three exist."""
     mean = total / count.clamp(min=1)
     valid = (count > 0).to(total)

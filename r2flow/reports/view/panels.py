@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from r2flow.data.opening import describe, find_drives, open_scans
 from r2flow.data.options import FOLDER, SIMULATED
@@ -84,7 +85,7 @@ def scan_panels(
         yield spec, Panel(caption, image[None], scans.sensor.rays(), classes)
 
 
-def _read_labels(source: ScanSource, number: int) -> np.ndarray | None:
+def _read_labels(source: ScanSource, number: int) -> ndarray | None:
     """Semantic ids of a scan, (1, H, W), if it has any."""
     if isinstance(source, SimulatedScans):
         return simulate(source.sensor, source.seed, source.numbers[number]).labels[None]

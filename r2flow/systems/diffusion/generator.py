@@ -10,7 +10,7 @@ from torch import Tensor
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Positive, Share
+from r2flow.registry import Options, Positive, Share
 from r2flow.samplers import MMPS, Repaint
 from r2flow.samplers.base import (
     Call,
@@ -63,7 +63,7 @@ class Diffusion(NetworkFlow):
         space: ModelSpace,
         backbone: Mapping[str, Any],
         prediction: str = "eps",
-        schedule: Mapping[str, Any] | None = None,
+        schedule: Options = None,
         clip: Positive | None = 1.0,
     ) -> None:
         super().__init__(space, backbone)

@@ -1,7 +1,6 @@
 """Training of GANs: losses, R1, learning rates, warm-up, and the stage."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from r2flow.registry import Count, Natural, NonNegative, Portion, Registry, construct
+from r2flow.registry import Count, Natural, NonNegative, Options, Portion, Registry, construct
 from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_discriminator
 from r2flow.systems.gan.augment import AdaptiveAugment, BatchDraws
@@ -123,12 +122,12 @@ class LearnGan(Stage):
     def __init__(
         self,
         *model: Any,
-        discriminator: Mapping[str, Any] | None = None,
+        discriminator: Options = None,
         betas: tuple[Portion, Portion] = (0.0, 0.99),
         r1: NonNegative = 1.0,
         r1_every: Count = 16,
-        warmup: Mapping[str, Any] | None = None,
-        augment: Mapping[str, Any] | None = None,
+        warmup: Options = None,
+        augment: Options = None,
         **options: Any,
     ) -> None:
         super().__init__(*model, betas=betas, **{"warmup_images": 0, **options})

@@ -1,6 +1,5 @@
 """Training of LiDM: an adversarial autoencoder, and the diffusion of its latents."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor, nn
 
 from r2flow.lidar.encoding import Encoding
 from r2flow.processes import mean_over_processes
-from r2flow.registry import Count, Natural, NonNegative, construct
+from r2flow.registry import Count, Natural, NonNegative, Options, construct
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.diffusion.process import noised
 from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
@@ -119,7 +118,7 @@ class LearnAutoencoder(Stage):
     def __init__(
         self,
         *model: Any,
-        discriminator: Mapping[str, Any] | None = None,
+        discriminator: Options = None,
         adversarial_weight: NonNegative = 0.6,
         adversarial_start: Natural = 1,
         inverted: bool = False,
