@@ -16,7 +16,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.labels import read_labels
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, read_sensor
-from r2flow.metrics.extractors.base import read_published
+from r2flow.metrics.extractors.base import _read_published
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.runs.folder import read_config
 from r2flow.store import Damaged
@@ -93,7 +93,7 @@ def config(path: Path) -> None:
 
 
 def weights(path: Path) -> None:
-    read_published(path)
+    _read_published(path)
 
 
 READERS: dict[str, Callable[[Path], object]] = {

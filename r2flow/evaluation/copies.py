@@ -50,7 +50,7 @@ def _described(
             advance(len(images))
 
 
-class Nearest:
+class _Nearest:
     """Distances of the scans of a set, those with returns, to the training scans compared so far.
 
     Raises:
@@ -97,19 +97,19 @@ class Nearest:
 
 def find_nearest(
     sets: Mapping[str, ScanSet], training: ScanSet, work: Work, device: str = "cpu"
-) -> dict[str, Nearest]:
+) -> dict[str, _Nearest]:
     """Find the nearest training scan of each scan of several sets.
 
     Reads training scans once, without storing them.
     """
-    nearest = {name: Nearest(scans, training, work, device) for name, scans in sets.items()}
+    nearest = {name: _Nearest(scans, training, work, device) for name, scans in sets.items()}
     for y in _described(training, training, work, device, "reading training scans"):
         for one in nearest.values():
             one.approach(y)
     return nearest
 
 
-def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
+def _copies_result(judged: _Nearest, real: _Nearest) -> MetricResult:
     """Median distance to the nearest training scan, and P(a scan's distance < a real scan's).
 
     The latter is 0.5 by chance. Real scans that are training scans are left out. A small p of the
@@ -145,14 +145,14 @@ def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
 
 
 def with_copies(
-    comparisons: Sequence[Comparison], nearest: Mapping[str, Nearest], real: Nearest
+    comparisons: Sequence[Comparison], nearest: Mapping[str, _Nearest], real: _Nearest
 ) -> list[Comparison]:
-    """Add `copies_result` to each judged set in `nearest`, and that of the real scans to halves."""
+    """Add a result to each judged set in `nearest`, and that of the real scans to halves."""
     of = {("judged", name): neighbours for name, neighbours in nearest.items()}
     of["reference", HALVES] = real
     extended = []
     for row in comparisons:
         judged = of.get((row.kind, row.name))
-        more = [] if judged is None else [copies_result(judged, real)]
+        more = [] if judged is None else [_copies_result(judged, real)]
         extended.append(replace(row, measured=[*row.measured, *more]))
     return extended

@@ -113,7 +113,7 @@ class MetricResult:
     remarks: Sequence[str] = ()
 
 
-def real_rule(
+def _real_rule(
     metric: ScanMetric, real: ScanSet, protocol: Rules = R2FLOW
 ) -> tuple[Sequence[int], str]:
     """Indices of the real scans for a metric and a description of the choice."""
@@ -146,7 +146,7 @@ def gather_real(
     keys: dict[str, str] = {}
     groups: dict[str, tuple[Sequence[int], dict[str, ScanMetric]]] = {}  # by choice of scans
     for name, metric in metrics.items():
-        numbers, chosen = real_rule(metric, real, protocol)
+        numbers, chosen = _real_rule(metric, real, protocol)
         if cache is not None and real.identity is not None:
             keys[name] = key_of(metric, real, chosen + points)
             cached = cache.read(keys[name])

@@ -126,9 +126,9 @@ class ScanMetric(Metric):
                 f"'{self.name}' needs reflectance, which these scans do not have; leave it out."
             )
         if len(scans):
-            self.add_rows(self.rows(scans), real, numbers)
+            self._add_rows(self.rows(scans), real, numbers)
 
-    def add_rows(self, rows: Tensor, real: bool, numbers: Sequence[int]) -> None:
+    def _add_rows(self, rows: Tensor, real: bool, numbers: Sequence[int]) -> None:
         """Add the rows of scans of these numbers to the states."""
         side = 0 if real else 1
         whole = rows.isfinite().all(1)

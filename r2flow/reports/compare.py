@@ -88,7 +88,7 @@ def configuration(config: Row) -> str:
     return json.dumps(kept, sort_keys=True, default=str)
 
 
-def group_rows(groups: Groups) -> list[Row]:
+def _group_rows(groups: Groups) -> list[Row]:
     """One row per group: means of the runs with a value, and the deviation of several."""
     rows = []
     for label, runs in groups.items():
@@ -121,7 +121,7 @@ def cell(row: Row, column: str) -> str:
 
 def tables(groups: Groups) -> dict[str, tuple[list[list[str]], list[str]]]:
     """(cells, headings) by title: settings of the runs, and results."""
-    rows = group_rows(groups)
+    rows = _group_rows(groups)
     measured = {
         key: heading
         for key, heading in _RESULTS.items()
@@ -168,7 +168,7 @@ def compare_page(groups: Groups) -> Page:
         "compare",
         "Runs compared",
         [*text, _NOTES],
-        group_rows(groups),
+        _group_rows(groups),
         figures,
         seeds,
         more={"runs": rows},

@@ -73,7 +73,7 @@ def write_completed(
     with Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches) as bar:
         for done, number in enumerate(left):
             scan = scans[number]
-            given = known_rays(scan, job, number)
+            given = _known_rays(scan, job, number)
             (completed,) = complete(
                 checkpoint,
                 torch.from_numpy(given.image)[None],
@@ -170,7 +170,7 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
     """
     kinds: dict[bool, str] = {}
     for number, scan in enumerate(track(scans, "looking at", "scans")):
-        state = known_rays(scan, job, number).state
+        state = _known_rays(scan, job, number).state
         if (state == Ray.UNKNOWN).any():
             kinds.setdefault(share_in_sectors(state) >= 0.5, scan.name)
     if len(kinds) > 1:
@@ -183,7 +183,7 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
 
 
 @lru_cache(maxsize=16)  # read the scans of a small folder once
-def known_rays(scan: PartialScan, job: Job, number: int) -> Partial:
+def _known_rays(scan: PartialScan, job: Job, number: int) -> Partial:
     """Known rays of scan `number` that the job's mask keeps; the mask depends only on (seed,
     number).
     """

@@ -57,7 +57,7 @@ def measure_paths(
     return Straightness(parts[0].t, s, squared_length, bends[order], trajectories[order])
 
 
-def curvature_rows(flows: Mapping[str, Straightness]) -> list[Row]:
+def _curvature_rows(flows: Mapping[str, Straightness]) -> list[Row]:
     """s(t) per checkpoint and time, mean over scans, unnormalised and over |d|^2."""
     rows = []
     for label, flow in flows.items():
@@ -128,7 +128,7 @@ def curvature_page(flows: Mapping[str, Straightness], seed: int, device: str = "
         "curvature",
         "Straightness of flows",
         curvature_text(flows),
-        curvature_rows(flows),
+        _curvature_rows(flows),
         {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)},
         {"scans": seed},
         device,

@@ -15,7 +15,7 @@ from r2flow.reports.verdict import heading, remarks_of, verdict
 _SPEED = {"evaluations": "network evaluations a scan", "seconds": "seconds a scan"}
 
 
-def value_rows(comparisons: Sequence[Comparison]) -> list[Row]:
+def _value_rows(comparisons: Sequence[Comparison]) -> list[Row]:
     """One row per value."""
     rows = []
     for comparison in comparisons:
@@ -78,7 +78,7 @@ def evaluation_page(
         names = [name for name in sampled[0] if "/" in name]
         figures["evaluation_speed"] = speed_figure(sampled, names)
     title = "Generated scans against real ones"
-    rows = value_rows(comparisons)
+    rows = _value_rows(comparisons)
     return Page("evaluation", title, text, rows, figures, seeds, device, {"comparisons": results})
 
 
@@ -101,7 +101,7 @@ def _table(comparisons: Sequence[Comparison]) -> list[list[str]]:
             "set": comparison.title,
             "its scans : real": f"({len(comparison.generated)} : {len(comparison.real)})",
         }
-        for row in value_rows([comparison]):
+        for row in _value_rows([comparison]):
             missing = math.isnan(row["value"])
             line[row["printed_as"]] = "none" if missing else f"{row['printed']:#.4g}"
         lines.append(line)

@@ -71,7 +71,7 @@ def interpolation(
     captions = [f"w = {weights[number]:.2f}" for number in chosen]
     panels = [first, Panel("between", images[chosen], rays, None, captions), last]
     write_viewer(out / "interpolation.html", panels, "Interpolation")
-    figures = {"interpolation": interpolation_figure(real, images, weights, rays, names)}
+    figures = {"interpolation": _interpolation_figure(real, images, weights, rays, names)}
     return Page(
         "interpolation",
         "Interpolation",
@@ -82,7 +82,7 @@ def interpolation(
     )
 
 
-def interpolation_figure(
+def _interpolation_figure(
     real: ndarray,
     frames: ndarray,
     weights: Sequence[float],

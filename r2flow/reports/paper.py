@@ -110,19 +110,19 @@ def paper_page(
         raise InputError(
             f"the results are of other models or checkpoints than {names}: evaluate these."
         )
-    architectures = architecture_rows(runs, evaluated, device)
+    architectures = _architecture_rows(runs, evaluated, device)
     protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
     text = [
         f"Generators: {names}.",
         "## Table I: methods and metrics",
-        table_i(evaluated),
+        _table_i(evaluated),
         f"Evaluated rows: {protocols or 'none'}. Printed rows: {_PROTOCOL} kitti_360. Figures with "
         "* are of another "
         "protocol than printed ones, and not comparable.",
         "## Table II: velocity estimators",
         table(architectures, _ARCHITECTURES),
     ]
-    figures = {"figure_7": scans_figure(runs, real)}
+    figures = {"figure_7": _scans_figure(runs, real)}
     metrics = [f"{name}/{name}" for name in COLUMNS]
     metrics = [name for name in metrics if any(name in row for row in evaluated)]
     if metrics:
@@ -145,7 +145,7 @@ def paper_page(
     return Page("paper", title, text, evaluated, figures, {"sampled scans": 0}, device, more)
 
 
-def scans_figure(runs: Sequence[PaperRun], real: ScanSet | None) -> Figure:
+def _scans_figure(runs: Sequence[PaperRun], real: ScanSet | None) -> Figure:
     """Figure 7: a real scan, and the first sample of each generator."""
     images = {}
     if real is not None:
@@ -171,7 +171,7 @@ def read_results(files: Sequence[Path]) -> list[Row]:
     return rows
 
 
-def table_i(rows: Sequence[Row]) -> str:
+def _table_i(rows: Sequence[Row]) -> str:
     """Table I as printed, with evaluated rows below: those of equal evaluations, or the most if
     both are many.
 
@@ -205,7 +205,7 @@ def _evaluated_line(row: Row) -> Row:
     return line
 
 
-def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str) -> list[Row]:
+def _architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str) -> list[Row]:
     """Table II: one row per 1-RF, with the printed row of equal parameters, and FRD of the most
     evaluations.
     """
@@ -215,7 +215,7 @@ def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str
             continue
         config = run.checkpoint.config
         measured = cost(config, 3, device)
-        printed = same_architecture(measured["parameters"])
+        printed = _same_architecture(measured["parameters"])
         line = {**printed, **measured, "backbone": (config["backbone"] or {}).get("name")}
         weights = weights_hash(run.checkpoint)
         evaluated = [row for row in rows if row["weights"] == weights and "frd/frd" in row]
@@ -226,7 +226,7 @@ def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str
     return lines
 
 
-def same_architecture(parameters: int) -> Row:
+def _same_architecture(parameters: int) -> Row:
     """The printed row of table II with this number of parameters; empty without one.
 
     Within 0.4 %: the printed 125.5 M are 125.2 M.

@@ -21,7 +21,7 @@ from r2flow.lidar.sensors import Sensor
 
 
 @dataclass(frozen=True, eq=False)  # compared and hashed by identity
-class Lasers:
+class _Lasers:
     """B lasers on a spinning head."""
 
     elevation: ndarray  # inclination E in radians, decreasing, (B,)
@@ -38,7 +38,7 @@ class Lasers:
 _BELOW, _BIAS, _GAIN = np.loadtxt(
     Path(__file__).with_name("hdl64e.csv"), delimiter=",", unpack=True
 )
-HDL64E = Lasers(
+HDL64E = _Lasers(
     elevation=-np.deg2rad(_BELOW),
     height=np.concatenate([np.linspace(0.209, 0.198, 32), np.linspace(0.126, 0.116, 32)]),
     side=np.tile([0.026, -0.026], 32),  # neighbours are left and right of the axis
@@ -51,18 +51,18 @@ HDL64E = Lasers(
 
 
 @lru_cache(maxsize=16)
-def lasers_of(sensor: Sensor) -> Lasers:
+def lasers_of(sensor: Sensor) -> _Lasers:
     """The lasers of a sensor: the calibrated lasers of an HDL-64E for any image size, else a laser
     along each row.
     """
-    return HDL64E if sensor.name == "hdl64e" else along_rows(sensor)
+    return HDL64E if sensor.name == "hdl64e" else _along_rows(sensor)
 
 
-def along_rows(sensor: Sensor) -> Lasers:
+def _along_rows(sensor: Sensor) -> _Lasers:
     """Lasers along `sensor.rays("centre")`, all at the origin."""
     elevation = np.deg2rad(np.asarray(sensor.elevations, dtype=np.float64))
     zero = np.zeros_like(elevation)
-    return Lasers(elevation, zero, zero, zero.astype(int), zero, bias=0.0, gain=0.0, straight=True)
+    return _Lasers(elevation, zero, zero, zero.astype(int), zero, bias=0.0, gain=0.0, straight=True)
 
 
 def rows_of(sensor: Sensor, slope: ndarray) -> ndarray:
@@ -82,7 +82,7 @@ class Rays:
     surface depends on the column only.
     """
 
-    def __init__(self, lasers: Lasers, columns: int, ground: float) -> None:
+    def __init__(self, lasers: _Lasers, columns: int, ground: float) -> None:
         self.lasers = lasers
         self.columns = columns
         self.ground = ground
@@ -154,7 +154,7 @@ RIGS = ((*_ROOF, _INSTRUMENT), _ROOF)  # with an instrument next to the sensor, 
 
 
 @lru_cache(maxsize=16)
-def hidden(lasers: Lasers, columns: int, rig: int) -> ndarray:
+def hidden(lasers: _Lasers, columns: int, rig: int) -> ndarray:
     """Rays that the ego vehicle occludes, (B, W), bool, for one of `RIGS`."""
     azimuth = 180 - 360 * (np.arange(columns) + 0.5) / columns
     elevation = np.rad2deg(lasers.elevation)[:, None]

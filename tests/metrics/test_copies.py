@@ -11,7 +11,7 @@ import pytest
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
-from r2flow.evaluation.copies import copies_result, find_nearest
+from r2flow.evaluation.copies import _copies_result, find_nearest
 from r2flow.evaluation.measuring import Work
 from tests.conftest import SENSOR, folder, images
 
@@ -68,7 +68,7 @@ def test_each_has_its_nearest_over_turns_and_mirror_and_copies_are_found(sets, m
             assert one.distances[i] == pytest.approx(math.sqrt(d.min()), rel=1e-5)
     one, real = found["generated"], found["held"]
     assert one.distances[3:].tolist() == [0, 0, 0]
-    result = copies_result(one, real)
+    result = _copies_result(one, real)
     assert f"{(one.distances < min(real.distances)).sum()} of 6 scans" in result.remarks[0]
     assert result.figures["copies"] == np.median(one.distances)
     wins = np.mean([a < b for a in one.distances for b in real.distances])

@@ -116,7 +116,7 @@ def add(name: str, path: Path) -> str:
     Returns the first 12 digits of the SHA-256 of the parameters, independent of the file format.
     """
     SOURCES[name]
-    tensors = read_published(path)
+    tensors = _read_published(path)
     with reading_errors(path):
         weights = weights_hash(EXTRACTORS[name].from_tensors(tensors))
     whole = {name: tensor.clone().contiguous() for name, tensor in tensors.items()}
@@ -131,7 +131,7 @@ def weights_hash(extractor: Extractor) -> str:
     return state_hash(tensors)[:12]
 
 
-def read_published(path: Path) -> dict[str, Tensor]:
+def _read_published(path: Path) -> dict[str, Tensor]:
     """Read tensors by name from a file, an archive or a folder."""
     with reading_errors(path) if path.is_dir() else reading(path, LARGEST, "file of weights"):
         if path.suffix == ".safetensors":

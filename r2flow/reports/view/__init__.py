@@ -96,7 +96,7 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
                 "caption": printable(panel.caption),
                 "rays": sensors[key],
                 "frames": [
-                    packed_image(image, step, numbers)
+                    _packed_image(image, step, numbers)
                     for image, numbers in zip(panel.images, classified, strict=True)
                 ],
                 "reflectance": panel.images.shape[1] > 1,
@@ -133,7 +133,7 @@ def most_images(shape: Sequence[int]) -> int:
     return MOST // int(np.prod(shape[-2:]))
 
 
-def packed_image(image: ndarray, step: float, numbers: ndarray | None = None) -> str:
+def _packed_image(image: ndarray, step: float, numbers: ndarray | None = None) -> str:
     """Encode an image, (2 or 1, H, W), as byte planes of H W each, compressed by zlib, in base64.
 
     Planes: high and low bytes of range codes, as differences along each row modulo 2^16; optionally

@@ -129,7 +129,7 @@ class AdaptiveAugment(nn.Module):
         """Transform x (B, C, H, W) in at least float32; twice differentiable."""
         with torch.autocast(x.device.type, enabled=False):
             maps = (part.to(x.device) for part in affine(draws, *x.shape[2:]))
-            return coloured(transformed(at_least_float32(x), *maps), draws)
+            return _coloured(transformed(at_least_float32(x), *maps), draws)
 
 
 def _applied(draws: Mapping[str, Draw], name: str, identity: float) -> Tensor:
@@ -193,7 +193,7 @@ def _row(lines: Tensor, index: Tensor) -> Tensor:
     return lines[nearest] * (index == nearest)[..., None].to(lines)
 
 
-def coloured(x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
+def _coloured(x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
     """Apply all of `COLOUR` to x of one channel; two are left alone, as in the published code."""
     if x.shape[1] != 1:
         return x

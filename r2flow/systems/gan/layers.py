@@ -121,7 +121,7 @@ def logistic(uniform: Tensor) -> Tensor:
     return torch.logit(uniform, torch.finfo(torch.float32).eps)
 
 
-def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0) -> Tensor:
+def _straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0) -> Tensor:
     """m ~ Bernoulli(sigmoid(logit)), 0 or 1, with the gradient of its relaxation s.
 
     s = sigmoid((logit + noise) / temperature) and m = [s > 1/2] for `logistic` noise (Maddison et
@@ -141,7 +141,7 @@ class RayDrop(nn.Module):
 
     def forward(self, made: Outputs, uniform: Tensor) -> Outputs:
         image = made[IMAGE]
-        mask = straight_through_mask(made[LOGIT], logistic(uniform), self.temperature)
+        mask = _straight_through_mask(made[LOGIT], logistic(uniform), self.temperature)
         dropped = image.lerp(self.raydrop_const, 1 - mask)
         return {**made, "image_orig": image, "raydrop_mask": mask, IMAGE: dropped}
 

@@ -16,12 +16,12 @@ from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import DROPPED, Filter
 
 
-def generator_loss(fake: Tensor) -> Tensor:
+def _generator_loss(fake: Tensor) -> Tensor:
     """mean softplus(-D(G(z))) (Goodfellow et al. 2014, section 3, the non-saturating form)."""
     return softplus(-fake).mean()
 
 
-def discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
+def _discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
     """mean softplus(-D(x)) + mean softplus(D(G(z))) (Goodfellow et al. 2014, eq. 1, as a loss)."""
     return softplus(-real).mean() + softplus(fake).mean()
 
@@ -36,7 +36,7 @@ def r1(scores: Tensor, x: Tensor) -> Tensor:
     return gradient.square().flatten(1).sum(1).mean()
 
 
-def lazy_adam(
+def _lazy_adam(
     learning_rate: float, betas: tuple[float, float], every: int
 ) -> tuple[float, tuple[float, float]]:
     """Adam's learning rate and betas with an additional penalty step every `every` steps.
@@ -66,13 +66,13 @@ class Warmup:
         `uniform` has each value's draw in [0, 1); None is enough once the warm-up is over.
         """
         left = self.left(images)
-        x = blurred(x, self.blur * left)
+        x = _blurred(x, self.blur * left)
         if uniform is None:
             return x
         return torch.where(uniform < 1 - self.dropout * left, x, DROPPED)
 
 
-def blurred(x: Tensor, sigma: float) -> Tensor:
+def _blurred(x: Tensor, sigma: float) -> Tensor:
     """x filtered by 2^(-(k / sigma)^2), |k| <= floor(3 sigma), over its sum.
 
     Circular in azimuth, the edge rows repeated (Karras et al. 2021, StyleGAN3).
@@ -101,7 +101,7 @@ class LearnGan(Stage):
     steps.
 
     All that D sees is warmed up (`Warmup`) and augmented (`AdaptiveAugment`). Both learn by Adam at
-    a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is r1
+    a constant rate (`_lazy_adam` for D). The loss is the non-saturating one; R1's weight is r1
     r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's. The log has the
     probability of augmentation after each step (`train/augmented`) and R1 when it was last measured
     (`train/last_r1`).
@@ -146,7 +146,7 @@ class LearnGan(Stage):
     def configure_optimizers(self) -> Any:
         learning_rate = self.hparams["learning_rate"]
         betas = tuple(self.hparams["betas"])
-        lazy = lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
+        lazy = _lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
         return [
             torch.optim.Adam(self.generator.parameters(), learning_rate, betas),
             torch.optim.Adam(self.discriminator.parameters(), *lazy),
@@ -161,7 +161,7 @@ class LearnGan(Stage):
         draws = BatchDraws(self.hparams["seed"], batch, GENERATOR)
         self.discriminator.requires_grad_(False)
         shown = self.shown(self.make(batch["x_0"], draws), images, draws)
-        loss = generator_loss(self.discriminator(shown))
+        loss = _generator_loss(self.discriminator(shown))
         self.take_step(for_generator, loss)
         self.discriminator.requires_grad_(True)
 
@@ -171,7 +171,7 @@ class LearnGan(Stage):
             fake = self.shown(self.make(z, draws), images, draws)
             seen = self.shown(real, images, BatchDraws(self.hparams["seed"], batch, REAL))
         of_real = self.discriminator(seen)
-        wrong = discriminator_loss(of_real, self.discriminator(fake))
+        wrong = _discriminator_loss(of_real, self.discriminator(fake))
         self.take_step(for_discriminator, wrong)
 
         if self.r1 and step % self.r1_every == 0:

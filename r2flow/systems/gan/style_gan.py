@@ -168,11 +168,11 @@ class _Synthesis(nn.Module):
         for level in self.layers:
             x, made = level(x, made, w, angles.pop())
         if shift is not None:
-            made = {name: turned_back(o, shift) for name, o in made.items()}
+            made = {name: _turned_back(o, shift) for name, o in made.items()}
         return {name: o / 4 for name, o in made.items()}
 
 
-def turned_back(x: Tensor, shift: Tensor) -> Tensor:
+def _turned_back(x: Tensor, shift: Tensor) -> Tensor:
     """Rotate x (B, C, H, W) left by `shift` turns, (B,), with linear interpolation of columns."""
     width = x.shape[-1]
     place = torch.arange(width, device=x.device) + shift.double()[:, None] * width

@@ -104,7 +104,7 @@ class LatentDDIM(Sampler):
     eta: Share = 1.0  # share of fresh noise
 
     def evaluations(self, generator: Any) -> int:
-        return len(some_of(len(generator.log_snr), self.steps))
+        return len(_some_of(len(generator.log_snr), self.steps))
 
     def check(self, generator: Any) -> None:
         super().check(generator)
@@ -113,7 +113,7 @@ class LatentDDIM(Sampler):
     def __call__(
         self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
     ) -> Generated:
-        times = some_of(len(generator.log_snr), self.steps)
+        times = _some_of(len(generator.log_snr), self.steps)
         log_snrs = generator.log_snr[[*times.tolist(), 0]]
         z = last_of(walk(generator.expected, noise, log_snrs, self.eta, draws, times), progress)
         # Its output is the scan, without later corrections.
@@ -122,7 +122,7 @@ class LatentDDIM(Sampler):
         return Generated.after(scans, len(times))
 
 
-def some_of(total: int, steps: int) -> Tensor:
+def _some_of(total: int, steps: int) -> Tensor:
     """Every (total // steps)-th number below total from 1, decreasing.
 
     There are more than `steps` if it does not divide the total.

@@ -58,15 +58,15 @@ def _state(content: Any, averaged: bool = False) -> dict[str, Tensor]:
     return weights
 
 
-def holds_diffusion(content: Any) -> bool:
+def _holds_diffusion(content: Any) -> bool:
     return {_UNET + "time_embed.0.weight", _AUTOENCODER + _FIRST} <= _state(content).keys()
 
 
-def holds_autoencoder(content: Any) -> bool:
+def _holds_autoencoder(content: Any) -> bool:
     return {_FIRST, _CODES} <= _state(content).keys()
 
 
-def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
+def _read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
     """Read a published latent diffusion."""
     state = _state(content, averaged)
     if _within(state, "cond_stage_model."):
@@ -101,7 +101,7 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
     return Published(_config(generator, path, notes), weights, int(content.get("global_step", 0)))
 
 
-def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
+def _read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
     """Read a published autoencoder, without its discriminator."""
     state = _state(content, averaged)
     generator = {"name": "vq_autoencoder", "autoencoder": _autoencoder(state)}
@@ -223,5 +223,5 @@ def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> 
     }
 
 
-DIFFUSION = Format("LiDM", holds_diffusion, read_diffusion)
-FIRST_STAGE = Format("LiDM's autoencoder", holds_autoencoder, read_autoencoder)
+DIFFUSION = Format("LiDM", _holds_diffusion, _read_diffusion)
+FIRST_STAGE = Format("LiDM's autoencoder", _holds_autoencoder, _read_autoencoder)
