@@ -18,6 +18,7 @@ import numpy as np
 from numpy import ndarray
 
 from r2flow.lidar.sensors import Sensor
+from r2flow.simulator.tables import TABLES
 
 
 @dataclass(frozen=True, eq=False)  # compared and hashed by identity
@@ -135,22 +136,8 @@ def row_windows(
     return b * rays.columns + w[n], rays.slope[b], rays.height[b], *(q[n] for q in spans)
 
 
-# Parts of the roof of the ego vehicle, from two KITTI drives: |across|^p + |up|^p < 1 in degrees.
-# Columns: half width, half height, power p, degrees below the horizon, distance in metres from the
-# sensor's axis, whether the part goes straight down to the roof, azimuths. All are nearer than any
-# valid return, so that scans show only their shadows. Lasers beside the axis see them displaced:
-# neighbouring rings are occluded alternately to the left and right.
-_ROOF = (
-    (22, 5.0, 2, 26.5, 1.2, True, (0,)),
-    (6, 2.6, 2, 26.2, 0.8, True, (34, -34)),
-    (5.0, 2.4, 2, 23.2, 0.7, True, (131, -128)),
-    (14, 2.9, 2, 26.5, 0.8, True, (142, -142)),
-    (15, 6.2, 2, 26, 1.2, True, (163, -163)),
-    (18, 6.6, 6, 26, 1.5, True, (180,)),
-    (4.2, 4.0, 4, 17.0, 1.0, False, (161, -158.5)),
-)
-_INSTRUMENT = (11.0, 4.4, 2, 20.0, 0.55, False, (-69,))
-RIGS = ((*_ROOF, _INSTRUMENT), _ROOF)  # with an instrument next to the sensor, and without
+# Parts of the ego vehicle's roof, with an instrument next to the sensor, and without.
+RIGS = ([*TABLES["roof"], TABLES["instrument"]], TABLES["roof"])
 
 
 @lru_cache(maxsize=16)
