@@ -269,11 +269,11 @@ def _classifier(real: Tensor, generated: Tensor) -> Callable[[Tensor], Tensor]:
     y = (torch.arange(len(rows)) >= len(real)).double()
     weight = len(y) / 2 / torch.where(y > 0, len(generated), len(real)).double()
     # An L2 penalty of 1 on the weights of standardised features.
-    ridge = torch.eye(x.shape[1], dtype=x.dtype)
-    ridge[-1, -1] = 1e-9
-    w = x.new_zeros(x.shape[1])
+    penalty = torch.ones_like(x[0])
+    penalty[-1] = 1e-9
+    w = torch.zeros_like(penalty)
     for _ in range(25):  # Newton's method
         p = (x @ w).sigmoid()
-        curvature = (x * (weight * p * (1 - p))[:, None]).mT @ x + ridge
-        w = w - torch.linalg.solve(curvature, x.mT @ (weight * (p - y)) + ridge @ w)
+        curvature = (x * (weight * p * (1 - p))[:, None]).mT @ x + penalty.diag()
+        w = w - torch.linalg.solve(curvature, x.mT @ (weight * (p - y)) + penalty * w)
     return lambda rows: with_bias(rows) @ w

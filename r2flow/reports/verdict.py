@@ -40,21 +40,21 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     metric = _HEADLINE if _HEADLINE in biased else next(iter(biased), "")
     values = [pair for pair in _first_values(comparisons, metric) if math.isfinite(pair[0])]
     values.sort(key=lambda pair: pair[0])
-    references = {c.name: (value, c) for value, c in values if c.kind == "reference"}
-    if HALVES not in references:
+    titled = {c.title: (value, c) for value, c in values}
+    halves = titled.get(f"reference: {HALVES}")
+    if halves is None:
         return []
-    halves = references[HALVES]
     baselines = [pair for pair in values if pair[1].kind == "baseline"][:1]
+    best = baselines[0][0] if baselines else math.inf
     title, factor = heading(metric, metric)
     bounds = [f"{c.title} {value * factor:.3g}" for value, c in (halves, *baselines)]
     lines = []
     for value, comparison in values:
         if comparison.kind != "judged":
             continue
-        equal = references.get(comparison.name + AS_MANY)
+        equal = titled.get(f"reference: {comparison.name}{AS_MANY}")
         same = [f"in as many scans as the halves {equal[0] * factor:.3g}"] if equal else []
         near = ", ".join([*same, *bounds])
-        best = baselines[0][0] if baselines else math.inf
         judgement = _judge((value, comparison), equal, halves, best)
         empty = comparison.measured[0].protocol.get("sizes", {}).get("generated_empty")
         if empty:

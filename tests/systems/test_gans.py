@@ -33,11 +33,11 @@ from r2flow.systems.gan.augment import (
 from r2flow.systems.gan.dcgan import DustyV1, VanillaGan
 from r2flow.systems.gan.layers import _straight_through_mask, logistic
 from r2flow.systems.gan.stage import (
+    Warmup,
     _blurred,
     _discriminator_loss,
     _generator_loss,
     _lazy_adam,
-    Warmup,
     r1,
 )
 from r2flow.systems.gan.style_gan import DustyV2
