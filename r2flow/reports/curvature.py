@@ -61,13 +61,8 @@ def _curvature_rows(flows: Mapping[str, Straightness]) -> list[Row]:
     """s(t) per checkpoint and time, mean over scans, unnormalised and over |d|^2."""
     rows = []
     for label, flow in flows.items():
-        means = zip(
-            flow.t.tolist(),
-            flow.s.mean(0).tolist(),
-            flow.s_normalised.mean(0).tolist(),
-            strict=True,
-        )
-        for t, s, normalised in means:
+        means = torch.stack([flow.t, flow.s.mean(0), flow.s_normalised.mean(0)], 1)
+        for t, s, normalised in means.tolist():
             rows.append({"checkpoint": label, "t": t, "s": s, "s_normalised": normalised})
     return rows
 
