@@ -9,7 +9,7 @@ with c by FFT along the rows. The test compares the distances of generated and r
 Meehan et al. (2020), "A non-parametric test to detect data-copying in generative models".
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
-from r2flow.evaluation.comparing import Comparison
+from r2flow.evaluation.comparing import Comparison, Comparisons
 from r2flow.evaluation.measuring import MetricResult, Work, bar
 from r2flow.evaluation.sets import HALVES
 from r2flow.lidar.encoding import Encoding
@@ -145,7 +145,7 @@ def _copies_result(judged: _Nearest, real: _Nearest) -> MetricResult:
 
 
 def with_copies(
-    comparisons: Sequence[Comparison], nearest: Mapping[str, _Nearest], real: _Nearest
+    comparisons: Comparisons, nearest: Mapping[str, _Nearest], real: _Nearest
 ) -> list[Comparison]:
     """Add a result to each judged set in `nearest`, and that of the real scans to halves."""
     of = {("judged", name): neighbours for name, neighbours in nearest.items()}

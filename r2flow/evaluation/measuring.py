@@ -142,8 +142,8 @@ def gather_real(
 ) -> dict[str, Statistics]:
     """Compute each metric's statistics of the real scans, or read them from the cache."""
     points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
-    gathered: dict[str, Statistics] = {}
-    keys: dict[str, str] = {}
+    gathered = {}
+    keys = {}
     groups: dict[str, tuple[Sequence[int], dict[str, ScanMetric]]] = {}  # by choice of scans
     for name, metric in metrics.items():
         numbers, chosen = _real_rule(metric, real, protocol)

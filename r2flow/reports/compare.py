@@ -91,7 +91,7 @@ def _group_rows(groups: Groups) -> list[Row]:
     """One row per group: means of the runs with a value, and the deviation of several."""
     rows = []
     for label, runs in groups.items():
-        row: Row = {"name": label, "n": len(runs)}
+        row = {"name": label, "n": len(runs)}
         for column in _SETTINGS:
             equal = {run.values[column] for run in runs}
             row[column] = equal.pop() if len(equal) == 1 else None

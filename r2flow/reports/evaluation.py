@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from r2flow.evaluation.comparing import Comparison
+from r2flow.evaluation.comparing import Comparison, Comparisons
 from r2flow.reports.pages import Page, Plot, lines_figure
 from r2flow.reports.tables import Row, print_table, table, words
 from r2flow.reports.verdict import heading, remarks_of, verdict
@@ -15,7 +15,7 @@ from r2flow.reports.verdict import heading, remarks_of, verdict
 _SPEED = {"evaluations": "network evaluations a scan", "seconds": "seconds a scan"}
 
 
-def _value_rows(comparisons: Sequence[Comparison]) -> list[Row]:
+def _value_rows(comparisons: Comparisons) -> list[Row]:
     """One row per value."""
     rows = []
     for comparison in comparisons:
@@ -36,7 +36,7 @@ def _value_rows(comparisons: Sequence[Comparison]) -> list[Row]:
     return rows
 
 
-def print_comparisons(comparisons: Sequence[Comparison]) -> None:
+def print_comparisons(comparisons: Comparisons) -> None:
     """Print the protocol, a table and remarks. Columns are numbered, since names are long."""
     columns, lines = _table(comparisons)
     numbers = [str(number) for number in range(1, len(columns))]
@@ -49,9 +49,7 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
     print(*verdict(comparisons), sep="\n")
 
 
-def evaluation_page(
-    comparisons: Sequence[Comparison], device: str, seeds: Mapping[str, int]
-) -> Page:
+def evaluation_page(comparisons: Comparisons, device: str, seeds: Mapping[str, int]) -> Page:
     """Build the page of an evaluation: table, verdict, sets, protocols, and quality against speed
     of models.
     """
@@ -80,7 +78,7 @@ def evaluation_page(
     return Page("evaluation", title, text, rows, figures, seeds, device, {"comparisons": results})
 
 
-def _protocol(comparisons: Sequence[Comparison]) -> str:
+def _protocol(comparisons: Comparisons) -> str:
     used = comparisons[0].measured[0].protocol
     top, bottom = used["elevations"]
     return (
@@ -91,7 +89,7 @@ def _protocol(comparisons: Sequence[Comparison]) -> str:
     )
 
 
-def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]]]:
+def _table(comparisons: Comparisons) -> tuple[list[str], list[list[str]]]:
     """Headings and lines: a column for each set, values as published tables scale them."""
     headings = [""]
     columns = []

@@ -23,7 +23,7 @@ from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row, words
 
 # Markers and dashes distinguish lines without colour.
-STYLES: tuple[dict[str, Any], ...] = tuple(
+STYLES: tuple[Row, ...] = tuple(
     {"marker": marker, "linestyle": dash, "color": f"C{number}"}
     for number, (marker, dash) in enumerate(
         zip("os^DvPX*<>", ("-", "--", "-.", ":", "-") * 2, strict=True)
@@ -76,7 +76,7 @@ def write_json(page: Page, path: Path) -> None:
     write_file(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
-def _provenance(page: Page) -> dict[str, Any]:
+def _provenance(page: Page) -> Row:
     """Machine, versions, seeds, date and command of a page; only the command has paths."""
     machine = {
         "cpu": _cpu_name(),

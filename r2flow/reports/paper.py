@@ -177,7 +177,7 @@ def _table_i(rows: Sequence[Row]) -> str:
 
     Evaluated rows without a printed row come last.
     """
-    lines: list[Row] = []
+    lines = []
     left = list(rows)
     for printed in _PRINTED["table_1"]:
         lines.append({**printed, "of": "paper"})

@@ -51,7 +51,7 @@ def _find_runs(paths: Sequence[Path]) -> list[Path]:
 def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     """Read all runs; build each network once."""
     folders = _find_runs(paths)
-    costs: dict[str, Row] = {}
+    costs = {}
     runs = []
     for path, label in zip(folders, short_names(folders), strict=True):
         config = read_config(path) or {}

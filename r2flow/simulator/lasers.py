@@ -20,6 +20,8 @@ from numpy import ndarray
 from r2flow.lidar.sensors import Sensor
 from r2flow.simulator.tables import TABLES
 
+Arrays = tuple[ndarray, ...]
+
 
 @dataclass(frozen=True, eq=False)  # compared and hashed by identity
 class _Lasers:
@@ -117,9 +119,7 @@ def column_windows(azimuth: ndarray, half: ndarray, columns: int) -> tuple[ndarr
     return k, w % columns
 
 
-def row_windows(
-    rays: Rays, spans: tuple[ndarray, ...], bottom: ndarray, top: ndarray
-) -> tuple[ndarray, ...]:
+def row_windows(rays: Rays, spans: Arrays, bottom: ndarray, top: ndarray) -> Arrays:
     """The rays that may intersect solids between their bottom and top.
 
     A span is a solid k, a column w, distances near and far, and more arrays; (N,) each. Returns the

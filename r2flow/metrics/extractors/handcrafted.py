@@ -162,7 +162,7 @@ class Handcrafted(Extractor):
 
     def _features(self, images: Tensor) -> Tensor:
         h, w = images.shape[2:]
-        found: dict[str, Tensor] = {}
+        found = {}
         q = images[:, 1] if self.needs_reflectance else None
         for name, x, where in _statistics(images[:, 0], q):
             masked = x * where

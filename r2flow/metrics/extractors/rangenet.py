@@ -9,14 +9,13 @@ translated.
 import random
 import re
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.extractors.base import Extractor, Tensors
 from r2flow.metrics.scans import Scans
 
 WIDTHS = (32, 64, 128, 256, 512, 1024)
@@ -123,7 +122,7 @@ class _RangeNet(Extractor):
         """Map decoder maps (B, C, H, W) to features (B, D)."""
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
+    def from_tensors(cls, tensors: Tensors) -> Self:
         tensors = {_translate(name): tensor for name, tensor in tensors.items()}
         return cls(len(tensors.get("head.1.bias", ()))).filled(tensors)
 

@@ -9,7 +9,7 @@ weights) and the features are not verified.
 """
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.extractors.base import Extractor, Tensors
 from r2flow.metrics.extractors.sparse import (
     Sparse,
     SparseConv3d,
@@ -158,7 +158,7 @@ class MinkowskiNet(Extractor):
         return means
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
+    def from_tensors(cls, tensors: Tensors) -> Self:
         levels = ["stem.0"]
         levels += [f"stage{level}.1.net.0" for level in range(1, 5)]
         levels += [f"up{level}.0.net.0" for level in range(1, 5)]

@@ -61,7 +61,7 @@ def scan_panels(
     The caption is the file name, with folders if names are ambiguous. Files not written by r2flow
     are opened one by one, since sizes of range images and reflectance may differ.
     """
-    views: list[tuple[str, Path, ScanSet, int]] = []
+    views = []
     for spec, reading in readings.items():
         reading = replace(reading, on_bad_scan="error")
         described = describe(spec)

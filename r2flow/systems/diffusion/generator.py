@@ -1,6 +1,5 @@
 """Diffusion models: a network that predicts noise or data, sampled by diffusion or as a flow."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,9 +60,9 @@ class Diffusion(NetworkFlow):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Mapping[str, Any],
+        backbone: Options,
         prediction: str = "eps",
-        schedule: Options = None,
+        schedule: Options | None = None,
         clip: Positive | None = 1.0,
     ) -> None:
         super().__init__(space, backbone)

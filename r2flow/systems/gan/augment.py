@@ -42,8 +42,8 @@ class BatchDraws:
         return torch.tensor(np.stack(draws))
 
 
-Draw = tuple[Tensor, Tensor]
-"""A batch's magnitudes, (B,) or (2, B) for rows and columns, and whether they apply, (B,) 0/1."""
+Draws = Mapping[str, tuple[Tensor, Tensor]]
+"""By name: magnitudes, (B,) or (2, B) for rows and columns, and whether they apply, (B,) 0/1."""
 
 
 def _flip(source: BatchDraws) -> Tensor:
@@ -116,7 +116,7 @@ class AdaptiveAugment(nn.Module):
         self.n_pred_cum.zero_()
         return sign
 
-    def draw(self, source: BatchDraws) -> dict[str, Draw]:
+    def draw(self, source: BatchDraws) -> Draws:
         """Draw a batch's transformations by name; the number of draws does not depend on p."""
         draws = {}
         p = float(self.p)
@@ -125,20 +125,20 @@ class AdaptiveAugment(nn.Module):
             draws[name] = (value, (source.uniform() < p).float())
         return draws
 
-    def forward(self, x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
+    def forward(self, x: Tensor, draws: Draws) -> Tensor:
         """Transform x (B, C, H, W) in at least float32; twice differentiable."""
         with torch.autocast(x.device.type, enabled=False):
             maps = (part.to(x.device) for part in affine(draws, *x.shape[2:]))
             return _coloured(transformed(at_least_float32(x), *maps), draws)
 
 
-def _applied(draws: Mapping[str, Draw], name: str, identity: float) -> Tensor:
+def _applied(draws: Draws, name: str, identity: float) -> Tensor:
     """Magnitudes of a transformation, and that of the identity where it does not apply."""
     value, chosen = draws[name]
     return torch.where(chosen > 0, value, identity)
 
 
-def affine(draws: Mapping[str, Draw], height: int, width: int) -> tuple[Tensor, Tensor]:
+def affine(draws: Draws, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Scale and shift of pixels about the image centre by all of `GEOMETRY`, (2, B) each.
 
     Rows are before columns. Only rows are scaled, since a scale of columns would open the ring.
@@ -193,7 +193,7 @@ def _row(lines: Tensor, index: Tensor) -> Tensor:
     return lines[nearest] * (index == nearest)[..., None].to(lines)
 
 
-def _coloured(x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
+def _coloured(x: Tensor, draws: Draws) -> Tensor:
     """Apply all of `COLOUR` to x of one channel; two are left alone, as in the published code."""
     if x.shape[1] != 1:
         return x

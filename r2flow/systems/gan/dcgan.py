@@ -49,7 +49,7 @@ class VanillaGan(Gan):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Options = None,
+        backbone: Options | None = None,
         latent: Count = 512,
         base_channels: Count = 64,
         max_channels: Count = 512,

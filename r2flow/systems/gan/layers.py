@@ -202,14 +202,14 @@ class LatentGenerator(nn.Module):
             uniform: u in [0, 1) for the noise of the mask, (B, 1, H, W).
             shift: Azimuth rotation of each scan in full turns, (B,), for a synthesis with angles.
         """
-        w: Tensor = self.mapping_network(z)
+        w = self.mapping_network(z)
         if self.training:
             mean = mean_over_processes(w.detach().mean(0, keepdim=True))
             self.w_avg.lerp_(mean.to(self.w_avg), 1 - self.decay)
         elif truncation != 1:
             w = self.w_avg.lerp(w, truncation)
         rays = () if angle is None else (angle, shift)
-        made: Outputs = self.synthesis_network(w, *rays)
+        made = self.synthesis_network(w, *rays)
         if self.tanh:
             made[IMAGE] = made[IMAGE].tanh()
         made["w"] = w[:, None].expand(-1, self.num_styles, -1)

@@ -122,12 +122,12 @@ class LearnGan(Stage):
     def __init__(
         self,
         *model: Any,
-        discriminator: Options = None,
+        discriminator: Options | None = None,
         betas: tuple[Portion, Portion] = (0.0, 0.99),
         r1: NonNegative = 1.0,
         r1_every: Count = 16,
-        warmup: Options = None,
-        augment: Options = None,
+        warmup: Options | None = None,
+        augment: Options | None = None,
         **options: Any,
     ) -> None:
         super().__init__(*model, betas=betas, **{"warmup_images": 0, **options})

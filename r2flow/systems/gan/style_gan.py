@@ -199,7 +199,7 @@ class DustyV2(Gan):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Options = None,
+        backbone: Options | None = None,
         latent: Count = 512,
         code: Count | None = None,
         depth: Count = 2,

@@ -21,7 +21,7 @@ from r2flow.systems.latent.unet import LatentUNet
 class _Latent(Generator):
     """A generator with an autoencoder, whose noise has the shape of the latents."""
 
-    def __init__(self, space: ModelSpace, autoencoder: Options) -> None:
+    def __init__(self, space: ModelSpace, autoencoder: Options | None) -> None:
         super().__init__(space)
         self.first_stage_model = construct(
             "generator.autoencoder", Autoencoder, autoencoder, space.shape[0]
@@ -38,7 +38,9 @@ class VQAutoencoder(_Latent):
 
     unconditional = False
 
-    def __init__(self, space: ModelSpace, backbone: Options, autoencoder: Options = None) -> None:
+    def __init__(
+        self, space: ModelSpace, backbone: Options | None, autoencoder: Options | None = None
+    ) -> None:
         super().__init__(space, autoencoder)
 
 
@@ -59,10 +61,10 @@ class LatentDiffusion(_Latent):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Options,
-        autoencoder: Options = None,
-        unet: Options = None,
-        schedule: Options = None,
+        backbone: Options | None,
+        autoencoder: Options | None = None,
+        unet: Options | None = None,
+        schedule: Options | None = None,
     ) -> None:
         super().__init__(space, autoencoder)
         self.run_by(LatentDDIM())

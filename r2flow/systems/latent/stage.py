@@ -118,7 +118,7 @@ class LearnAutoencoder(Stage):
     def __init__(
         self,
         *model: Any,
-        discriminator: Options = None,
+        discriminator: Options | None = None,
         adversarial_weight: NonNegative = 0.6,
         adversarial_start: Natural = 1,
         inverted: bool = False,

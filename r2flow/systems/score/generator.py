@@ -6,7 +6,7 @@ gradient by x of the log density of data plus noise of standard deviation sigma_
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import IMAGE, KNOWN, Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Count, Positive
+from r2flow.registry import Count, Options, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.score.refinenet import RefineNet
 
@@ -105,7 +105,7 @@ class ScoreModel(Generator):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Mapping[str, Any],
+        backbone: Options,
         rate: Positive = 6.2e-6,
         pull: Positive = 1.0,
         width: Count = 128,
