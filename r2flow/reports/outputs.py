@@ -77,9 +77,16 @@ def write_samples(
     evaluations = len(left) * (sampler.evaluations(generator) or 0)
     with Bar("sampling", sum(map(len, left)), evaluations=evaluations) as bar:
         done = 0
-        how: Any = {"region": region, "precision": precision, "progress": bar.evaluated}
         for numbers in left:
-            drawn = draw(generator, numbers, seed, sampler, **how)
+            drawn = draw(
+                generator,
+                numbers,
+                seed,
+                sampler,
+                region=region,
+                precision=precision,
+                progress=bar.evaluated,
+            )
             warn_unsolved(drawn.converged, numbers.start)
             while stale:  # the first scan shows that the settings are valid
                 stale.pop().unlink()
