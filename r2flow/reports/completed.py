@@ -1,7 +1,6 @@
 """Completed scans as files and pictures."""
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -68,7 +67,8 @@ def write_completed(
         for number, scan in enumerate(scans)
         if not all(path.is_file() for path in files[scan.name])
     ]
-    counts = Counter[str]()
+    rays = np.zeros(len(Ray), int)  # of each state, of scans of points
+    outside = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches) as bar:
         for done, number in enumerate(left):
@@ -97,9 +97,22 @@ def write_completed(
                     f"{scan.name}: everything is known, so nothing was completed; see --from, "
                     "--fill-gaps and --mask"
                 )
-            counts += _count(scan, given)
+            if not scan.image:
+                rays += np.bincount(given.state.ravel(), minlength=len(Ray))
+                outside += given.points.dropped if given.points else 0
             bar.set((done + 1) * job.num)
-    _print_counts(checkpoint, counts)
+    share = rays[Ray.EMPTY] / max(rays[Ray.EMPTY] + rays[Ray.RETURN], 1)
+    if share > 0.5:  # 31 % at most of real scans
+        print(
+            f"{share:.0%} of the measured rays have no return: for thinned scans give --fill-gaps"
+        )
+    if rays.any():
+        sensor = checkpoint.sensor
+        rows, columns = sensor.shape
+        print(
+            f"used: the nearest point in each pixel of {rows}x{columns}; {outside:,} outside "
+            f"{sensor.min_range:g}-{sensor.max_range:g} m left out"
+        )
     skipped = f", {len(scans) - len(left)} there already" if len(left) < len(scans) else ""
     print(f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}{skipped}")
 
@@ -131,35 +144,6 @@ def _check_inputs(
                 "--out."
             )
     return inputs
-
-
-def _count(scan: PartialScan, given: Partial) -> Counter[str]:
-    """Rays of points with and without a return, and points that are written and left out."""
-    counts = Counter[str]()
-    if not scan.image:
-        counts["used"] = int((given.state == Ray.RETURN).sum())
-        counts["empty"] = int((given.state == Ray.EMPTY).sum())
-        if given.points is not None:
-            counts["kept"] = len(given.points.xyz)
-            counts["outside"] = given.points.dropped
-    return counts
-
-
-def _print_counts(checkpoint: Checkpoint, counts: Counter[str]) -> None:
-    share = counts["empty"] / max(counts["used"] + counts["empty"], 1)
-    if share > 0.5:  # 31 % at most of real scans
-        print(
-            f"{share:.0%} of the measured rays have no return: for thinned scans give --fill-gaps"
-        )
-    if counts["used"]:
-        sensor = checkpoint.sensor
-        size = "x".join(map(str, sensor.shape))
-        print(
-            f"measured points used: {counts['used']:,}, the nearest in each pixel of {size}; "
-            f"kept: {counts['kept']:,}, {counts['outside']:,} outside "
-            f"{sensor.min_range:g}-{sensor.max_range:g} m "
-            "left out"
-        )
 
 
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from r2flow.evaluation.comparing import Comparison, Comparisons
 from r2flow.reports.pages import Page, Plot, lines_figure
-from r2flow.reports.tables import Row, print_table, table, words
+from r2flow.reports.tables import Row, print_table, table
 from r2flow.reports.verdict import heading, remarks_of, verdict
 
 _SPEED = {"evaluations": "network evaluations a scan", "seconds": "seconds a scan"}
@@ -50,22 +50,15 @@ def print_comparisons(comparisons: Comparisons) -> None:
 
 
 def evaluation_page(comparisons: Comparisons, device: str, seeds: Mapping[str, int]) -> Page:
-    """Build the page of an evaluation: table, verdict, sets, protocols, and quality against speed
+    """Build the page of an evaluation: table, verdict, and quality against speed
     of models.
     """
     columns, lines = _table(comparisons)
-    sets = [
-        (c.name, side, scans.label, len(scans), words(scans.about))
-        for c in comparisons
-        for side, scans in (("real", c.real), ("generated", c.generated))
-    ]
     text = [
         _protocol(comparisons),
         table(lines, columns),
         "\n".join(f"- {remark}" for remark in remarks_of(comparisons)),
         *verdict(comparisons),
-        "## Sets",
-        table(sets, ("comparison", "as", "set", "scans", "details, as read")),
     ]
     results = [_plain_comparison(comparison) for comparison in comparisons]
     figures = {}
