@@ -87,7 +87,7 @@ class _ScoreBlock(nn.Module):
         return self.shortcut(x) + self.conv2(F.elu(self.normalize2(h)))
 
 
-class _ResidualUnits(nn.Module):
+class _ResidualUnits(nn.ModuleDict):
     """x <- x + conv elu conv elu (x), repeated."""
 
     def __init__(self, channels: int, count: int) -> None:
@@ -95,16 +95,12 @@ class _ResidualUnits(nn.Module):
         self.count = count
         for unit in range(1, count + 1):
             for layer in (1, 2):
-                self.add_module(
-                    f"{unit}_{layer}_conv", _convolution(channels, channels, bias=False)
-                )
+                self[f"{unit}_{layer}_conv"] = _convolution(channels, channels, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         for unit in range(1, self.count + 1):
-            h = x
-            for layer in (1, 2):
-                h = self.get_submodule(f"{unit}_{layer}_conv")(F.elu(h))
-            x = x + h
+            h = self[f"{unit}_1_conv"](F.elu(x))
+            x = x + self[f"{unit}_2_conv"](F.elu(h))
         return x
 
 
