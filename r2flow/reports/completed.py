@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from r2flow import noise
@@ -101,6 +102,13 @@ def write_completed(
                 rays += np.bincount(given.state.ravel(), minlength=len(Ray))
                 outside += given.points.dropped if given.points else 0
             bar.set((done + 1) * job.num)
+    _print_counts(checkpoint, rays, outside)
+    skipped = f", {len(scans) - len(left)} there already" if len(left) < len(scans) else ""
+    print(f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}{skipped}")
+
+
+def _print_counts(checkpoint: Checkpoint, rays: ndarray, outside: int) -> None:
+    """Print what was taken of points, from the number of rays of each state."""
     share = rays[Ray.EMPTY] / max(rays[Ray.EMPTY] + rays[Ray.RETURN], 1)
     if share > 0.5:  # 31 % at most of real scans
         print(
@@ -113,8 +121,6 @@ def write_completed(
             f"used: the nearest point in each pixel of {rows}x{columns}; {outside:,} outside "
             f"{sensor.min_range:g}-{sensor.max_range:g} m left out"
         )
-    skipped = f", {len(scans) - len(left)} there already" if len(left) < len(scans) else ""
-    print(f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}{skipped}")
 
 
 def _answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int) -> list[Path]:

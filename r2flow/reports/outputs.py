@@ -78,15 +78,7 @@ def write_samples(
     with Bar("sampling", sum(map(len, left)), evaluations=evaluations) as bar:
         done = 0
         for numbers in left:
-            drawn = draw(
-                generator,
-                numbers,
-                seed,
-                sampler,
-                region=region,
-                precision=precision,
-                progress=bar.evaluated,
-            )
+            drawn = draw(generator, numbers, seed, sampler, None, region, precision, bar.evaluated)
             warn_unsolved(drawn.converged, numbers.start)
             while stale:  # the first scan shows that the settings are valid
                 stale.pop().unlink()

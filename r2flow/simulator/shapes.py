@@ -49,7 +49,7 @@ class Frusta(
 ):
     """Boxes whose sides lean inwards by metres (>= 0) per metre of height; every field a column."""
 
-    def leans(self) -> ndarray:
+    def _leans(self) -> ndarray:
         """Lean of the sides ahead, behind, left and right, (4, P)."""
         return np.stack([self.front, self.back, self.sides, self.sides])
 
@@ -63,7 +63,7 @@ class Frusta(
         solids = row_windows(rays, _box_spans(self, rays), self.bottom, self.top)
         pixel, slope, height, k, _, near, far, u, v, du, dv = solids
         rise = height - self.bottom[k]
-        lean = self.leans()[:, k]
+        lean = self._leans()[:, k]
         direction = _outwards(du, dv) + lean * slope
         room = _reach(self)[:, k] - _outwards(u, v) - lean * rise
         below = self.top[k] - self.bottom[k] - rise
@@ -72,7 +72,7 @@ class Frusta(
 
     def normal(self, k: ndarray, x: ndarray, y: ndarray, z: ndarray) -> Normal:
         u, v, c, s = _into(self, k, x, y)
-        lean = self.leans()[:, k]
+        lean = self._leans()[:, k]
         outside = _outwards(u, v) + lean * (z - self.bottom[k]) - _reach(self)[:, k]
         face = np.stack([*outside, z - self.top[k], self.bottom[k] - z]).argmax(0)
         up = np.ones(len(k), np.float32)

@@ -160,7 +160,7 @@ class LearnGan(Stage):
 
         draws = BatchDraws(self.hparams["seed"], batch, GENERATOR)
         self.discriminator.requires_grad_(False)
-        shown = self.shown(self.make(batch["x_0"], draws), images, draws)
+        shown = self._shown(self._make(batch["x_0"], draws), images, draws)
         loss = _generator_loss(self.discriminator(shown))
         self.take_step(for_generator, loss)
         self.discriminator.requires_grad_(True)
@@ -168,14 +168,14 @@ class LearnGan(Stage):
         draws = BatchDraws(self.hparams["seed"], batch, FAKE)
         with torch.no_grad():
             z = draws.normal(*self.generator.noise_shape).to(real.device)
-            fake = self.shown(self.make(z, draws), images, draws)
-            seen = self.shown(real, images, BatchDraws(self.hparams["seed"], batch, REAL))
+            fake = self._shown(self._make(z, draws), images, draws)
+            seen = self._shown(real, images, BatchDraws(self.hparams["seed"], batch, REAL))
         of_real = self.discriminator(seen)
         wrong = _discriminator_loss(of_real, self.discriminator(fake))
         self.take_step(for_discriminator, wrong)
 
         if self.r1 and step % self.r1_every == 0:
-            penalty = self.penalty(real, images, BatchDraws(self.hparams["seed"], batch, PENALTY))
+            penalty = self._penalty(real, images, BatchDraws(self.hparams["seed"], batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
             self.last_r1 = penalty.detach()
         if self.last_r1 is not None:
@@ -188,14 +188,14 @@ class LearnGan(Stage):
         self.log("train/loss", loss, prog_bar=True, sync_dist=True)
         self.log("train/discriminator", wrong, prog_bar=True, sync_dist=True)
 
-    def make(self, z: Tensor, draws: BatchDraws) -> Tensor:
+    def _make(self, z: Tensor, draws: BatchDraws) -> Tensor:
         """G(z), (B, C, H, W), with random mask and rotation."""
         gan = self.generator
         uniform = draws.uniform(1, *gan.space.shape[1:]).to(z.device) if gan.drops else None
         shift = None if gan.angle is None else draws.uniform().to(z.device)
         return gan.made(z, uniform, shift=shift)["image"]
 
-    def shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:
+    def _shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:
         """Input x of D after a number of images of the run."""
         uniform = None
         if self.warmup.left(images):
@@ -203,8 +203,8 @@ class LearnGan(Stage):
         x = self.warmup(x, images, uniform)
         return x if self.augment is None else self.augment(x, self.augment.draw(draws))
 
-    def penalty(self, real: Tensor, images: int, draws: BatchDraws) -> Tensor:
+    def _penalty(self, real: Tensor, images: int, draws: BatchDraws) -> Tensor:
         """R1 with gradients by the scans, through warm-up and augmentation, in float32."""
         with torch.autocast(real.device.type, enabled=False):
             x = real.detach().requires_grad_()
-            return r1(self.discriminator(self.shown(x, images, draws)), x)
+            return r1(self.discriminator(self._shown(x, images, draws)), x)
