@@ -98,6 +98,13 @@ SOURCES: Registry[SourceKind] = Registry(
     odometry=Layout(layouts.odometry, layouts.ODOMETRY_SPLIT, levels=100),
     object=Layout(layouts.kitti_object, layouts.OBJECT_SPLIT, levels=100),
     nuscenes=Layout(layouts.nuscenes, sensor="hdl32e", reflectance_scale=255.0, levels=255),
+    pandaset=Layout(
+        layouts.pandaset,
+        layouts.PANDASET_SPLIT,
+        sensor="pandar64",
+        reflectance_scale=255.0,
+        levels=255,
+    ),
     folder=Layout(layouts.folder),
 )
 
