@@ -38,26 +38,35 @@ CLASSES = np.array([
 
 
 def read_frame(path: Path) -> Table:
-    """x, y, z and intensity (0 to 255) of the points of the Pandar64 (`d == 0`).
+    """x, y, z and intensity (0 to 255) of the points of the Pandar64 (`d == 0`)."""
+    table = read_table(path)
+    spinning = column(table, "d") == 0
+    world = np.stack([column(table, axis)[spinning] for axis in "xyz"], axis=1)
+    times = column(table, "t")[spinning].astype(float)
+    strength = column(table, "i")[spinning]
+    return ["x", "y", "z", "i"], [*in_laser(world.astype(float), times, path.parent).T, strength]
+
+
+def in_laser(world: ndarray, times: ndarray, folder: Path) -> ndarray:
+    """Points of the Pandar64 in its own frame, (N, 3), each at its own time.
 
     A point p in the world, measured at time t, is R(t)^T (p - T(t)) in the vehicle, by the poses
     next to t: linear in position, a constant rate in rotation. The laser's frame is fixed in the
     vehicle, `ORIGIN` and `TILT`. Poses ten times a second miss how the vehicle rocks between them,
     up to 0.15 degrees, so `_aligned` corrects the frame by the laser's known elevations.
 
+    Args:
+        times: Seconds, as in timestamps.json, (N,).
+        folder: That of poses.json and timestamps.json.
+
     Raises:
-        InputError: No poses.json and timestamps.json lie beside the frame, or they lack its time.
+        InputError: The files are missing, or lack these times.
     """
-    table = read_table(path)
-    spinning = column(table, "d") == 0
-    world = np.stack([column(table, axis)[spinning] for axis in "xyz"], axis=1)
-    times = column(table, "t")[spinning].astype(float)
-    strength = column(table, "i")[spinning]
     if not len(world):
-        return ["x", "y", "z", "i"], [*world.T, strength]
-    vehicle = _in_vehicle(world.astype(float), times, path.parent)
+        return world
+    vehicle = _in_vehicle(world, times, folder)
     laser = Rotation.from_euler("xyz", [*TILT, 0]).inv().apply(vehicle - ORIGIN)
-    return ["x", "y", "z", "i"], [*(_aligned(laser, times) @ AHEAD.T).T, strength]
+    return _aligned(laser, times) @ AHEAD.T
 
 
 def labels_of(path: Path) -> Path:

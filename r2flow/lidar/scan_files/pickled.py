@@ -70,7 +70,7 @@ def _columns(frame: Any) -> dict[str, ndarray]:
     held = frame.state if _name(frame) == "DataFrame" else None
     if not isinstance(held, dict):
         raise InputError(f"it holds a {_name(frame)}, not a table.")
-    manager = held.get("_mgr", held.get("_data"))
+    manager: Any = held.get("_mgr", held.get("_data"))
     if manager.args:  # pandas 1.3 and later
         blocks, axes = manager.args
         pairs = [block.args[:2] for block in blocks]
