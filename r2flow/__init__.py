@@ -113,7 +113,7 @@ def read(
     without a return.
 
     Args:
-        path: A scan file, a range image (.npy) or a sample of the published R2Flow code (.pth).
+        path: A scan file, a range image (.npy) or a sample of the published code (.pth).
         sensor: Sensor of the image, or its name or YAML file. Default: the sensor in the manifest
             of a folder that r2flow wrote, else the built-in sensor with the file's beams, else
             hdl64e; a range image keeps its size.

@@ -68,9 +68,9 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     z intensity ring. .pcd, .ply, .las, .feather, .parquet: fields x y z and, where present,
     intensity (or reflectance, reflectivity, remission, i) and ring (or channel), of any type.
     .npy: (N, 3) or (N, 4), or named fields. .csv, .xyz, .txt: three or four columns, or columns
-    named in the first line. .pth: the samples of the published R2Flow code. .pkl.gz, .pkl: a frame
-    of PandaSet (`pandaset.read_frame`). LAS, Arrow tables and
-    compressed PCDs need the extra `formats`.
+    named in the first line. .pth: samples of the published R2Flow and R2DM code. .pkl.gz, .pkl: a
+    frame of PandaSet (`pandaset.read_frame`). LAS, Arrow tables and compressed PCDs need the extra
+    `formats`.
 
     Args:
         columns: Names of the columns of a .bin, .npy or text file without names: x, y, z and, where
