@@ -82,27 +82,32 @@ def table(columns: dict[str, np.ndarray], protocol: int = 3) -> bytes:
     return pickled(Call("pandas.core.frame DataFrame", (), {**held, "_typ": "dataframe"}), protocol)
 
 
-def scanned(rocking: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def scanned(rocking: float, ahead: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of a turn of the laser, (N, 3), their times, and the same points in the world.
 
-    The vehicle drives a curve at a constant rate, and rocks by some degrees between its poses.
+    The vehicle drives a curve at a constant rate, and rocks by some degrees between its poses; the
+    laser is mounted some metres further ahead.
     """
-    draws = np.random.default_rng(0)
     azimuth, elevation = np.meshgrid(np.linspace(3, -3.2, 120), np.deg2rad(PANDAR64_CHANNELS))
-    a, e, r = azimuth.ravel(), elevation.ravel(), draws.uniform(4, 60, azimuth.size)
+    a, e = azimuth.ravel(), elevation.ravel()
+    walls = 12 / (np.cos(e) * np.maximum(abs(np.cos(a)) / 3, abs(np.sin(a))))
+    r = np.minimum(walls, 2 / np.sin(np.maximum(-e, 1e-3)))  # a street, 2 m below the laser
+    r[(e < -0.15) & (a > 1)] = 0.8  # the vehicle
     laser = r * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right_ahead_up = np.stack([-laser[1], laser[0], laser[2]], axis=1)
     tilted = Rotation.from_euler("xyz", [0.0157, -0.0006, 0]).apply(right_ahead_up)
     time = (3 - a) / 6.2 * 0.1 + 0.1  # between the second and the third pose
     rock = np.deg2rad(rocking) * np.sin(np.pi * (time - 0.1) / 0.1)[:, None] * [1, 0.5, 0]
-    vehicle = Rotation.from_rotvec(rock).apply(tilted + ORIGIN)
+    vehicle = Rotation.from_rotvec(rock).apply(tilted + ORIGIN + [0, ahead, 0])
     pose = TURN * Rotation.from_rotvec(time[:, None] * RATE)
     return laser.T, STAMPS[0] + time, pose.apply(vehicle) + time[:, None] * SPEED + [40, -7, 3]
 
 
-def write_drive(folder: Path, rocking: float = 0.0, protocol: int = 3) -> np.ndarray:
+def write_drive(
+    folder: Path, rocking: float = 0.0, ahead: float = 0.0, protocol: int = 3
+) -> np.ndarray:
     """One frame, 01.pkl.gz, with labels; returns its points in the laser's frame."""
-    laser, times, world = scanned(rocking)
+    laser, times, world = scanned(rocking, ahead)
     forward = np.arange(len(world)) % 5 == 4  # every 5th point is of the other sensor
     columns = dict(zip("xyz", world.T, strict=True), i=np.arange(len(world)) % 256.0, t=times)
     (folder / "lidar").mkdir(parents=True)
@@ -131,8 +136,11 @@ def test_points_are_those_that_the_laser_measured(tmp_path: Path, protocol: int)
     assert points.reflectance.max() == 255
 
 
-def test_rocking_between_the_poses_is_corrected_by_the_beams(tmp_path: Path):
-    laser = write_drive(tmp_path / "002", rocking=0.2)
+@pytest.mark.parametrize(("rocking", "ahead"), [(0.2, 0.0), (0.0, 0.15)])
+def test_a_rocking_vehicle_or_another_mount_is_corrected_by_the_beams(
+    tmp_path: Path, rocking: float, ahead: float
+):
+    laser = write_drive(tmp_path / "002", rocking, ahead)
     xyz = read_points(tmp_path / "002/lidar/01.pkl.gz").xyz
     off = [np.degrees(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))) for p in (xyz, laser)]
     assert np.quantile(abs(off[0] - off[1]), 0.95) < 0.01
