@@ -18,6 +18,7 @@ from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.scan_files.pickled import MOST_STEPS, read_table
 from r2flow.lidar.sensors import PANDAR64_CHANNELS, SENSORS
+from r2flow.reports.view.panels import list_scans
 from tests.conftest import refused
 
 STAMPS = 1_557_539_956.5 + np.arange(4) / 10
@@ -153,6 +154,8 @@ def test_drives_splits_and_labels(tmp_path: Path):
     assert [drive.name for drive in find_drives("pandaset", tmp_path, "train")] == ["002"]
     assert [drive.name for drive in find_drives("pandaset", tmp_path, "test")] == ["115"]
     assert [drive.name for drive in find_drives("pandaset", tmp_path / "002")] == ["002"]
+    paths = [tmp_path / name / "lidar/01.pkl.gz" for name in ("002", "115")]
+    assert list_scans(Path(f"pandaset:{tmp_path}"), 8) == (paths, 2)
     scans = open_scans(f"pandaset:{tmp_path}")
     image = scans.source[0]
     assert image.shape == (2, 64, 1024)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy import ndarray
 
-from r2flow.data.opening import describe, find_drives, open_scans
+from r2flow.data.opening import SOURCES, describe, find_drives, open_scans
 from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import Reading, estimated_scale, read_labelled_scan
 from r2flow.data.sets import ScanSet
@@ -31,10 +31,17 @@ from r2flow.simulator import simulate
 
 
 def list_scans(path: Path, most: int) -> tuple[list[Path], int]:
-    """A scan file, or up to `most` scans of a folder, evenly spread; and the number of all."""
-    if not path.is_dir():
+    """A scan file, or up to `most` scans of a folder or `NAME:FOLDER`, evenly spread; and the
+    number of all.
+    """
+    name, _, root = str(path).partition(":")
+    if name in SOURCES and not path.exists():
+        drives = find_drives(name, root)
+    elif path.is_dir():
+        drives = find_drives(FOLDER, path)
+    else:
         return [path], 1
-    paths = [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
+    paths = [Path(scan) for drive in drives for scan in drive.scans]
     return [paths[index] for index in spread(len(paths), most)], len(paths)
 
 
