@@ -18,17 +18,17 @@ from r2flow.lidar.scan_files.pickled import column, read_table
 from r2flow.lidar.sensors import PANDAR64_CHANNELS
 
 # The laser in the vehicle's frame (x right, y ahead, z up): metres, and radians about x and y.
-# Medians of the fits (`_aligned`) of 20 frames of drive 002: 18 agree to 3 mm, all to 11 mm.
+# Medians of fits to 20 frames of drive 002, with one position each: 18 agree to 3 mm, all to 11.
 ORIGIN = (0.0, 0.781, 1.860)
 TILT = (0.0157, -0.0006)
 AHEAD = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # from the vehicle's axes to r2flow's
 
-KNOTS = 5  # times of a frame at which the vehicle's tilt is fitted
+KNOTS = 5  # times of a frame at which the vehicle's pose is corrected
 VEHICLE = 3.0  # metres: nearer points are its own, whose elevations a small shift changes most
 FITTED = 8000  # points, evenly spread over the frame
 SCALES = np.radians(np.geomspace(1, 0.005, 8))  # of the residual, from coarse to fine
 # Standard deviations of what is fitted: tilts, and the laser's position in metres.
-PRIOR = np.array([np.radians(1)] * 2 * KNOTS + [0.3] * 3)
+PRIOR = np.repeat([np.radians(1), np.radians(1), 0.3, 0.3, 0.3], KNOTS)
 
 # SemanticKITTI's ids of PandaSet's classes 0 to 42: smoke, exhaust, rain and reflections are
 # outliers; pickups are trucks and driveways sidewalk, as SemanticKITTI defines them.
@@ -54,7 +54,8 @@ def in_laser(world: ndarray, times: ndarray, folder: Path) -> ndarray:
     A point p in the world, measured at time t, is R(t)^T (p - T(t)) in the vehicle, by the poses
     next to t: linear in position, a constant rate in rotation. The laser's frame is fixed in the
     vehicle, `ORIGIN` and `TILT`. Poses ten times a second miss how the vehicle rocks between them,
-    up to 0.15 degrees, so `_aligned` corrects the frame by the laser's known elevations.
+    up to 0.15 degrees and some millimetres, so `_aligned` corrects them by the laser's known
+    elevations.
 
     Args:
         times: Seconds, as in timestamps.json, (N,).
@@ -112,8 +113,8 @@ def _json(path: Path) -> Any:
 def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
     """Points in the laser's frame, so corrected that their elevations are those of the Pandar64.
 
-    The vehicle's tilt at `KNOTS` times, linear between them, and a constant shift of the laser are
-    fitted to the points around the vehicle by iterated least squares. A residual r is the elevation
+    The vehicle's tilt and the laser's position at `KNOTS` times, linear between them, are fitted to
+    the points around the vehicle by iterated least squares. A residual r is the elevation
     of the nearest beam of the maker's table less the point's; it weighs 1 / (1 + (r / s)^2), with s
     from 1 to 0.005 degrees. Beams that are less than 2 s apart, which could be mistaken for each
     other, wait for a smaller s.
@@ -136,10 +137,8 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
         residual = beams[beam] - elevation
         weight = (apart[beam] > 2 * scale) / (1 + (residual / scale) ** 2)
         cos, sin, square = x / level, y / level, level**2 + z**2
-        slopes = np.column_stack([
-            sin[:, None] * near[chosen], -cos[:, None] * near[chosen],
-            z * cos / square, z * sin / square, -level / square,
-        ])  # fmt: skip
+        each = [sin, -cos, z * cos / square, z * sin / square, -level / square]
+        slopes = np.hstack([slope[:, None] * near[chosen] for slope in each])
         weighted = slopes.T * weight
         prior = (scale / PRIOR) ** 2
         fitted += np.linalg.solve(
@@ -149,6 +148,7 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
 
 
 def _moved(xyz: ndarray, near: ndarray, fitted: ndarray) -> ndarray:
-    tilts = near @ fitted[: 2 * KNOTS].reshape(2, KNOTS).T  # about x and y
+    """Points after a shift and a turn by the tilts of their times."""
+    tilts, shifts = np.split(near @ fitted.reshape(5, KNOTS).T, [2], axis=1)
     turn = Rotation.from_rotvec(np.pad(tilts, ((0, 0), (0, 1))))
-    return turn.apply(xyz - fitted[2 * KNOTS :])
+    return turn.apply(xyz - shifts)
