@@ -12,6 +12,7 @@ from r2flow.lidar.encoding import ModelSpace
 FEATURES = 31  # of `Surroundings`
 ROW = 8  # size of the vector learned for each row
 STEEP = 3.0  # gain of the elevation that follows it
+_FEW = 128  # rows that are searched one after the other
 _SAME = 2e-4  # radians: tolerance for rows of the same elevation
 # Mean reflectance of returns, of simulated scans, to which scans of other sensors are scaled.
 _REFLECTANCE = 0.265
@@ -201,31 +202,57 @@ def nearest_returns(returned: Tensor, steps: Tensor, ring: bool) -> Tensor:
         steps: See `Surroundings.of`.
         ring: Whether the columns are a full turn.
     """
-    twice = steps.repeat(2, 1).mT[..., None]  # (2, 2 B, 1)
-    above, below = _before(torch.cat([returned, returned.flip(1)]), twice, ring).chunk(2, 1)
-    level = torch.cat([returned, returned.flip(2)]).mT
-    turn = level.shape[1]
-    if ring:  # two turns: the last columns precede the first
-        level = torch.cat([level, level], dim=1)
-    left, right = _before(level, twice.flip(0), False)[:, :, -turn:].mT.flip(0).chunk(2, 1)
+    twice = steps.repeat(2, 1).mT[..., None, None]  # (2, 2 B, 1, 1)
+    pairs = torch.cat([returned, returned.flip(1)])
+    above, below = _before(pairs, twice, turning=False, ring=ring).chunk(2, 1)
+    pairs = torch.cat([returned, returned.flip(2)]).mT
+    left, right = _before(pairs, twice.flip(0), turning=ring, ring=False).mT.flip(0).chunk(2, 1)
     upward = steps.new_tensor([-1, 1])[:, None, None, None]  # the opposite direction of rows
     return torch.stack([above, below.flip(2) * upward, left, right.flip(3) * -upward])
 
 
-def _before(returned: Tensor, steps: Tensor, ring: bool) -> Tensor:
-    """Offsets to the nearest return in the quadrant of previous rows, (2, B, H, W), row by row."""
-    batch, rows, columns = returned.shape
-    device = returned.device
-    missing = torch.full((2, batch, columns), math.inf, device=device)
-    moves = torch.tensor([[-1.0, -1.0], [-1.0, 0.0], [-1.0, 1.0]], device=device)
-    offsets = [missing]
-    state = torch.where(returned[:, 0], 0.0, missing)
-    for row in range(1, rows):
-        ends = state if ring else missing
-        wide = torch.cat([ends[..., -1:], state, ends[..., :1]], -1)
-        candidates = wide.unfold(-1, columns, 1).permute(2, 0, 1, 3) + moves[..., None, None]
-        best = (candidates * steps).square().sum(1).argmin(0)
-        nearest = candidates.gather(0, best.expand(1, 2, *best.shape))[0]
-        offsets.append(nearest)
-        state = torch.where(returned[:, row], 0.0, nearest)
-    return torch.stack(offsets, dim=2)
+def _before(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tensor:
+    """Offsets to the nearest return in the quadrant of previous rows, (2, B, H, W).
+
+    The rows are searched in blocks side by side. Each block begins again from what the previous one
+    found, until nothing changes: two or three times on scans, instead of one after the other.
+
+    Args:
+        turning: Whether the first row follows the last.
+        ring: Whether the first column follows the last.
+    """
+    rows = returned.shape[1]
+    blocks = max(n for n in range(1, math.isqrt(rows) + 1) if rows % n == 0) if rows > _FEW else 1
+    parts = returned.unflatten(1, (blocks, -1)).unbind(2)
+    missing = steps.new_full((2, *parts[0].shape), math.inf)
+    start = missing
+    for _ in range(2 * blocks):  # at most two turns
+        state = start
+        offsets = []
+        for own in parts:
+            offsets.append(state)
+            state = _next(torch.where(own, 0.0, state), steps, ring, missing[..., :1])
+        end = state.roll(1, 2)
+        if not turning:
+            end[:, :, 0] = math.inf
+        if torch.equal(end, start):
+            break
+        start = end
+    return torch.stack(offsets, 3).flatten(2, 3)
+
+
+def _next(state: Tensor, steps: Tensor, ring: bool, missing: Tensor) -> Tensor:
+    """Offsets of a row, (2, ..., W), from those of the previous row."""
+    columns = state.shape[-1]
+    ends = (state[..., -1:], state[..., :1]) if ring else (missing, missing)
+    down, across = torch.cat([ends[0], state, ends[1]], -1).unbind()
+    down = down - 1
+    height = (down * steps[0]).square()
+    best = None
+    for first, move in enumerate((-1, 0, 1)):
+        part = slice(first, first + columns)
+        aside = across[..., part] + move
+        square = height[..., part] + (aside * steps[1]).square()
+        one = torch.stack([square, down[..., part], aside])
+        best = one if best is None else torch.where(square < best[0], one, best)
+    return best[1:]
