@@ -1,6 +1,7 @@
 """Candidates and features for every ray, from the nearest measured returns."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -60,20 +61,20 @@ class Surroundings(NamedTuple):
         offsets = nearest_returns(returned[:, 0], steps, ring).transpose(0, 2)  # (B, 2, 4, H, W)
         near = offsets[:, 0].isfinite()
         down, across = torch.where(near[:, None], offsets, 0).unbind(1)
-        ranges = _moved(log_r, down, across) * near
-        strengths = _moved(strength, down, across) * near
+        ranges, strengths = _moved(torch.stack([log_r, strength]), down, across) * near
         candidates = [
             torch.stack([ranges, strengths]),
             _between(ranges[:, :2], strengths[:, :2], down.abs()[:, :2]),
             _between(ranges[:, 2:], strengths[:, 2:], across.abs()[:, 2:]),
         ]
-        ranges, strengths = torch.cat(candidates, 2)
+        both = torch.cat(candidates, 2)
         present = torch.cat([near, near.unflatten(1, (2, 2)).all(2)], 1)
-        best = (present.roll(2, 1).int().argmax(1, keepdim=True) + 4) % 6
-        any_present = present.any(1, keepdim=True)
-        guess = torch.where(any_present, ranges.gather(1, best), math.log(10))
+        any_present = near.any(1, keepdim=True)
+        nothing = both.new_tensor([math.log(10), 0])[:, None, None, None, None]
+        guess, mean = first_present(both, present, (4, 5, 0, 1, 2, 3), nothing)
+        ranges, strengths = both
         metres = guess.exp().clamp(space.sensor.min_range, space.sensor.max_range)
-        start = encoded(space, metres, strengths.gather(1, best) * any_present)
+        start = encoded(space, metres, mean)
         relative = ((ranges - guess) * present).clamp(-3, 3)
         features = [
             near,
@@ -172,12 +173,23 @@ def within_reach(known: Tensor) -> Tensor:
     return reach[:, None, :, None]
 
 
+def first_present(values: Tensor, present: Tensor, order: Sequence[int], default: Tensor) -> Tensor:
+    """The first candidate in an order that is present, (..., B, 1, H, W), else `default`.
+
+    Values are (..., B, N, H, W), `present` is (B, N, H, W).
+    """
+    for k in reversed(order):
+        default = torch.where(present[:, k : k + 1], values[..., k : k + 1, :, :], default)
+    return default
+
+
 def _moved(values: Tensor, down: Tensor, across: Tensor) -> Tensor:
-    """Values of an image (B, 1, H, W) at offsets in rows and columns, (B, N, H, W)."""
-    rows, columns = values.shape[2:]
+    """Values of images (2, B, 1, H, W) at offsets in rows and columns, (2, B, N, H, W)."""
+    rows, columns = values.shape[3:]
     row = torch.arange(rows, device=values.device)[:, None] + down.long()
     column = (torch.arange(columns, device=values.device) + across.long()) % columns
-    return values.flatten(1).gather(1, (row * columns + column).flatten(1)).view_as(down)
+    pixel = (row * columns + column).flatten(1).expand(2, -1, -1)
+    return values.flatten(2).gather(2, pixel).view(2, *down.shape)
 
 
 def _between(log_r: Tensor, strength: Tensor, distance: Tensor) -> Tensor:

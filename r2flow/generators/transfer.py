@@ -25,6 +25,7 @@ from r2flow.generators.surroundings import (
     RowFeatures,
     Surroundings,
     encoded,
+    first_present,
     gain_of,
     scaled,
     steps_of,
@@ -135,7 +136,7 @@ class TransferFlow(Flow):
         near = about.ranges + _SHIFT * shifts[:, :6]
         ranges = torch.cat([near, about.guess + _FREE * shifts[:, 6:]], 1)
         scales = (scales - 4).clamp(max=2).exp() + 1e-3
-        nearest = about.strengths.gather(1, about.there.int().argmax(1, keepdim=True))
+        nearest = first_present(about.strengths, about.there, range(4), about.strengths[:, :1])
         strengths = torch.cat([about.strengths, nearest], 1) + correction
         if not self.training:
             strengths = strengths.clamp(0, 1)
