@@ -19,6 +19,7 @@ from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.lidar.transfer import image_through
+from r2flow.model import checkpoint
 from r2flow.noise import generator
 from r2flow.reports import completed
 from r2flow.simulator import simulate
@@ -463,6 +464,18 @@ def test_points_in_memory_are_named_in_a_refusal_and_in_a_warning(run, tmp_path,
         InputError, match="^points in memory: .*, in Python by sensor: .*beams cannot be separated"
     ):
         r2flow.load(run).complete(np.random.default_rng(0).normal(size=(1000, 3)))
+
+
+def test_a_named_sensor_of_points_in_memory_is_found_once_in_a_loop(run, tmp_path, monkeypatch):
+    points, found = sparse_scan(tmp_path / "room.ply"), []
+    see = checkpoint.sight
+    monkeypatch.setattr(checkpoint, "sight", lambda *given: found.append(1) or see(*given))
+    flow = r2flow.load(run)
+    one, other = (flow.complete(points, sensor="vlp16") for _ in range(2))
+    assert torch.equal(one, other)
+    assert len(found) == 1
+    flow.complete(points[::2], sensor="vlp16")  # another number of rays a turn
+    assert len(found) == 2
 
 
 def test_a_wrong_sensor_of_the_scans_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture):

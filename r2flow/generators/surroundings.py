@@ -260,11 +260,11 @@ def _next(state: Tensor, steps: Tensor, ring: bool, missing: Tensor) -> Tensor:
     down, across = torch.cat([ends[0], state, ends[1]], -1).unbind()
     down = down - 1
     height = (down * steps[0]).square()
-    best = None
+    best = state.new_full((3, *state.shape[1:]), math.inf)
     for first, move in enumerate((-1, 0, 1)):
         part = slice(first, first + columns)
         aside = across[..., part] + move
         square = height[..., part] + (aside * steps[1]).square()
         one = torch.stack([square, down[..., part], aside])
-        best = one if best is None else torch.where(square < best[0], one, best)
+        best = torch.where(square < best[0], one, best)
     return best[1:]

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError, warn_odd
+from r2flow.errors import IN_MEMORY, InputError, naming, warn_odd
 from r2flow.files import atomic_write, reading
 from r2flow.lidar.scan_files import clouds, pandaset, samples, tables
 from r2flow.lidar.scan_files.points import (
@@ -113,6 +113,17 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
         points = column_points(names, arrays, raw)
         if stored:
             warn_of_unused(path, names, arrays, points)
+    return _tell_dropped(path, points)
+
+
+def points_in_memory(rows: ndarray) -> Points:
+    """The points of an array (N, 3 or 4): x, y, z and reflectance, as `read_points` of a file."""
+    with naming(IN_MEMORY):
+        points = column_points(tables.usual_names(rows.shape[1], None), [*rows.T])
+    return _tell_dropped(Path(IN_MEMORY), points)
+
+
+def _tell_dropped(path: Path, points: Points) -> Points:
     if points.dropped:
         kind = f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped"
         warn_odd(path, kind, points.dropped)
