@@ -1,9 +1,12 @@
 """Completed scans as files and pictures."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +33,8 @@ from r2flow.reports.outputs import recipe_of
 from r2flow.reports.pictures import contact_sheet, save_figure
 from r2flow.reports.view import Panel, write_viewer
 from r2flow.store import Store, manifest_of
+
+_THREADS = 4  # at most: Python's own work is done by one thread at a time
 
 
 @dataclass(frozen=True)
@@ -71,28 +76,41 @@ def write_completed(
     rays = np.zeros(len(Ray), int)  # of each state, of scans of points
     outside = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
-    with Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches) as bar:
-        for done, number in enumerate(left):
+    bar = Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches)
+
+    def answer(number: int) -> tuple[Partial, Completed]:
+        given = _known_rays(scans[number], job, number)
+        (completed,) = complete(
+            checkpoint,
+            torch.from_numpy(given.image)[None],
+            torch.from_numpy(given.state)[None],
+            job.num,
+            job.seed,
+            sampler=sampler,
+            batch_size=job.batch_size,
+            first=number,
+            precision=job.precision,
+            progress=bar.evaluated,
+        )
+        return given, completed
+
+    def write(number: int, given: Partial, completed: Completed) -> tuple[Partial, Completed]:
+        scan = scans[number]
+        _write(checkpoint, scan, out, files[scan.name], given, completed)
+        return given, completed
+
+    with bar, _threads(checkpoint) as pool:
+        done: Iterable[tuple[Partial, Completed]] = ()
+        if left:
+            first = answer(left[0])  # it shows that the settings are valid
+            store.check()  # commands for other scans add theirs at the same time
+            store.write_manifest(inputs={**manifest_of(out).get("inputs", {}), **inputs})
+            others = pool.map(lambda number: write(number, *answer(number)), left[1:])
+            done = chain([write(left[0], *first)], others)
+        for number, (given, completed) in zip(left, done, strict=True):
             scan = scans[number]
-            given = _known_rays(scan, job, number)
-            (completed,) = complete(
-                checkpoint,
-                torch.from_numpy(given.image)[None],
-                torch.from_numpy(given.state)[None],
-                job.num,
-                job.seed,
-                sampler=sampler,
-                batch_size=job.batch_size,
-                first=number,
-                precision=job.precision,
-                progress=bar.evaluated,
-            )
-            if not done:  # the first answer shows that the settings are valid
-                store.check()  # commands for other scans add theirs at the same time
-                store.write_manifest(inputs={**manifest_of(out).get("inputs", {}), **inputs})
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed)
-            _write(checkpoint, scan, out, files[scan.name], given, completed)
             if not completed.evaluations.any():
                 print(
                     f"{scan.name}: everything is known, so nothing was completed; see --from, "
@@ -101,7 +119,7 @@ def write_completed(
             if not scan.image:
                 rays += np.bincount(given.state.ravel(), minlength=len(Ray))
                 outside += given.points.dropped if given.points else 0
-            bar.set((done + 1) * job.num)
+        bar.set(len(left) * job.num)
     _print_counts(checkpoint, rays, outside)
     skipped = f", {len(scans) - len(left)} there already" if len(left) < len(scans) else ""
     print(f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}{skipped}")
@@ -121,6 +139,21 @@ def _print_counts(checkpoint: Checkpoint, rays: ndarray, outside: int) -> None:
             f"used: the nearest point in each pixel of {rows}x{columns}; {outside:,} outside "
             f"{sensor.min_range:g}-{sensor.max_range:g} m left out"
         )
+
+
+@contextmanager
+def _threads(checkpoint: Checkpoint) -> Iterator[ThreadPoolExecutor]:
+    """Threads that read, complete and write a scan each: on a CPU they share its cores.
+
+    A command that is stopped does not wait for the scans that are left.
+    """
+    cores = torch.get_num_threads()
+    count = min(cores, _THREADS) if checkpoint.generator.device.type == "cpu" else _THREADS
+    pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(cores // count,))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int) -> list[Path]:
