@@ -75,11 +75,13 @@ def write_samples(
     batches = [range(first, min(first + batch_size, num)) for first in range(0, num, batch_size)]
     left = [part for part in batches if part.start < pictures or stale or store.missing(part)]
     evaluations = len(left) * (sampler.evaluations(generator) or 0)
+    taken: list[int] = []  # evaluations of each scan
     with Bar("sampling", sum(map(len, left)), evaluations=evaluations) as bar:
         done = 0
         for numbers in left:
             drawn = draw(generator, numbers, seed, sampler, None, region, precision, bar.evaluated)
             warn_unsolved(drawn.converged, numbers.start)
+            taken += drawn.evaluations.tolist()
             while stale:  # the first scan shows that the settings are valid
                 stale.pop().unlink()
             if not (done and store.check()):  # `begin` lists the folder
@@ -90,6 +92,13 @@ def write_samples(
                     shown.append(image)
             done += len(numbers)
             bar.set(done)
+    if taken and not evaluations:  # an adaptive sampler's differ
+        each = ", ".join(map(str, taken[:16]))
+        more = ", ..." if len(taken) > 16 else ""
+        mean = sum(taken) / len(taken)
+        print(
+            f"evaluations of each scan: {each}{more}; {min(taken)} to {max(taken)}, mean {mean:.0f}"
+        )
     if region is not None:
         shown = [region.crop(torch.from_numpy(image)).numpy() for image in shown]
         rays = region.crop(rays)

@@ -38,7 +38,7 @@ from r2flow.reports.savings import savings_text
 from r2flow.reports.tables import Row, shown, table
 
 USUAL = ("euler", "midpoint", "adams3", "dopri5")  # measured first
-METHODS = (*USUAL, *(name for name in SOLVERS if name not in USUAL), f"{TORCHDIFFEQ}dopri5")
+METHODS = (*dict.fromkeys((*USUAL, "exprb43", *SOLVERS)), f"{TORCHDIFFEQ}dopri5")
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of adaptive methods
 _REPEATS = 5  # maximum timed solutions per scan
 _PATIENCE = 0.5  # seconds after which timing stops
@@ -277,7 +277,7 @@ def solvers_page(
             lines.append([name, *cells])
         text += [
             "## Exact problems",
-            f"{rows[0]['scans']} scans each, in float64: the most accurate solver within a number "
+            f"{next(iter(groups.values()))[0]['scans']} scans each, in float64: the most accurate solver within a number "
             "of evaluations and "
             "its median RMS error; none if x_0 has a smaller error.",
             table(lines, ["problem", *(f"within {budget}" for budget in budgets)]),
