@@ -95,10 +95,7 @@ def write_samples(
     if taken and not evaluations:  # an adaptive sampler's differ
         each = ", ".join(map(str, taken[:16]))
         more = ", ..." if len(taken) > 16 else ""
-        mean = sum(taken) / len(taken)
-        print(
-            f"evaluations of each scan: {each}{more}; {min(taken)} to {max(taken)}, mean {mean:.0f}"
-        )
+        print(f"evaluations of each scan: {each}{more}; mean {sum(taken) / len(taken):.1f}")
     if region is not None:
         shown = [region.crop(torch.from_numpy(image)).numpy() for image in shown]
         rays = region.crop(rays)

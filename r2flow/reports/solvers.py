@@ -271,15 +271,15 @@ def solvers_page(
         figures["solvers"] = lines_figure(plots, 2)
     if groups:
         lines = []
+        scans = next(iter(groups.values()))[0]["scans"]
         for name, group in groups.items():
             best = [best_within(group, budget) for budget in budgets]
             cells = [f"{row['method']} {shown(reached(row))}" if row else "none" for row in best]
             lines.append([name, *cells])
         text += [
             "## Exact problems",
-            f"{next(iter(groups.values()))[0]['scans']} scans each, in float64: the most accurate solver within a number "
-            "of evaluations and "
-            "its median RMS error; none if x_0 has a smaller error.",
+            f"{scans} scans each, in float64: the most accurate solver within a number of "
+            "evaluations and its median RMS error; none if x_0 has a smaller error.",
             table(lines, ["problem", *(f"within {budget}" for budget in budgets)]),
         ]
         plots = [_plot(name, group, "evaluations", "error") for name, group in groups.items()]

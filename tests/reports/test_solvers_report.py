@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -124,6 +125,25 @@ def test_a_saving_is_what_a_flow_leaves_out():
     assert common["evaluations"] == early["whole_evaluations"]
     assert channel["seconds_share"] == 1
     assert savings_text([]) == []
+
+
+def test_an_adaptive_sampler_says_what_each_scan_took(r2flow, saved, tmp_path):
+    options = [
+        "--sampler",
+        "dopri5",
+        "--tolerance",
+        "0.5",
+        "--num",
+        "2",
+        "--pictures",
+        "0",
+        "--format",
+        "npy",
+        "--out",
+    ]
+    said = r2flow("sample", saved[0], *options, tmp_path).said
+    each, mean = re.search(r"evaluations of each scan: (.*); mean (.*)\n", said).groups()
+    assert float(mean) == np.mean([int(count) for count in each.split(", ")]) >= 6
 
 
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog):
