@@ -123,10 +123,9 @@ class TransferFlow(Flow):
         output = self.backbone(t, inputs).float()
         correction = output[:, -1:]
         if self.foreign:
-            raised = inputs.clone()
             # The elevation, among the last inputs.
-            raised[:, ROW - RowFeatures.FEATURES] += STEEP * _RAISED
-            output[:, -2] = self.backbone(t, raised).float()[:, -2]
+            inputs[:, ROW - RowFeatures.FEATURES] += STEEP * _RAISED
+            output[:, -2] = self.backbone(t, inputs).float()[:, -2]
             correction = correction * _FOREIGN
         logits, shifts, scales = output[:, :-2].chunk(3, 1)
         # The interpolations are likelier at first.
