@@ -418,14 +418,14 @@ def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_pa
 
 def test_densify_keeps_all_beams_by_default(complete, tmp_path):
     """The model's own view, from +3 to -25 degrees, has 10 of a VLP-16's 16 beams."""
-    xyz = sparse_scan(tmp_path / "room.pcd", steps=200)
+    sparse_scan(tmp_path / "room.pcd", steps=200)
     said = complete(tmp_path / "room.pcd", model=None).said
     assert "16 of the 64 rows of mine are measured" in said
     assert "in their own view, as 64x1024, which keeps all their beams" in said
-    assert f"measured points used: {len(xyz):,}" in said
     answer = read_points(tmp_path / "out" / "room.pcd").xyz
     elevation = np.degrees(np.arcsin(answer[:, 2] / np.linalg.norm(answer, axis=1)))
     assert elevation.max() > 14
+    assert elevation.min() < -14
 
 
 def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_path):
