@@ -20,6 +20,9 @@ from r2flow.errors import InputError
 
 T = TypeVar("T")
 
+Options = Mapping[str, Any]  # of a config, by key
+Config = dict[str, Any]  # a config, or a part of one
+
 MISSING = "???"  # OmegaConf's mandatory value
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 

@@ -30,7 +30,7 @@ from r2flow.model.sampling import draw
 from r2flow.noise import seed_torch
 from r2flow.plugins import loaded_plugins
 from r2flow.processes import average_gradients
-from r2flow.registry import Natural, NonNegative, Portion, Seed
+from r2flow.registry import Natural, NonNegative, Options, Portion, Seed
 from r2flow.samplers import build_sampler
 from r2flow.stages.muon import Muon
 
