@@ -15,7 +15,6 @@ from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
-from r2flow.config import Config, Options
 from r2flow.errors import InputError
 
 T = TypeVar("T")

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.backbones import BACKBONES
-from r2flow.config import Config, Options
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
@@ -16,7 +15,7 @@ from r2flow.lidar.sensors import sensor_options
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.saving import weights_hash
 from r2flow.models import name_of
-from r2flow.registry import options_of
+from r2flow.registry import Config, Options, options_of
 
 # The default of each group, and the function that completes its options.
 _GROUPS: dict[str, tuple[str, Callable[[Any], Config]]] = {

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from r2flow.config import Config, Options
-from r2flow.registry import Registry, lazy
+from r2flow.registry import Config, Options, Registry, lazy
 
 BACKBONE = "backbone."  # prefix of a flow's network in the generator
 

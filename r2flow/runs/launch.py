@@ -22,9 +22,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from r2flow.config import Config, Options, key_of, override
+from r2flow.config import key_of, override
 from r2flow.errors import InputError
 from r2flow.plugins import load_plugins
+from r2flow.registry import Config, Options
 from r2flow.runs.composing import (
     CONF,
     WRONG,

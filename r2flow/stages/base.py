@@ -13,7 +13,6 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from r2flow.config import Config, Options
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import ItemFormat
 from r2flow.errors import InputError, naming
@@ -30,7 +29,7 @@ from r2flow.model.sampling import draw
 from r2flow.noise import seed_torch
 from r2flow.plugins import loaded_plugins
 from r2flow.processes import average_gradients
-from r2flow.registry import Natural, NonNegative, Options, Portion, Seed
+from r2flow.registry import Config, Natural, NonNegative, Options, Portion, Seed
 from r2flow.samplers import build_sampler
 from r2flow.stages.muon import Muon
 
