@@ -231,15 +231,16 @@ def _images(
 
 
 def _seeing_all(source: Sensor, target: Sensor) -> Sensor | None:
-    """A sensor with at least the target's rows and with its columns and ranges that sees all beams
-    of the source; None if the target does.
+    """A sensor with at least the target's rows and with its columns that sees all beams of the
+    source, and as near; None if the target sees all beams.
     """
     if (rows_of(source.elevations, target) >= 0).all():
         return None
     beams = len(source.elevations)
     rows = max(target.shape[0], math.ceil(beams / 16) * 16)  # networks halve them four times
     sensor = source.resized(rows, target.columns)
-    return replace(sensor, min_range=target.min_range, max_range=target.max_range)
+    near = min(source.min_range, target.min_range)
+    return replace(sensor, min_range=near, max_range=target.max_range)
 
 
 def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -> list[str]:

@@ -167,7 +167,7 @@ class LearnAutoencoder(Stage):
         self.log("train/codebook", codebook, sync_dist=True)
         self.log("train/discriminator", judged, sync_dist=True)
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+    def validation_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         x = batch["x_1"]
         made, _ = self.autoencoder(x)
         loss = _reconstruction_loss(x, made, self._mask_of(x), self.mask_factor)
