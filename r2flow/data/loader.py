@@ -1,6 +1,7 @@
 """The images of a run as resumable batches, also of mixtures of data sets."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -35,6 +36,7 @@ class ItemFormat(NamedTuple):
     smallest: tuple[int, int] = (1, 1)  # rows and columns that `further` needs
 
 
+@dataclass(eq=False)
 class FlowDataset(Dataset[Item]):
     """Image k of a run as a training item.
 
@@ -50,22 +52,16 @@ class FlowDataset(Dataset[Item]):
     A mixture has a sensor per part; images of several sizes need a `further` that crops them.
     """
 
-    def __init__(
-        self,
-        source: ScanSource,
-        item_format: ItemFormat,
-        seed: int,
-        purpose: str,
-        augment: Augmentation | None = None,
-        sensors: Sequence[Sensor] = (),
-    ) -> None:
-        self.source = source
-        self.format = item_format
-        self.seed = seed
-        self.purpose = purpose
-        self.augment = augment
-        encoding = item_format.encoding
-        self.encodings = [encoding.through(sensor) for sensor in sensors] or [encoding]
+    source: ScanSource
+    format: ItemFormat
+    seed: int
+    purpose: str
+    augment: Augmentation | None = None
+    sensors: Sequence[Sensor] = ()
+
+    def __post_init__(self) -> None:
+        encoding = self.format.encoding
+        self.encodings = [encoding.through(sensor) for sensor in self.sensors] or [encoding]
 
     def __len__(self) -> int:
         return len(self.source)
@@ -77,11 +73,12 @@ class FlowDataset(Dataset[Item]):
         u = torch.tensor(draw.random(dtype=np.float32))
         encoding = self.encodings[self.source.locate(index)[0]]
         image = self.source[index][: encoding.channels]
-        if image.shape != encoding.shape:
-            raise InputError(
-                f"{self.source.names[index]}: an image of {encoding.shape}, found {image.shape}."
-            )
-        if wrong := wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range)):
+        if image.shape == encoding.shape:
+            far = max(FAR, encoding.sensor.max_range)
+            wrong = wrong_with(torch.from_numpy(image), far)
+        else:
+            wrong = f"an image of {encoding.shape}, found {image.shape}"
+        if wrong:
             raise InputError(f"{self.source.names[index]}: {wrong}.")
         if self.augment:
             image = self.augment(image, self.seed, k)
@@ -122,6 +119,7 @@ class Permutations:
         return int(self.order[turn])
 
 
+@dataclass(eq=False)
 class RunSampler(DistributedSampler[Key]):
     """The images of one rank in an epoch of a run, or a validation, as (k, scan).
 
@@ -136,19 +134,11 @@ class RunSampler(DistributedSampler[Key]):
             a resumed run skips.
     """
 
-    def __init__(
-        self,
-        order: Order,
-        images: int,
-        rank: int = 0,
-        ranks: int = 1,
-        place: Callable[[], tuple[int, int]] = lambda: (0, 0),
-    ) -> None:
-        self.order = order
-        self.images = images
-        self.rank = rank
-        self.ranks = ranks
-        self.place = place
+    order: Order
+    images: int
+    rank: int = 0
+    ranks: int = 1
+    place: Callable[[], tuple[int, int]] = lambda: (0, 0)
 
     def __len__(self) -> int:
         return self.images // self.ranks
@@ -158,16 +148,13 @@ class RunSampler(DistributedSampler[Key]):
         for k in range(first + self.rank, first + self.images - done, self.ranks):
             yield k, self.order[k]
 
-    def set_epoch(self, epoch: int) -> None:
-        """Do nothing: the position in the run is that of the trainer."""
-
 
 class Mixture(ScanSource):
     """Concatenated sources."""
 
     def __init__(self, parts: Sequence[ScanSource]) -> None:
         self.parts = list(parts)
-        self.starts = np.cumsum([0, *(len(part) for part in parts)])
+        self.starts = np.cumsum([0, *map(len, parts)])
 
     @property
     def names(self) -> list[str]:

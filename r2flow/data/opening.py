@@ -315,7 +315,7 @@ def open_scans(
     if reading.reflectance == AUTO:
         lacking = lacks_reflectance([scans.file], reading.on_bad_scan, reading.columns)
         reading = replace(reading, reflectance=lacking is None)
-    source = ScanFiles([scans.file], reading, scans.file.parent, about={"kind": "file"})
+    source = ScanFiles([scans.file], reading, scans.file.parent, described={"kind": "file"})
     return ScanSet(scans.label, source, reading.sensor)
 
 

@@ -10,7 +10,8 @@ import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -118,18 +119,11 @@ def made_here(root: str | Path) -> bool:
     folder = given.parent if given.is_file() else given
     if not folder.is_dir() or manifest_of(folder):
         return folder.is_dir()
-    with os.scandir(
-        folder
-    ) as entries:  # knows folders without a system call per file; fails at a loop of links
-        listed = [
-            e
-            for e in entries
-            if scan_ending(e.name) or (os.path.isdir(e) if e.is_symlink() else e.is_dir())
-        ]
-    shown = (
-        e for e in listed if not e.name.startswith(".")
-    )  # not a disk's .Trash-1000, nor its lost+found
-    below = [e.path for e in shown if scan_ending(e.name) or os.access(e, os.X_OK)]
+    below = [
+        path
+        for path in folder.glob("[!.]*")  # not a disk's .Trash-1000, nor its lost+found
+        if scan_ending(path.name) or (path.is_dir() and os.access(path, os.X_OK))
+    ]
     return bool(below) and all(map(manifest_of, below))
 
 
@@ -211,6 +205,7 @@ def warn_of_other_sensor(
     )  # fmt: skip
 
 
+@dataclass(eq=False)
 class ScanFiles(ScanSource):
     """Scan files of any format and range images, read on access.
 
@@ -222,17 +217,12 @@ class ScanFiles(ScanSource):
 
     slow = True
 
-    def __init__(
-        self,
-        paths: Sequence[str | Path],
-        reading: Reading,
-        root: str | Path = "",
-        drives: Mapping[str, Sequence[int]] | None = None,
-        about: Mapping[str, Any] | None = None,
-    ) -> None:
-        self.paths, self.reading, self.root = list(paths), reading, root
-        self.drives, self.described = drives or {}, about or {}
-        self.bad: set[int] = set()
+    paths: list[str | Path]
+    reading: Reading
+    root: str | Path = ""
+    drives: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    described: Mapping[str, Any] = field(default_factory=dict)  # part of `about`
+    bad: set[int] = field(default_factory=set, init=False)
 
     @property
     def names(self) -> list[str]:
@@ -240,9 +230,8 @@ class ScanFiles(ScanSource):
         return [str(path).removeprefix(below) for path in self.paths]
 
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
-        return ScanFiles(
-            [self.paths[i] for i in indices], self.reading, self.root, about=self.described
-        )
+        paths = [self.paths[i] for i in indices]
+        return ScanFiles(paths, self.reading, self.root, described=self.described)
 
     def about(self) -> dict[str, Any]:
         return {
@@ -280,12 +269,10 @@ class ScanFiles(ScanSource):
         return hashlib.sha256(json.dumps([stats, hashes]).encode()).hexdigest()
 
     def places(self) -> set[str]:
-        parts = [os.path.split(path) for path in self.paths]
-        real = {
-            folder: os.path.realpath(folder) for folder in {folder for folder, _ in parts}
-        }  # slow on network disks
-        files = (os.path.join(real[folder], name) for folder, name in parts)
-        return {os.path.realpath(file) if os.path.islink(file) else file for file in files}
+        real = cache(os.path.realpath)  # slow on network disks
+        parts = map(os.path.split, self.paths)
+        files = (os.path.join(real(folder), name) for folder, name in parts)
+        return {real(file) if os.path.islink(file) else file for file in files}
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -336,15 +323,18 @@ class MadeScans(ScanSource):
         return part
 
 
+@dataclass(eq=False)
 class SimulatedScans(MadeScans):
     """Simulated scenes of one seed."""
 
-    slow, word, doing = True, "scene", "simulating"
+    slow = True
+    word = "scene"
+    doing = "simulating"
 
-    def __init__(
-        self, sensor: Sensor, seed: int, numbers: Sequence[int], reflectance: bool
-    ) -> None:
-        self.sensor, self.seed, self.numbers, self.reflectance = sensor, seed, numbers, reflectance
+    sensor: Sensor
+    seed: int
+    numbers: Sequence[int]
+    reflectance: bool
 
     def about(self) -> dict[str, Any]:
         return {
@@ -355,12 +345,9 @@ class SimulatedScans(MadeScans):
         }
 
     def identity(self) -> dict[str, Any]:
-        numbers = hashlib.sha256(np.asarray(self.numbers, dtype=np.int64).tobytes()).hexdigest()[
-            :16
-        ]
         return {
             **self.about(),
-            "numbers": numbers,
+            "numbers": checksum([*self.numbers])[:16],
             "simulator": simulator.REVISION,
             "sensor": self.sensor.described(),
         }
