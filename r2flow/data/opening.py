@@ -189,15 +189,10 @@ class Described:
         """Refuse samples or completed scans of another sensor or size."""
         if not self.is_samples or self.stored is None or self.stored.sensor.same_image(sensor):
             return
-        theirs, ours = (
-            f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (self.stored.sensor, sensor)
-        )
         raise InputError(
-            f"{self.options.folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: "
-            "give no other "
-            "--sensor or --size, no scans of another sensor next to them, and for a model of "
-            "another sensor point "
-            "clouds (.ply, .bin)."
+            f"{self.options.folder} holds images of {self.stored.sensor} (in its {MANIFEST}), not "
+            f"of {sensor}: give no other --sensor or --size, no scans of another sensor next to "
+            "them, and for a model of another sensor point clouds (.ply, .bin)."
         )
 
     def refuse_parts(self) -> None:
@@ -358,9 +353,9 @@ def reading_for(
         sensor = _detected(first, reading)
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and not chosen.same_image(model.sensor):
-        expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
         raise InputError(
-            f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out."
+            f"the flow's images are of {model.sensor}, not of {chosen}; leave --sensor and --size "
+            "out."
         )
     reading = replace(reading, sensor=reading.sensor if model else chosen)
     if "reflectance_scale" in given:

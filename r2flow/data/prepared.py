@@ -205,9 +205,8 @@ def refuse_other_images(store: PreparedStore, reading: Reading) -> None:
     if differing := [*differences(*images).values()]:
         stored = store.reading
         raise InputError(
-            f"{store.folder} was prepared for other images (sensor {stored.sensor.name}, "
-            f"{stored.sensor.shape[0]}x{stored.sensor.shape[1]}, {stored.projection}, "
-            f"{stored.convention}): "
+            f"{store.folder} was prepared for other images (sensor {stored.sensor}, "
+            f"{stored.projection}, {stored.convention}): "
             f"{at_most_three(differing)}. Give the run the same, or prepare the scans for it."
         )
 

@@ -152,9 +152,9 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Do
                 or theirs.shape[0] < sensor.shape[0]
             )
             if differs and not theirs.resized(*sensor.shape).same_image(sensor):
-                seen = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}"
                 known = theirs.name in SENSORS
-                return Doubt(seen, theirs.name if known else None, sure=known)
+                name = theirs.name if known else None
+                return Doubt(f"{MANIFEST} names {theirs}", name, sure=known)
         return None
     scans = [
         *readable([paths[number] for number in spread(len(paths), LOOKED_AT)], reading.columns)

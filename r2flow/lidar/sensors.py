@@ -75,6 +75,10 @@ class Sensor:
         """Image size (H, W)."""
         return len(self.elevations), self.columns
 
+    def __str__(self) -> str:
+        """Name and image size, as in messages."""
+        return f"{self.name} {len(self.elevations)}x{self.columns}"
+
     def same_image(self, other: "Sensor") -> bool:
         """Whether images of both have the same size, and elevations within 0.001 degrees."""
         return self.shape == other.shape and np.allclose(
