@@ -16,10 +16,8 @@ from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import (
     Bound,
     Registry,
-    UnknownName,
     check_options,
     construct,
-    did_you_mean,
     options_of,
     presets,
 )
@@ -138,9 +136,8 @@ class Encoding:
 
     def described(self) -> dict[str, Any]:
         """All options but the sensor, as plain values."""
-        name = FORMATS.name_of(type(self.format))
         return {
-            "format": name,
+            "format": FORMATS.name_of(type(self.format)),
             "reflectance": self.reflectance,
             "limits": self.limits,
             "levels": self.levels,
@@ -275,20 +272,15 @@ def encoding_options(encoding: Encoding | str | Mapping[str, Any]) -> dict[str, 
     """
     if isinstance(encoding, Encoding):
         return encoding.described()
-    if not isinstance(encoding, str):
-        return {**options_of(Encoding, given=1), **encoding}
-    known = presets("encoding")
-    if encoding not in known:
-        hint = did_you_mean(encoding, known)
-        raise UnknownName(
-            f"no encoding named {encoding!r}; known: {', '.join(sorted(known))}.{hint}"
-        )
-    return {**options_of(Encoding, given=1), **known[encoding]}
+    if isinstance(encoding, str):
+        if encoding not in presets("encoding"):
+            Registry("encoding")[encoding]  # not known
+        encoding = presets("encoding")[encoding]
+    return {**options_of(Encoding, given=1), **encoding}
 
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:
     """The model space of a config with the keys `sensor` and `encoding`."""
     sensor = construct("sensor", build_sensor, config["sensor"])
-    check_options("encoding", Encoding, config["encoding"], given=1)
-    rays = sensor.rays(config["sensor"].get("rays", "centre"))
-    return ModelSpace(sensor, Encoding(sensor, **config["encoding"]), rays)
+    encoding = construct("encoding", Encoding, config["encoding"], sensor)
+    return ModelSpace(sensor, encoding, sensor.rays(config["sensor"].get("rays", "centre")))

@@ -139,8 +139,7 @@ class Sensor:
             centre = (2 * beam + 1) * rows // (2 * old)
             middle = np.interp(np.arange(rows), centre, [above, *e, below])
         else:
-            share = np.linspace(0, old, rows + 1)
-            edges = np.interp(share, np.arange(old + 1), self.row_edges)
+            edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)
             middle = (edges[:-1] + edges[1:]) / 2
         return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # not one laser each
 
@@ -259,30 +258,22 @@ def build_sensor(
     return replace(sensor.resized(rows, columns, rays), **given)  # type: ignore[arg-type]
 
 
-def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
-    """Read a sensor from a YAML file with the options of `build_sensor`, in a size if given."""
+def read_sensor(path: str | Path) -> Sensor:
+    """Read a sensor from a YAML file with the options of `build_sensor`."""
     with reading(Path(path), 1 << 20, "sensor's YAML"):  # of a dozen lines
         options = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         if not isinstance(options, dict):
             raise InputError("it is not a sensor: give `name: mine`, `elevations: [15.0, ...]`.")
         if options.get("rays", "centre") != "centre":
             raise InputError("rays are a model's: give sensor.rays=reference in training.")
-        if rows is not None:
-            options["rows"] = rows
-        if columns is not None:
-            options["columns"] = columns
         return construct(str(path), build_sensor, options)
 
 
 def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
     """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
-    rows, columns = size or (None, None)
-    if isinstance(sensor, Sensor):
-        return sensor.resized(rows, columns)
-    if str(sensor).lower().endswith(ENDINGS):
-        return read_sensor(sensor, rows, columns)
-    named = build_sensor(**sensor_options(sensor))
-    return named if size is None else named.resized(rows, columns)
+    if not isinstance(sensor, Sensor):
+        sensor = build_sensor(**sensor_options(sensor))
+    return sensor if size is None else sensor.resized(*size)
 
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
@@ -297,8 +288,7 @@ def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
 
 def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
     """The keys of `sensor` in a config: the options of `build_sensor`."""
-    fields = asdict(sensor)
-    options = {key: np.asarray(value).tolist() for key, value in fields.items()}  # no NumPy numbers
+    options = {key: np.asarray(value).tolist() for key, value in asdict(sensor).items()}
     options |= {"rows": None, "rays": "centre"}
     if sensor.name in SENSORS:  # beams by the name
         options |= {"rows": len(sensor.elevations), "elevations": None}
