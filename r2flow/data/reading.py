@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,22 +54,14 @@ class Reading:
 
     def described(self) -> dict[str, Any]:
         """All fields as plain values, for manifests."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)} | {
-            "sensor": self.sensor.described()
-        }
+        values = {**vars(self), "sensor": self.sensor.described()}
         return json.loads(json.dumps(values))  # turns tuples into lists
 
     @classmethod
     def of(cls, described: Mapping[str, Any]) -> "Reading":
         """The reading of a manifest; missing fields have their defaults."""
-        columns = described.get("columns")
-        return cls(
-            **{
-                **described,
-                "sensor": Sensor(**described["sensor"]),
-                "columns": columns and tuple(columns),
-            }
-        )
+        reading = cls(**{**described, "sensor": Sensor(**described["sensor"])})
+        return replace(reading, columns=reading.columns and tuple(reading.columns))
 
     @classmethod
     def stored(cls, folder: str | Path) -> "Reading | None":
@@ -90,22 +82,21 @@ def read_projected(
         points = read_points(path, reading.columns)
         if reading.projection == "unfolding":
             points = points.with_lost_rays()
-        scaled = (
-            scaled_reflectance(path, points, reading.reflectance_scale)
-            if reading.reflectance
-            else None
-        )
+        scaled = []
+        if reading.reflectance:
+            scaled = [scaled_reflectance(path, points, reading.reflectance_scale)]
         with naming(path):
             pixels, chosen, r = project_indices(
                 points.xyz, sensor, reading.projection, reading.convention, points.ring
             )
-        image = scatter(sensor, pixels, [r] if scaled is None else [r, scaled[chosen]])
-        if not image[0].any():
+        if not r.any():
             raise nothing_in_view(path, points, sensor)
+        image = scatter(sensor, pixels, [r, *(channel[chosen] for channel in scaled)])
     except NoPointsError:
         if reading.on_bad_scan != "empty":
             raise
-        points, (pixels, chosen) = Points(np.zeros((0, 3), np.float32)), np.zeros((2, 0), np.int64)
+        points = Points(np.zeros((0, 3), np.float32))
+        pixels = chosen = np.zeros(0, np.int64)
         image = np.zeros((1 + bool(reading.reflectance), *sensor.shape), np.float32)
     return image, points, pixels, chosen
 
@@ -194,13 +185,10 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     if image is None:
         return read_projected(path, reading)[0]
     if image.shape[1:] != reading.sensor.shape:
-        size, expected = (
-            "x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape)
-        )
+        size = "x".join(map(str, image.shape[1:]))
         raise InputError(
-            f"{path} is a range image of {size}, the sensor's is {expected}; give --size {size}, "
-            "or its points "
-            "(.bin, .ply, .pcd), which take any size."
+            f"{path} is a range image of {size}, sensor {reading.sensor}; give --size {size}, or "
+            "its points (.bin, .ply, .pcd), which take any size."
         )
     if len(image) < channels:
         raise _no_reflectance(path)
@@ -210,9 +198,11 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     nearest, farthest = reading.sensor.min_range, reading.sensor.max_range
     seen = (image[0] >= nearest) & (image[0] <= farthest)
     if not seen.any() and reading.on_bad_scan != "empty":
-        r = image[0][image[0] > 0]
-        ranges = f"; its ranges are {r.min():.4g} to {r.max():.4g}, in metres" if r.size else ""
-        raise NoPointsError(f"{path} has no return from {nearest:g} to {farthest:g} m{ranges}.")
+        r = image[0]
+        raise NoPointsError(
+            f"{path} has no return from {nearest:g} to {farthest:g} m; its ranges are up to "
+            f"{r.max():.4g} m."
+        )
     image = np.where(seen, image, np.float32(0))
     highest = image[1:].max(initial=0)
     check(
@@ -262,9 +252,8 @@ def lacks_reflectance(
             else:
                 reflectance = image[1][image[0] > 0] if len(image) > 1 else None
         except InputError as error:
-            if on_bad_scan == "error" or (
-                on_bad_scan == "empty" and not isinstance(error, NoPointsError)
-            ):
+            usable = on_bad_scan == "empty" and isinstance(error, NoPointsError)
+            if on_bad_scan != "skip" and not usable:
                 raise
             continue
         if reflectance is None:

@@ -398,6 +398,15 @@ class InMemory(ScanSource):
         return self.images[index]
 
 
+def drives_within(
+    drives: Mapping[str, Sequence[Any]], chosen: Sequence[Any]
+) -> dict[str, list[int]]:
+    """The places of the chosen scans of each drive that has any, by the names or numbers of all."""
+    place = {scan: index for index, scan in enumerate(chosen)}
+    within = {name: [place[n] for n in scans if n in place] for name, scans in drives.items()}
+    return {name: places for name, places in within.items() if places}
+
+
 def spread(count: int, most: int) -> list[int]:
     """At most `most` numbers of range(count), evenly spread and in order."""
     most = min(most, count)

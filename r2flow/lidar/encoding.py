@@ -16,7 +16,6 @@ from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import (
     Bound,
     Registry,
-    check_options,
     construct,
     options_of,
     presets,

@@ -79,9 +79,8 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     except NoBeamsError as error:
         return Doubt(str(error), None, hopeless=True)
     except InputError:
-        own = np.asarray(whole.elevations)
-        nearest = own[np.searchsorted(-(own[:-1] + own[1:]) / 2, -elevation)]
-        off = np.median(abs(elevation - nearest))
+        nearest = np.searchsorted(-whole.row_edges[1:-1], -elevation)
+        off = np.median(abs(elevation - np.asarray(whole.elevations)[nearest]))
         fits = share >= IN_VIEW and off < MOST_OFF
         return None if fits else Doubt(f"{seen}, {off:.1f} degrees off its beams", None)
     name, near = nearest_sensor(beams)
@@ -93,7 +92,9 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
         most = 1 if built_in else rows // len(beams)
         tables = [(sensor.elevations[n // 2 :: n], n) for n in range(1, most + 1)]
         family = _family(sensor.name)
-        tables += [(SENSORS[other].elevations, 1) for other in SENSORS if _family(other) == family]
+        tables += [
+            (other.elevations, 1) for other in SENSORS.values() if _family(other.name) == family
+        ]
         distance, every = min((_distance(beams, table), n) for table, n in tables)
     if share < IN_VIEW or distance >= OFF or (distance > BEATEN and near < distance / 2):
         ends = f"{beams[0]:+.1f} to {beams[-1]:+.1f} degrees"
@@ -109,8 +110,8 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     void = np.diff(filled) - 1
     if void.sum() - widest <= rows * MOST_VOID or rows > len(whole.elevations):
         return None
-    seen = f"{void.clip(0).sum()} of its {rows} rows lie between their beams and stay empty"
-    return Doubt(seen, None)
+    void = void.clip(0).sum()
+    return Doubt(f"{void} of its {rows} rows lie between their beams and stay empty", None)
 
 
 def is_tilted(scans: Sequence[Points]) -> bool:
