@@ -33,7 +33,7 @@ from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding, encoding_options
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
-from r2flow.registry import check_options, construct
+from r2flow.registry import construct
 from r2flow.signals import init_loader_worker
 
 log = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ class ScanDataModule(L.LightningDataModule):
             options["reflectance"] = lacking is None
         if options["levels"] is None and self.plan.sets:
             options["levels"] = reflectance_levels(self.plan.sets)
-        return Encoding(self.sensor, **check_options("encoding", Encoding, options, given=1))
+        return construct("encoding", Encoding, options, self.sensor)
 
     @property
     def sensors(self) -> list[Sensor]:

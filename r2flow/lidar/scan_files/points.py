@@ -95,13 +95,12 @@ def check_columns(columns: Sequence[str] | None) -> None:
                 f"intensities=reflectance,channel=_; found {','.join(names)[:80]}."
             )
         return
-    for role, aliases in ROLES.items():
-        count = sum(name in aliases for name in names)
-        if count > 1 or (count == 0 and role in "xyz"):
-            raise InputError(
-                "columns must name x, y and z, and intensity and ring at most once, as "
-                f"x,y,z,intensity,_; found {','.join(names)[:80]}."
-            )
+    roles = [role for role in map(role_of, names) if role]
+    if len(set(roles)) < len(roles) or not set("xyz").issubset(roles):
+        raise InputError(
+            "columns must name x, y and z, and intensity and ring at most once, as "
+            f"x,y,z,intensity,_; found {','.join(names)[:80]}."
+        )
 
 
 def renamed(names: Sequence[str], columns: Sequence[str] | None) -> list[str]:
