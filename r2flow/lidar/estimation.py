@@ -128,14 +128,12 @@ def is_tilted(scans: Sequence[Points]) -> bool:
     elevation = 110 + elevations_of(xyz)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     ahead = np.stack([np.cos(azimuth), np.sin(azimuth)])
-    level = tilted = 0.0
+    clear = {}
     for tilt in product(TILTS, TILTS):
         count = np.bincount(((elevation - tilt @ ahead) / 0.05).astype(int))
-        clear = (np.convolve(count, np.ones(5)) ** 2).sum()
-        tilted = max(tilted, clear)
-        if max(map(abs, tilt)) <= LEVEL:
-            level = max(level, clear)
-    return bool(tilted > CLEARER * level)
+        clear[tilt] = (np.convolve(count, np.ones(5)) ** 2).sum()
+    level = max(value for tilt, value in clear.items() if max(map(abs, tilt)) <= LEVEL)
+    return bool(max(clear.values()) > CLEARER * level)
 
 
 def is_unclear(scans: Sequence[Points]) -> bool:
