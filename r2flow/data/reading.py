@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from r2flow.errors import InputError, check, naming, warn_odd
+from r2flow.errors import InputError, naming, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
 from r2flow.lidar.labels import read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
@@ -148,18 +148,20 @@ def scaled_reflectance(
     """
     if points.reflectance is None:
         raise _no_reflectance(path)
+    path = Path(path)
     stored = points.reflectance
     highest = float(stored.max(initial=0))
     seen = stored[stored > 0]
     scale = estimated_scale(path, [points]) if scale is None else scale
-    fractions = len(seen) and np.mean(seen > 1) <= OUTLIERS and (seen % 1).any()
-    if scale in FULL_REFLECTANCE[1:] and fractions:
-        warn_odd(
-            Path(path), f"reflectance is not divided by {scale:g}: its values are fractions of 1"
-        )
-        scale = 1.0
-    if len(seen) and (highest < FAINT * scale or np.median(seen) < DARKEST * scale):
-        warn_odd(Path(path), DARK)
+    if len(seen):
+        fractions = np.mean(seen > 1) <= OUTLIERS and (seen % 1).any()
+        if scale in FULL_REFLECTANCE[1:] and fractions:
+            warn_odd(
+                path, f"reflectance is not divided by {scale:g}: its values are fractions of 1"
+            )
+            scale = 1.0
+        if highest < FAINT * scale or np.median(seen) < DARKEST * scale:
+            warn_odd(path, DARK)
     if strict and stored.min(initial=0) < 0:
         raise InputError(
             f"{path}: reflectance must not be negative, found {stored.min():g}; correct the file."
@@ -174,7 +176,7 @@ def scaled_reflectance(
             f"its part of data.parts, or --reflectance-scale {full:g}."
         )
     if beyond:
-        warn_odd(Path(path), f"reflectance beyond {scale:g} is clipped", beyond)
+        warn_odd(path, f"reflectance beyond {scale:g} is clipped", beyond)
     return (stored / np.float32(scale)).clip(0, 1)
 
 
@@ -195,21 +197,22 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     image = image[:channels]
     if not reading.within_limits:
         return image
-    nearest, farthest = reading.sensor.min_range, reading.sensor.max_range
-    seen = (image[0] >= nearest) & (image[0] <= farthest)
+    r = image[0]
+    nearest = reading.sensor.min_range
+    farthest = reading.sensor.max_range
+    seen = (r >= nearest) & (r <= farthest)
     if not seen.any() and reading.on_bad_scan != "empty":
-        r = image[0]
         raise NoPointsError(
             f"{path} has no return from {nearest:g} to {farthest:g} m; its ranges are up to "
             f"{r.max():.4g} m."
         )
     image = np.where(seen, image, np.float32(0))
     highest = image[1:].max(initial=0)
-    check(
-        highest <= 1 + 1e-3,
-        f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide "
-        "by full reflectance.",
-    )
+    if highest > 1 + 1e-3:
+        raise InputError(
+            f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; "
+            "divide by full reflectance."
+        )
     image[1:] = image[1:].clip(0, 1)
     return image
 

@@ -217,7 +217,7 @@ class ScanFiles(ScanSource):
 
     slow = True
 
-    paths: list[str | Path]
+    paths: Sequence[str | Path]
     reading: Reading
     root: str | Path = ""
     drives: Mapping[str, Sequence[int]] = field(default_factory=dict)
