@@ -125,21 +125,21 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
 
 def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
     assert store.source is not None
-    left_out, codes = list[int](), {name: list[np.ndarray]() for name in store.codes}
+    left_out: list[int] = []
+    images: list[np.ndarray] = []
     for number in store.parts[shard]:
         try:
-            image = store.source[number]
+            images.append(store.source[number])
         except InputError as error:
             if not skip:
                 raise
             log.warning("left out: %s", error)
             left_out.append(number)
-            continue
-        for channel, (name, coder) in zip(image, store.codes.items(), strict=True):
-            codes[name].append(coder.encode(channel))
-    empty = np.empty((0, *store.reading.sensor.shape))
+    shape = len(images), len(store.codes), *store.reading.sensor.shape
+    channels = np.reshape(images, shape).swapaxes(0, 1)
     tensors = {
-        name: np.array(codes[name] or empty, coder.dtype) for name, coder in store.codes.items()
+        name: coder.encode(channel)
+        for channel, (name, coder) in zip(channels, store.codes.items(), strict=True)
     }
     store.write(shard, tensors, {"left_out": left_out, "files": store.sources_of(shard)})
 

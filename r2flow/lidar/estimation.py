@@ -202,9 +202,8 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         )
     beams = find_beams(*scans)
     steps = steps_of_a_turn(scans, beams.of_point)
-    elevations = (beams.elevations.astype(float).round(3) + 0.0).tolist()  # no -0.0
-    for row in range(1, len(elevations)):  # equal after rounding
-        elevations[row] = min(elevations[row], round(elevations[row - 1] - 1e-3, 3))
+    fall = 1e-3 * np.arange(len(beams.elevations))  # of rows that are equal after rounding
+    elevations = np.minimum.accumulate(beams.elevations.astype(float).round(3) + fall) - fall
     r = np.linalg.norm(xyz, axis=1)
     near, middle, far = np.quantile(r, [1e-4, 0.5, 1 - 1e-4])
     if middle > FARTHEST_RAY:
@@ -214,7 +213,7 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
     ground = _height(xyz)
     sensor = Sensor(
         name,
-        tuple(elevations),
+        tuple((elevations.round(3) + 0.0).tolist()),  # no -0.0
         max(int((steps + 0.5) // COLUMNS), 1) * COLUMNS,
         max(math.floor(near * 10) / 10, 0.1),
         float(math.ceil(far)),
