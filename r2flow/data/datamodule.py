@@ -196,8 +196,8 @@ class ScanDataModule(L.LightningDataModule):
             raise InputError(
                 "this stage learns from scans of one sensor: leave sensor out of data.parts."
             )
+        rows, columns = wanted.smallest
         for number, one in enumerate(self.sensors if several else ()):
-            rows, columns = wanted.smallest
             if one.shape[0] < rows or one.shape[1] < columns:
                 raise InputError(
                     f"data.parts[{number}]: crops of {rows}x{columns} need images as large, found "
@@ -275,9 +275,9 @@ class ScanDataModule(L.LightningDataModule):
         """Identity of the data, independent of its path: a run resumes only with the same scans and
         order.
         """
-        texts = (
-            [] if self.pairs is None else [f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"]
-        )
+        texts = []
+        if self.pairs is not None:
+            texts.append(f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}")
         if self.opened:
             known = [*self.names, *(source.contents for source in self.opened)]
             digest = hashlib.sha256(os.fsencode("\n".join(known))).hexdigest()[:12]
@@ -300,10 +300,8 @@ class ScanDataModule(L.LightningDataModule):
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = [*source.parts]
         firsts = {i: part[0] for i, part in enumerate(parts) if part.slow and len(part)}
-        if (
-            sum(4 * len(parts[i]) * first.size for i, first in firsts.items())
-            > self.options.memory_gib * 2**30
-        ):
+        size = sum(len(parts[i]) * first.nbytes for i, first in firsts.items())
+        if size > self.options.memory_gib * 2**30:
             return source
         for i, first in firsts.items():
             parts[i] = InMemory(parts[i].read_all(what, first.shape), parts[i].names)

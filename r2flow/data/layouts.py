@@ -13,7 +13,7 @@ from r2flow.data.options import SourceOptions
 from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
 from r2flow.errors import InputError, warn_odd
-from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS, scan_ending
+from r2flow.lidar.scan_files import FIRM_ENDINGS, LOOSE_ENDINGS, conversion_of, scan_ending
 from r2flow.store import manifest_of
 
 log = logging.getLogger(__name__)
@@ -260,11 +260,7 @@ def _elsewhere(root: Path) -> str:
     form.
     """
     paths = (os.path.join(place, name) for place, names in _walk(root) for name in sorted(names))
-    for path in paths:
-        for end, advice in ELSEWHERE.items():
-            if path.lower().endswith(end):
-                return f" {path} {advice.format(path=path)}."
-    return ""
+    return next((f" {path} {advice}." for path in paths if (advice := conversion_of(path))), "")
 
 
 def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:

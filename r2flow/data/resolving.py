@@ -148,7 +148,7 @@ def lacking_reflectance(sets: Sequence[Described]) -> str | None:
     reflectance.
     """
     reasons = (one.kind.lacks_reflectance(one, one.options.chosen["on_bad_scan"]) for one in sets)
-    return next((reason for reason in reasons if reason), None)
+    return next(filter(None, reasons), None)
 
 
 def reflectance_levels(sets: Sequence[Described]) -> int | None:

@@ -6,10 +6,8 @@ from contextlib import nullcontext
 from functools import cached_property, partial
 from typing import Any
 
-import numpy as np
-import torch
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, default_collate
 
 from r2flow.data.sources import ScanSource, drives_within, spread
 from r2flow.lidar.sensors import Sensor
@@ -90,9 +88,8 @@ class ScanSet:
             return iter(loader)
 
 
-def _with_points(source: ScanSource, numbers: list[int]) -> tuple[Tensor, Tensor]:
-    images, points = zip(*(source.with_points(number) for number in numbers), strict=True)
-    return torch.from_numpy(np.stack(images)), torch.from_numpy(np.stack(points))
+def _with_points(source: ScanSource, numbers: list[int]) -> list[Tensor]:
+    return default_collate([source.with_points(number) for number in numbers])
 
 
 def fixed_choice(count: int, most: int) -> list[int]:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -146,23 +147,20 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Do
         for folder in sorted({os.path.dirname(path) for path in paths}):
             stored = Reading.stored(folder)
             theirs = stored.sensor if stored else sensor
-            differs = (
-                theirs.name != sensor.name
-                or sensor.name not in SENSORS
-                or theirs.shape[0] < sensor.shape[0]
-            )
-            if differs and not theirs.resized(*sensor.shape).same_image(sensor):
-                known = theirs.name in SENSORS
+            known = theirs.name in SENSORS
+            if known and theirs.name == sensor.name and theirs.shape[0] >= sensor.shape[0]:
+                continue  # rows of rows are nearly the rows of the sensor
+            if not theirs.resized(*sensor.shape).same_image(sensor):
                 name = theirs.name if known else None
                 return Doubt(f"{MANIFEST} names {theirs}", name, sure=known)
         return None
-    scans = [
-        *readable([paths[number] for number in spread(len(paths), LOOKED_AT)], reading.columns)
-    ]
+    looked_at = [paths[number] for number in spread(len(paths), LOOKED_AT)]
+    scans = [*readable(looked_at, reading.columns)]
     mismatch = other_sensor(scans, reading.sensor) if scans else None
     if not scans or (mismatch and mismatch.hopeless):
         return mismatch
-    return None if warn_of_frame(paths[0], scans) and not (mismatch and mismatch.sure) else mismatch
+    unclear = warn_of_frame(paths[0], scans)
+    return None if unclear and not (mismatch and mismatch.sure) else mismatch
 
 
 def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
@@ -170,11 +168,13 @@ def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
 
     Warns of files of several turns, too.
     """
+    path = Path(path)
     if any(turns(scan) > SEVERAL for scan in scans):
-        warn_odd(Path(path), "a file holds several turns of the sensor; a scan is one: split it")
-    if unclear := is_unclear(scans):
+        warn_odd(path, "a file holds several turns of the sensor; a scan is one: split it")
+    unclear = is_unclear(scans)
+    if unclear:
         warn_odd(
-            Path(path),
+            path,
             "its beams are not clear: give scans of one sensor, in its own frame, not a vehicle's",
         )
     return unclear
@@ -291,7 +291,7 @@ class ScanFiles(ScanSource):
             )
             with leaving_out(advised):
                 return read(Path(self.paths[index]))
-        for candidate in ((index + i) % len(self) for i in range(len(self))):
+        for candidate in chain(range(index, len(self)), range(index)):
             if candidate in self.bad:
                 continue
             try:

@@ -7,7 +7,7 @@ from itertools import groupby
 
 import numpy as np
 from numpy import ndarray
-from scipy.ndimage import median
+from scipy.ndimage import fourier_gaussian, median
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points
@@ -189,11 +189,9 @@ def _beams_of_elevations(elevation: ndarray) -> Beams | None:
     edges = np.arange(low - 3, high + 3 + BIN, BIN)
     size = 2 << len(edges).bit_length()  # the FFT of other sizes can be many times slower
     density = np.fft.rfft(np.histogram(seen, edges)[0], size)
-    frequency = np.fft.rfftfreq(size, BIN)
     peaks_of = []
     for bandwidth in BANDWIDTHS:
-        kernel = np.exp(-2 * (np.pi * bandwidth * frequency) ** 2)
-        smooth = np.fft.irfft(density * kernel)[: len(edges) - 1]
+        smooth = np.fft.irfft(fourier_gaussian(density, bandwidth / BIN, size))[: len(edges) - 1]
         peaks, _ = find_peaks(smooth)
         heights = smooth[peaks]
         # Returns from the vehicle itself have scattered elevations.

@@ -79,13 +79,9 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     check_columns(columns)
     ending = scan_ending(path.name)
     if not ending and path.exists():
-        advice = (
-            f"has no ending of a scan file; known: {', '.join(SCAN_ENDINGS)}. Convert or rename it"
-        )
-        for other, conversion in ELSEWHERE.items():
-            if path.name.lower().endswith(other):
-                advice = conversion.format(path=path)
-        raise InputError(f"{path} {advice}.")
+        known = ", ".join(SCAN_ENDINGS)
+        other = f"has no ending of a scan file; known: {known}. Convert or rename it"
+        raise InputError(f"{path} {conversion_of(path) or other}.")
     raw = ending in _ROWS
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
         if raw:
@@ -106,6 +102,14 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
         kind = f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped"
         warn_odd(path, kind, points.dropped)
     return points
+
+
+def conversion_of(path: str | Path) -> str | None:
+    """Advice on how a file of a format that is not read becomes scans; None for other files."""
+    for endings, advice in ELSEWHERE.items():
+        if str(path).lower().endswith(endings):
+            return advice.format(path=path)
+    return None
 
 
 def points_beside(path: Path) -> Path:
