@@ -207,9 +207,8 @@ class Encoding:
 
 def wrong_with(image: Tensor, far: float = FAR) -> str | None:
     """Problem of a range image, (2 or 1, H, W), with a hint; None if it is in metres and [0, 1]."""
-    low = image.amin((1, 2)).tolist()  # NaN if a channel contains NaN
-    high = image.amax((1, 2)).tolist()
-    for name, least, most in zip(("range", "reflectance"), low, high, strict=False):
+    for name, channel in zip(("range", "reflectance"), image, strict=False):
+        least, most = (end.item() for end in channel.aminmax())  # NaN if it contains NaN
         if not math.isfinite(least - most):
             return f"its {name} is NaN or infinite in places; 0 stands for a ray without a return"
         if least < 0:
@@ -217,14 +216,12 @@ def wrong_with(image: Tensor, far: float = FAR) -> str | None:
             if max(-least, most) <= 1:
                 hint = "is it in model space ([-1, 1])? Decode it"
             return f"its {name} goes down to {least:.4g}; {hint}"
-    if high[0] >= far:
-        median = image[0][image[0] > 0].median().item()
-        if median >= far:
+        if name == "reflectance" and most > FULL:
+            return (
+                f"its reflectance goes up to {most:.4g}, not 1; divide by its full scale, often 255"
+            )
+        if name == "range" and most >= far and (median := channel[channel > 0].median()) >= far:
             return f"its median range is {median:.4g} m; are these millimetres? Give metres"
-    if len(high) > 1 and high[1] > FULL:
-        return (
-            f"its reflectance goes up to {high[1]:.4g}, not 1; divide by its full scale, often 255"
-        )
     return None
 
 

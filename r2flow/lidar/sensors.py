@@ -42,11 +42,10 @@ class Sensor:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elevations", _plain(self.elevations))  # lists have no hash
-        rows = len(self.elevations)
-        order: Sequence[int] = range(rows)
         if self.firing is not None:
             object.__setattr__(self, "firing", _plain(self.firing))
-            order = self.firing
+        rows = len(self.elevations)
+        order = range(rows) if self.firing is None else self.firing
         scale = 1.0 if self.reflectance_scale is None else self.reflectance_scale
         inside = (90.0, *self.elevations, -90.0)
         rules = {
